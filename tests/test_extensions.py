@@ -435,7 +435,7 @@ def test_a_share_that_is_no_tensor_is_named(scene):
             return 0.5
 
     half = with_effects(scene, bstcad.effect("half", Half))
-    with pytest.raises(ValueError, match=r"effect 'half': share\(\) gives float, not a tensor like cos_in"):
+    with pytest.raises(ValueError, match=r"effect 'half': share\(\) returned float; return a tensor of the shape"):
         bstcad.measure(scene.flat_lens(33), half.channels(), half.target.screen, half.target.irradiance())
 
 

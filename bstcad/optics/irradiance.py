@@ -20,7 +20,7 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.rays import Landed, Status, axes, clocked, clocking_of, tilt_of
 from bstcad.optics.receivers import LevelPlane, Receiver, TiltedPlane
 
-LEAK_ROUNDING = 1e-12  # fraction of the light on a target that counts as rounding
+LEAK_ROUNDING = 1e-12  # largest fraction of the light on a target that counts as rounding
 MAX_DARK_VALUE = 1e-6  # largest value of a dark pixel of a target, as a fraction of its brightest pixel
 
 
@@ -131,7 +131,7 @@ def collect(rays: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
 
 
 def collect_plain(position: Tensor, flux: Tensor, screen: Screen) -> tuple[Tensor, Tensor]:
-    """Run `collect` in plain torch: four weights per ray, without those outside the border."""
+    """Run `collect` in plain torch: four pixels per ray, without pixels outside the screen."""
     column, row = (p.reshape(-1) for p in screen.pixel(position[0].double(), position[1].double()))
     flux, (rows, columns) = flux.reshape(-1).double(), screen.shape
     outside = (column - column.clamp(0, columns)) ** 2 + (row - row.clamp(0, rows)) ** 2
@@ -167,7 +167,7 @@ def rrmsd(irradiance: Tensor, target: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Leak:
-    """Light on the dark pixels D of a target: those at or below MAX_DARK_VALUE times the brightest pixel."""
+    """Light on the dark pixels D of a target: pixels of at most MAX_DARK_VALUE times the brightest pixel."""
 
     share: float  # Σ_D E / Σ E, fraction of the light on the target that falls on D
     # Mean of E over the other pixels divided by the mean of E over D; None: the light on D is rounding.
@@ -187,7 +187,7 @@ def leak(irradiance: np.ndarray, target: np.ndarray) -> Leak | None:
     return Leak(share, float(lit * dark.sum() / share) if share > LEAK_ROUNDING else None)
 
 
-LEDGER = {  # reason of loss by line of the ledger
+LEDGER = {  # status of lost rays, by line of the ledger
     "missed the lens": Status.MISSED_FRONT,
     "lost through the sides": Status.VIGNETTED,
     "total internal reflection": Status.TOTAL_REFLECTION,

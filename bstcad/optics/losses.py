@@ -40,7 +40,7 @@ def reflectance(
     """Return the reflectance R of an uncoated face between two media.
 
     r_s = (n cos θ - n' cos θ') / (n cos θ + n' cos θ'),  r_p = (n' cos θ - n cos θ') / (n' cos θ + n cos θ'),
-    R = r² of one polarisation with respect to the plane of incidence, or the mean of both.
+    R = r² of one polarisation with respect to the plane of incidence, or the mean of s and p.
     """
     r_s, r_p = _amplitudes(n_in, n_out, cos_in, cos_out)
     return _mean(r_s * r_s, r_p * r_p, polarisation)
@@ -49,8 +49,8 @@ def reflectance(
 def coated_reflectance(face: Transmission, coating: CoatingLayer, cos_in: Tensor, cos_out: Tensor) -> Tensor:
     """Return the reflectance R of a face with a single layer between its two media.
 
-    r = (r_1 + r_2 e^{2iβ}) / (1 + r_1 r_2 e^{2iβ}),  β = 2π n_f d cos θ_f / λ,  r_1 and r_2 the amplitudes of the
-    layer's two sides.  The angle in the layer is real for transmitted light, since n_f >= 1 >= n sin θ.
+    r = (r_1 + r_2 e^{2iβ}) / (1 + r_1 r_2 e^{2iβ}),  β = 2π n_f d cos θ_f / λ,  r_1 and r_2 the amplitudes at the two
+    sides of a layer of thickness d.  The angle in the layer is real for transmitted light, since n_f >= 1 >= n sin θ.
     """
     n_f = coating.index
     cos_f = torch.sqrt(1 - (face.n_in / n_f) ** 2 * (1 - cos_in * cos_in))
@@ -146,11 +146,11 @@ class CustomLoss:
         return bool(getattr(self.loss, "in_glass", False))
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
-        """Return the fraction that remains; ValueError, with the name, unless it is a tensor like the cosines."""
+        """Return the fraction that remains; raise ValueError if it is not a tensor of the cosines' shape."""
         share = self.loss.share(cos_in, cos_out, path)
         if not (isinstance(share, Tensor) and share.shape == cos_in.shape):
             found = f"a tensor of shape {tuple(share.shape)}" if isinstance(share, Tensor) else type(share).__name__
-            raise ValueError(f"effect {self.name!r}: share() gives {found}, not a tensor like cos_in")
+            raise ValueError(f"effect {self.name!r}: share() returned {found}; return a tensor of the shape of cos_in")
         return share
 
 
@@ -161,10 +161,10 @@ class FresnelLoss:
     wavelength: float  # wavelength, nm
     polarisation: Polarisation = "none"
     coating: CoatingLayer | None = None
-    metal: complex | None = None  # n + ik of the mirror's metal
+    metal: complex | None = None  # n + ik of the mirror's metal; None: no mirror
 
     def of(self, interface: Interface, index: float = 1.0) -> Loss:
-        """Return the loss at an interface; index: of the medium before it."""
+        """Return the loss at an interface; index: refractive index of the medium before it."""
         law = interface.law
         if isinstance(law, Reflect):
             assert self.metal is not None  # a mirror states it
@@ -181,7 +181,7 @@ class Losses:
     own: tuple[CustomLoss, ...] = ()
 
     def on(self, interfaces: Sequence[Interface]) -> tuple[Interface, ...]:
-        """Return the interfaces of a lens, each with its losses there and in the glass before it."""
+        """Return the interfaces of a lens, each with the losses at the face and in the glass before it."""
         index = getattr(interfaces[0].law, "n_out", 1.0)  # index behind the first interface
         return tuple(replace(each, losses=self._at(k, each, index if k else 1.0)) for k, each in enumerate(interfaces))
 
@@ -198,5 +198,5 @@ def _amplitudes(n_in: float, n_out: float, cos_in: Tensor, cos_out: Tensor) -> t
 
 
 def _mean(s: Tensor, p: Tensor, polarisation: Polarisation) -> Tensor:
-    """Return the value of one polarisation, or the mean of both."""
+    """Return the value of one polarisation, or the mean of s and p."""
     return s if polarisation == "s" else p if polarisation == "p" else (s + p) / 2

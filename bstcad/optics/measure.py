@@ -1,23 +1,24 @@
 """Measurement of the irradiance that a lens produces on a screen, and of its RRMSD from a target.
 
-Verification, made parts, tolerances and the sweeps of accuracy over time all use it; `Effort` limits the work.
+Verification, manufactured parts, tolerances and the sweeps of accuracy against time use it; `Effort` limits the work.
 
-RRMSD is measured without bias, from SETS independent sets of stratified rays.  Each gives a picture A_i = A + n_i, the
-noiseless picture A of the lens plus noise of mean zero, so that the square of its distance from the target T is too
-large by the square of the noise.  The product of two sets is not: E <(A_i - T) (A_j - T)> = <(A - T)²>, i ≠ j.  The
-mean over all pairs is a U-statistic (Hoeffding 1948), and its standard error follows from the scatter of the pairs
-(`squared_distance`).  Rays are added until that error is as small as requested.  For an extended source each set draws
-its own points of the source, so that their number leaves no bias either.
+RRMSD is estimated without bias from SETS independent sets of stratified rays.  Set i gives a picture A_i = A + n_i: the
+noiseless picture A of the lens plus noise n_i of mean zero.  The squared distance of A_i from the target T is too large
+by the squared noise, but the product of two sets is unbiased: E <(A_i - T) (A_j - T)> = <(A - T)²>, i ≠ j.  The mean
+over all pairs is a U-statistic (Hoeffding 1948), and its standard error follows from the scatter of the pairs
+(`squared_distance`).  Rays are added until this error is as small as requested.  For an extended source each set
+samples new source points, so that their finite number causes no bias.
 
 The picture for display is the mean of all sets, smoothed as long as this removes more noise than detail.  Flux tubes
-(tubes.py) give a second picture without noise, the witness, which shares only the trace with the rays.  Tubes
-interpolate linearly between their corners: with two per cell of the net the error is about the RRMSD that tailoring by
-tubes leaves, with four a third of it, with eight a tenth (measured).  They are therefore halved in width until both
-pictures agree, or until the tubes' own error cannot explain the difference.  Their RRMSD (`rrmsd_by_tubes`) is a few
-per cent too low for a lens tailored with the same tubes.  A ghost is traced once; its noise is the same in all sets.
+(tubes.py) give a second picture without noise, the witness; rays and tubes share only the trace.  Tubes interpolate
+linearly between their corners: with two tubes per control cell and side the error is about the RRMSD that remains after
+tailoring with tubes, with four a third of this error, with eight a tenth (measured).  The tubes are therefore halved in
+width until the pictures agree, or until the error of the tubes cannot explain the difference.  The RRMSD by tubes
+(`rrmsd_by_tubes`) is a few per cent too low for a lens tailored with them.  A ghost is traced once, with equal noise in
+all sets.
 
-An extended source forms an image of itself through each point of the lens (`ImageSamples`).  All rays that leave one
-point of the back face share its slope, whatever point of the source they come from: no lens can bring them together.
+An extended source forms an image of itself through each point of the lens (`ImageSamples`).  All rays through one point
+of the back meet the same slope, whichever source point they come from: no lens can unite them in one point.
 """
 
 from __future__ import annotations
@@ -42,25 +43,25 @@ from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import point_pairs
 from bstcad.optics.trace import UNDERSIDE, GhostImage, Simulation, simulate, through, whole_kernel
 
-SETS = 8  # independent sets of rays: a standard error is then known to a quarter of itself
-PILOT_DIVISOR = 5  # maximum rays per side relative to those of the first sets, which predict how many are needed
-PICTURE_NOISE = 0.45  # noise of the mean picture relative to the RRMSD, at the default accuracy: RRMSD grows by a tenth
+SETS = 8  # number of independent sets of rays: the relative uncertainty of a standard error is a quarter
+PILOT_DIVISOR = 5  # maximum rays per side divided by those of the first sets, which predict the number needed
+PICTURE_NOISE = 0.45  # largest noise of the mean picture divided by RRMSD, at the default accuracy; adds 10 %
 RESOLVED = 5.0  # smallest ratio of an RRMSD to its standard error at which it counts as resolved
 # Tolerances of the difference between the pictures by rays and by tubes: relative to the smaller RRMSD, and absolute.
 WITNESS_RELATIVE_TOLERANCE, WITNESS_TOLERANCE = 0.5, 0.002
-MAX_WITNESS_TUBES = 4200  # maximum tubes per side of the witness where the pictures differ by more
-SMOOTHING_WIDTHS = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # standard deviations of a normal kernel (pixels)
-# Power of the number of points of an extended source by which tubes and rays per side fall: the total stays constant.
+MAX_WITNESS_TUBES = 4200  # maximum tubes per side to which the witness is refined until the pictures agree
+SMOOTHING_WIDTHS = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # standard deviations of Gaussians (pixels)
+# Exponent: k points of an extended source divide tubes and rays per side by k^SIDE_EXPONENT; the total is constant.
 SIDE_EXPONENT = 0.5
 RAYS_PER_POINT = 1 << 13  # rays of each set per point of an extended source
-MIN_SOURCE_POINTS, MAX_SOURCE_POINTS = 8, 1024  # points of an extended source in each set
+MIN_SOURCE_POINTS, MAX_SOURCE_POINTS = 8, 1024  # limits of the number of source points of each set
 MIN_TUBES = 513  # minimum tubes per side of the witness: fewer do not resolve pixels
-COARSE_SHEET = 64  # tubes per side of the coarse sheet of many pictures: to find it is half the work; error 1e-6
+COARSE_SHEET = 64  # tubes per side of the coarse sheet (tubes.picture: few) with over_the_back; error 1e-6
 PASS_SEEDS = 1 << 20  # difference between the seeds of successive passes of rays from an extended source
-GHOST_DIVISOR = 4  # rays per side relative to those of the ghost, which is a hundredth of the light
+GHOST_DIVISOR = 4  # rays per side divided by those of the ghost, which is a hundredth of the light
 IMAGE_POINTS_PER_SIDE = 48  # points per side of the back face through which the image of the source is computed
 # Largest distance of an image from the centre of the screen, relative to the screen's width plus the median distance.
-# Light outside it grazes a tilted plane and does not belong to the image.
+# Light farther out grazes a tilted plane and does not belong to the image.
 MAX_IMAGE_DISTANCE = 16
 EVEN_POINT_PAIRS = 2048  # pairs of points that represent an evenly bright source
 
@@ -72,10 +73,10 @@ class Effort:
     rays: int = 2896  # maximum rays per side of the window in each of SETS sets: 67 million in total
     seed: int = 0  # seed of the rays
     places: int = 1025  # points per side of the lens at which a verification evaluates the thickness
-    points: int = 1 << 17  # points of a face at which the written file is compared with the design
+    points: int = 1 << 17  # points per face at which the written file is compared with the design
     accuracy: float = 0.005  # relative standard error of the RRMSD at which tracing ends; 0: all rays are traced
-    seconds: float = math.inf  # time limit (s): no further sets of rays are started that would end later
-    witness: bool = True  # True if flux tubes also trace a point source
+    seconds: float = math.inf  # time limit (s): no sets of rays are started that would end later
+    witness: bool = True  # True: flux tubes give a second picture of a point source
 
 
 FULL = Effort()
@@ -88,8 +89,8 @@ class Witness:
     """Second measurement of the light, by flux tubes."""
 
     rrmsd: float  # RRMSD of the tubes' picture
-    difference: float  # RRMSD of the tubes' picture from the rays' picture, without bias
-    limit: float  # largest difference allowed, from the RRMSD, or from the tubes' own error and the noise of the rays
+    difference: float  # RRMSD between the pictures by tubes and by rays, without bias
+    limit: float  # largest difference allowed: root square sum of tolerance and noise, or error of the tubes if larger
     tubes: int  # number of tubes per side
 
 
@@ -101,13 +102,13 @@ class Light:
     rrmsd: float  # RRMSD without bias (Wang et al. 2023, Eq. 15); NaN: no light falls on the screen
     standard_error: float  # standard error of the RRMSD
     rays: int  # total number of rays
-    flux: dict[str, float]  # ledger of the source's flux by fate; the lines sum to 1
+    flux: dict[str, float]  # ledger: fractions of the source's flux by fate; they sum to 1
     tent: float = math.nan  # RRMSD by linear binning
-    picture_error: float = math.nan  # RRMSD of `picture` from the lens's noiseless picture
+    picture_error: float = math.nan  # RRMSD between `picture` and the lens's noiseless picture
     witness: Witness | None = None  # None: an extended source, losses, no kernel for this lens, or not requested
     ghost: np.ndarray | None = field(default=None, repr=False)  # ghost's part of the picture; None: no ghost is traced
     leak: Leak | None = None  # leak of the rays' mean picture before smoothing; None: the target has no dark pixel
-    rrmsd_whole: float | None = None  # RRMSD from a picture of which the target is a part; None: there is none
+    rrmsd_whole: float | None = None  # RRMSD from the whole picture of which the target is a part; None: it is no part
 
     @property
     def efficiency(self) -> float:
@@ -134,8 +135,8 @@ def measure(
 
     lens: heights in float64 on the CPU for full accuracy.  channels: weights sum to 1.  target: (rows, columns) of any
     sum, row 0 = y max.  ghost: function that traces light reflected twice inside the lens (trace.ghost_light), which is
-    added to picture and ledger; None: such light is left out.  draw: draws new points of an extended source for each
-    set of rays; None: all sets use the points of `channels`.
+    added to picture and ledger; None: no ghost is traced.  draw: function that samples new source points for
+    each set of rays; None: all sets use the points of `channels`.
     """
     goal = Goal("target", screen, np.asarray(target, dtype=np.float64))
     return measure_goal(lens, channels, goal, effort, ghost=ghost, draw=draw)
@@ -144,7 +145,7 @@ def measure(
 def measure_goal(
     lens: Lens, channels: Sequence[Channel], goal: Goal, effort: Effort, ghost: GhostTracer | None, draw: Draw | None
 ) -> Light:
-    """Measure as `measure` does, on the receiver of a goal, against its picture and the picture before restriction."""
+    """Measure the light on the receiver of a goal against its picture and against `goal.whole` (see `measure`)."""
     screen, target = goal.receiver, torch.from_numpy(goal.picture)
     side = effort.rays / GHOST_DIVISOR
     ghost_image = ghost(lens, channels, screen, round(side_factor(channels) * side), effort.seed) if ghost else None
@@ -179,7 +180,7 @@ def rrmsd_by_rays(
 
 
 def rrmsd_by_tubes(lens: Lens, channels: Sequence[Channel], goal: Goal, n: int) -> float:
-    """Return the RRMSD by n x n tubes per channel: without noise, with the bias of tubes; NaN if no light falls."""
+    """Return the RRMSD by n x n tubes per channel, without noise but with their bias; NaN if no light lands."""
     flux = tubes_picture(lens, channels, goal.receiver, n).cpu()
     return float(rrmsd(flux, torch.from_numpy(goal.picture))) if total(flux) > 0 else math.nan
 
@@ -193,10 +194,10 @@ class _Rays:
     flux: dict[str, float]  # ledger of the flux by fate
     count: int  # number of rays
     on_screen: float  # flux on the screen, as a fraction of the source's
-    weight: float = 1.0  # weight of the pictures in a mean: 1 / the variance of their noise, on any scale
+    weight: float = 1.0  # weight of the pictures in a mean: inverse variance of their noise, on any scale
 
     def joined(self, other: _Rays) -> _Rays:
-        """Return the weighted means of each set with the same set of `other`; sets stay independent."""
+        """Return the weighted mean of each set and the set of equal number in `other`; sets stay independent."""
         weight = self.weight + other.weight
         share = other.weight / weight
 
@@ -214,7 +215,7 @@ class _Setup:
     """Lens, light and target of a measurement."""
 
     lens: Lens
-    draw: Draw  # channels of each set of rays
+    draw: Draw  # function that returns the channels of a set of rays
     screen: Screen
     target: Tensor  # (rows, columns), row 0 = y max, of any sum
     ghost: GhostImage | None = None
@@ -239,12 +240,12 @@ class _Setup:
         return _Rays(boxes, tents, flux, count, on_screen=on_screen, weight=float(side) ** 3)
 
     def with_ghost(self, picture: Tensor) -> Tensor:
-        """Return a picture on the CPU with the light of the ghost."""
+        """Return the picture on the CPU, plus that of the ghost if one is traced."""
         return picture.cpu() if self.ghost is None else picture.cpu() + self.ghost.picture.cpu()
 
 
 def _value(rays: _Rays, target: Tensor) -> tuple[float, float]:
-    """Return (RRMSD, its standard error); an RRMSD² below its standard error is replaced by that error."""
+    """Return (RRMSD, its standard error); an RRMSD² below its standard error is replaced by the standard error."""
     squared, error = squared_distance(rays.boxes, target)
     value = math.sqrt(max(squared, error))
     return value, math.sqrt(value**2 + error) - value
@@ -257,10 +258,10 @@ def squared_distance(pictures: Sequence[Tensor], other: Tensor) -> tuple[float, 
 
         σ² = 4 σ_a² / M + 2 σ_e² / (M (M - 1)).
 
-    The jackknife, 4 / M times the variance of the means of p_ij over j times ((M - 1) / (M - 2))², has 4 σ_e² / (M (M -
-    2)) as its second term (Efron and Stein 1981): twice too much where noise times noise dominates, or by chance a
-    tenth of it.  σ_e² is therefore estimated from the residuals e_ij of the M (M - 1) / 2 products, with M (M - 3) / 2
-    degrees of freedom.
+    The jackknife is 4 / M times the variance of the means of p_ij over j times ((M - 1) / (M - 2))².  Its second term
+    is 4 σ_e² / (M (M - 2)) (Efron and Stein 1981): twice too large where noise dominates, or by chance ten times too
+    small. σ_e² is therefore estimated from the residuals e_ij of the M (M - 1) / 2 products, with M (M - 3) / 2 degrees
+    of freedom.
     """
     differences = [(picture - other).reshape(-1) for picture in pictures]
     size, m = _squared(other), len(differences)
@@ -284,9 +285,9 @@ def _noise(pictures: Sequence[Tensor], target: Tensor) -> float:
 
 
 def _smoothed(pictures: Sequence[Tensor], target: Tensor) -> tuple[Tensor, float]:
-    """Return (smoothed mean picture with the target's sum; its RRMSD from the lens's noiseless picture).
+    """Return (smoothed mean picture with the target's sum; RRMSD between it and the lens's noiseless picture).
 
-    Each kernel S of SMOOTHING_WIDTHS is applied to the mean of all sets but two and compared with these two, whose
+    Each kernel S of SMOOTHING_WIDTHS is applied to the mean of all sets except two and compared with these two, whose
     errors are independent: E <(S A - A_i) (S A - A_j)> = |S A - A|².  The kernel with the smallest difference is used.
     """
     from scipy.ndimage import gaussian_filter  # not loaded by the import of bstcad
@@ -311,11 +312,11 @@ def _smoothed(pictures: Sequence[Tensor], target: Tensor) -> tuple[Tensor, float
 
 
 def _sample(setup: _Setup, effort: Effort, max_noise: float = math.inf) -> _Rays:
-    """Trace rays, at most `effort.rays` per side, until the standard error is `effort.accuracy` of the RRMSD.
+    """Trace rays, at most `effort.rays` per side, until the standard error is `effort.accuracy` times the RRMSD.
 
-    The noise of the mean picture, which falls as n^-3/2, must also fall below `max_noise` times the RRMSD.
-    The error falls as n^-3 with n rays per side where noise times noise dominates (the variance of a pixel of n²
-    stratified rays falls as n^-3; measured: n^-2.9), and as n^-3/2 where the lens's own error times noise dominates.
+    The noise of the mean picture, which falls as n^-3/2 with n rays per side, must also be below `max_noise` times
+    RRMSD. The standard error falls as n^-3 where products of noise dominate (the variance of a pixel of n² stratified
+    rays falls as n^-3; measured: n^-2.9), and as n^-3/2 where products of the lens's error and noise dominate.
     """
     pilot = max(effort.rays // PILOT_DIVISOR, min(effort.rays, 32))
     began, side, rays = time.perf_counter(), pilot if effort.accuracy else effort.rays, None
@@ -344,9 +345,9 @@ def _sample(setup: _Setup, effort: Effort, max_noise: float = math.inf) -> _Rays
 
 
 def _sample_source(setup: _Setup, effort: Effort, max_noise: float) -> _Rays:
-    """Trace rays from an extended source as `_sample` does, from new points of the source in each set.
+    """Trace rays from an extended source to the limits of `_sample`, from new source points in each set.
 
-    Each pixel receives few rays from each of many points, so that its variance falls as for random rays, n^-2.  The
+    Each pixel receives few rays from each of many points, so that its variance falls as n^-2, as for random rays.  The
     error of the RRMSD falls as n^-2, or faster where more rays come from more points (measured: n^-2.6).  Source and
     picture are smooth, so that `max_noise` limits the error of the smoothed picture, not the noise of single pixels.
     """
@@ -378,7 +379,7 @@ def _sample_source(setup: _Setup, effort: Effort, max_noise: float) -> _Rays:
 
 
 def _witness(setup: _Setup, channels: Sequence[Channel], rays: _Rays) -> Witness:
-    """Compare the picture by rays with the picture by tubes, from `tubes_of` the lens per side on (`_compare`)."""
+    """Compare the pictures by rays and by tubes (`_compare`), from `tubes_of(lens)` tubes per side on."""
     lens, screen, target = setup.lens, setup.screen, setup.target
 
     def by_tubes(n: int) -> Tensor | None:
@@ -394,8 +395,8 @@ def _compare(
 ) -> Witness:
     """Compare pictures by independent sets of rays with pictures by tubes, whose number per side doubles from `first`.
 
-    The error of n tubes per side falls about as n^-1.6, so that it is less than half the difference from the picture by
-    n / 2 tubes.  If n tubes differ from the rays by more than twice that difference, no finer tubes will agree.
+    The error of n tubes per side falls about as n^-1.6, so that it is less than half the change from the picture by n /
+    2 tubes.  If the pictures by tubes and by rays differ by more than twice this change, no finer tubes will agree.
     """
 
     def change_from(fine: Tensor | None, coarse: Tensor | None) -> float:
@@ -423,9 +424,9 @@ def _compare(
 def tubes_of(lens: Lens, pixels: int = 0) -> int:
     """Return the number of tubes per side for a lens: two per control point, at least MIN_TUBES.
 
-    Two nets take twice as many, since light deflected by the first net varies within the cells of the second.  If a
-    cell of the net lights several pixels, two tubes per pixel are used, at most four per cell.  Five more are added, so
-    that lines of the net and corners of tubes do not coincide.
+    A lens with two nets gets twice as many, since light deflected by the first net varies within the cells of the
+    second.  If a cell of the net lights several pixels, two tubes per pixel are used, at most four per cell.  Five more
+    are added, so that lines of the net and corners of tubes do not coincide.
     """
     each = 2 * len(lens.nets)
     return max(*(each * max(net.side, min(pixels, 2 * net.side)) + 5 for net in lens.nets), MIN_TUBES)
@@ -433,7 +434,7 @@ def tubes_of(lens: Lens, pixels: int = 0) -> int:
 
 @dataclass(frozen=True)
 class RayTubes:
-    """Flux tubes of some channels in front of the first net, launched once for lenses that differ little.
+    """Flux tubes of channels in front of the first net, launched once for all lenses that differ little.
 
     A tube carries the light between four neighbouring rays; its picture is differentiable in the heights of all nets.
     """
@@ -443,7 +444,7 @@ class RayTubes:
 
     @classmethod
     def launched(cls, lens: Lens, channels: Sequence[Channel], n: int | None = None) -> RayTubes:
-        """Launch n x n tubes per channel (default: two per control point) that hold all light which gets through."""
+        """Launch n x n tubes per channel (default: `tubes_of`) that carry all light which the lens transmits."""
         n = n or tubes_of(lens)
         return cls(tuple(channels), tuple(tubes.launch_tubes(c.source, c.through(lens), n) for c in channels))
 
@@ -494,13 +495,13 @@ def spectral_lines(lens: Lens, channels: Sequence[Channel], goal: Goal, n: int) 
 
 
 def simulated(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, seed: int) -> Simulation:
-    """Simulate picture and ledger by n x n stratified rays per channel, different ones at each point of the source."""
+    """Simulate picture and ledger by n x n stratified rays per channel, with another seed for each source point."""
     pairs = zip(channels, source_numbers(channels), strict=True)
     return simulate([(c.weight, c.source, c.through(lens), seed + SETS * k) for c, k in pairs], screen, n)
 
 
 def side_factor(channels: Sequence[Channel]) -> float:
-    """Return k^-1/2, the factor of tubes or rays per side at each of k points of a source: the total is constant."""
+    """Return k^-1/2, the factor of tubes or rays per side for each of k source points: their total is constant."""
     k = points_per_line(channels)
     return k**-SIDE_EXPONENT if k > 1 else 1
 
@@ -513,18 +514,18 @@ def _squared(t: Tensor) -> float:
 class ImageSamples:
     """Images of a source through several points of the back face: landing points of the light of each channel."""
 
-    offset: Tensor  # landing from the centroid of the point's own image, (2, channels, points), in columns and rows
+    offset: Tensor  # landing point minus centroid of the image, (2, channels, points), columns and rows
     flux: Tensor  # flux of each channel through each point, (channels, points)
 
     def width(self) -> float:
-        """Return 2 √2 times the rms distance from the centroid (pixels), the diameter D of an even disc."""
+        """Return 2 √2 times the RMS distance from the centroid (pixels), the diameter D of an equal uniform disc."""
         square = torch.where(self.flux > 0, (self.offset**2).sum(0), torch.zeros_like(self.flux))
         return 2 * math.sqrt(2 * float(total(square * self.flux) / total(self.flux)))
 
     def mean(self, limit: tuple[int, int]) -> np.ndarray:
-        """Return the mean image (rows, columns), centred and of sum 1; both numbers are odd.
+        """Return the mean image (odd number of rows, odd number of columns), centred, of sum 1.
 
-        limit: largest distance from the centre in columns and rows; light outside it counts in the sum only.
+        limit: largest distance from the centre in columns and rows; light farther out counts in the sum only.
         """
         extent = [math.ceil(float(p[self.flux > 0].abs().max())) + 1 for p in self.offset]
         columns, rows = (2 * min(reach, side) + 1 for reach, side in zip(extent, limit, strict=True))
@@ -535,7 +536,7 @@ class ImageSamples:
         return (image / (image.sum() if fits else self.flux.sum())).numpy()
 
     def deviation(self, target: np.ndarray) -> float:
-        """Return the RRMSD of a target (rows, columns) convolved with the mean image from the target itself.
+        """Return the RRMSD between a target (rows, columns) and the target convolved with the mean image.
 
         Light shifted by more than the target's width falls outside the target and needs no pixels.
         """
@@ -549,13 +550,13 @@ class ImageSamples:
 
 
 def even_image(extent: Outline) -> ImageSamples:
-    """Return the image of an evenly bright disc or rectangle, its extent in pixels."""
+    """Return the image of a uniformly bright disc or rectangle; extent: outline of the image (pixels)."""
     offset = torch.tensor(point_pairs(extent, EVEN_POINT_PAIRS), dtype=torch.float64).T[..., None]
     return ImageSamples(offset, torch.full(offset.shape[1:], 1 / (2 * EVEN_POINT_PAIRS), dtype=torch.float64))
 
 
 def detail_width(source_image: float, pixel: float) -> float:
-    """Return √(D² + 4/3 p²): the diameter of an even disc whose variance is that of a disc D plus that of a pixel p.
+    """Return √(D² + 4/3 p²): diameter of the uniform disc whose variance is the sum of those of a disc D and a pixel p.
 
     The variances are D² / 8 and p² / 6; D, p and the result have the same unit of length.
     """
@@ -564,7 +565,7 @@ def detail_width(source_image: float, pixel: float) -> float:
 
 @torch.no_grad()
 def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMAGE_POINTS_PER_SIDE) -> ImageSamples:
-    """Return the images of the source through the lit ones of n x n points of the back, for the first line of light."""
+    """Return the images of the source through the lit points of an n x n grid on the back, at the first line."""
     first = channels[0]
     channels = [c for c in channels if (c.source.wavelength, c.index) == (first.source.wavelength, first.index)]
     pixel, flux = landing_pixels(channels, lens, screen, n)
@@ -583,7 +584,7 @@ def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMA
 def landing_pixels(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int) -> tuple[Tensor, Tensor]:
     """Return (pixel (2, channels, points), flux (channels, points)) of the light through n x n points of the back.
 
-    pixel: column and row of the landing of each channel's light, without meaning where the flux is zero.
+    pixel: column and row at which each channel's light lands, meaningless where the flux is zero.
     """
     x, y = tubes.corners(lens.apertures[1], n)
     landed = [_through(channel, lens, screen, x=x, y=y) for channel in channels]

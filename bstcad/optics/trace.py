@@ -6,9 +6,10 @@ a lens is tailored: `to_first_net` traces it once, and `from_first_net` traces t
 A simulation traces stratified rays a strip at a time, so that memory does not grow with their number.
 
 A ghost is light that is reflected twice inside the lens: it enters through the front, is reflected at the back and
-again at the front, and leaves through the back.  It carries T R' R T' of a ray's flux, about a thousandth for bare
-glass; beyond the critical angle R is 1.  Light that is reflected more often is a few hundred times fainter and is left
-out.  Light that meets the outline is absorbed by the sides.  Only verification traces ghosts, in plain torch.
+again at the front, and leaves through the back.  With T and R the transmittance and reflectance of the front, T' and R'
+those of the back, it carries the fraction T R' R T' of a ray's flux, about a thousandth for bare glass; beyond the
+critical angle R = 1.  Light that is reflected more often is a few hundred times fainter and is neglected.  Light that
+meets the outline is absorbed by the sides.  Only verification traces ghosts, in plain torch.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ from bstcad.optics.receivers import Receiver
 from bstcad.optics.surfaces import Plane, Surface
 
 UNDERSIDE = "vignetted by the underside"  # line of the ledger: light beside the optical part of a front
-BLOCKED = "stopped beside a window or mirror"  # line of the ledger of a lens with windows or mirrors behind it
-UNDERSIDE_CELLS = 256  # cells per side of the lens for the sum of the light that the underside stops
+BLOCKED = "stopped beside a window or mirror"  # line of the ledger: light that misses such an element
+UNDERSIDE_CELLS = 256  # cells per side of the lens, over which the light stopped by the underside is summed
 WINDOW_CELLS = 96  # cells per side of the search for useful light in front of a window or mirror
 MIN_RAYS_FOR_TABLE = 256  # minimum rays per side for which a table of the source's light is worth its cost
-GHOST_RAYS = 1024  # maximum rays per side; a ghost of 1 % of the light, with 3 % noise per pixel, adds 0.0003 to RRMSD
+GHOST_RAYS = 1024  # maximum rays per side of a ghost; 3 % noise per pixel on 1 % of the light adds 0.0003 to RRMSD
 # Lines of the ledger that a ghost changes, besides losses.REFLECTED.
 GHOST_ON, GHOST_OFF, TOTAL_REFLECTION = "ghost on target", "ghost off target", "total internal reflection"
 
@@ -54,7 +55,7 @@ def across(rays: Rays, interfaces: Sequence[Interface]) -> Rays:
 
 
 def through(rays: Rays, interfaces: Sequence[Interface], plane: Receiver) -> Landed:
-    """Trace rays through interfaces to the receiver; nets by a fused kernel where one takes the tensors."""
+    """Trace rays through interfaces to the receiver; nets by a fused kernel if one supports the tensors."""
     *others, last = interfaces
     for interface in others:
         rays = behind(rays, interface)
@@ -64,13 +65,13 @@ def through(rays: Rays, interfaces: Sequence[Interface], plane: Receiver) -> Lan
 
 
 def behind(rays: Rays, interface: Interface) -> Rays:
-    """Trace rays through one interface; a net by a fused kernel where one takes the tensors."""
+    """Trace rays through one interface; a net by a fused kernel if one supports the tensors."""
     fast = _net_kernel("trace.behind", rays, interface)
     return fast(rays, interface) if fast else cross(rays, interface).rays
 
 
 def _net_kernel(name: str, rays: Rays, interface: Interface) -> Callable[..., Any] | None:
-    """Return the kernel of this name if the interface is a net; None: the plain form runs."""
+    """Return the kernel of this name if the interface is a net that it supports; None: use plain torch."""
     net = interface.surface
     return ops.kernel(name, net.heights, rays.position, rays.direction) if is_net(net) else None
 
@@ -78,7 +79,7 @@ def _net_kernel(name: str, rays: Rays, interface: Interface) -> Callable[..., An
 def whole_kernel(
     name: str, source: Emitter, lens: Lens, plane: Receiver, tables: bool = True
 ) -> Callable[..., Any] | None:
-    """Return the kernel of this name if it can trace the whole path: source, all interfaces of the lens and receiver.
+    """Return the kernel of this name if it can trace from the source through the lens to the receiver; None: it cannot.
 
     tables: allow a table of the source's light, which costs as much as some ten thousand rays.
     """
@@ -87,12 +88,12 @@ def whole_kernel(
 
 
 def to_first_net(rays: Rays, lens: Lens) -> Rays:
-    """Trace rays from the source through all interfaces in front of the first freeform one."""
+    """Trace rays from the source through all interfaces in front of the first freeform interface."""
     return across(rays, lens.interfaces[: lens.freeform[0]])
 
 
 def from_first_net(coming: Rays, lens: Lens, plane: Receiver) -> Landed:
-    """Trace rays through the first freeform interface and all behind it to the receiver."""
+    """Trace rays through the first freeform interface, and all interfaces behind it, to the receiver."""
     return through(coming, lens.interfaces[lens.freeform[0] :], plane)
 
 
@@ -141,7 +142,7 @@ def _useful(
 
 
 def _around(area: Rectangle, points: tuple[Tensor, ...], n: int, useful: Tensor) -> Rectangle:
-    """Return the rectangle about the axis that holds the useful ones of n x n points, with a margin of two cells."""
+    """Return the rectangle about the axis with all useful points of an n x n grid, and a margin of two cells."""
     if not bool(useful.any()):
         return area
     sides = zip(points, (area.width, area.height), strict=True)
@@ -151,9 +152,9 @@ def _around(area: Rectangle, points: tuple[Tensor, ...], n: int, useful: Tensor)
 
 @torch.no_grad()
 def clear_window(source: Emitter, lens: Lens, n: int = 256) -> Rectangle:
-    """Return the part of `window` whose light gets through all faces, with a margin of two cells.
+    """Return the part of `window` whose light passes all faces, with a margin of two cells.
 
-    Light outside it counts as lost; it need not be traced during tailoring.
+    Light outside this part counts as lost, and need not be traced during tailoring.
     """
     area = window(source, lens)
     x, y = (p.to(lens.like) for p in sampling.grid(area, n))
@@ -187,7 +188,7 @@ Lights = Sequence[tuple[float, Emitter, Lens, int]]  # (weight, source, lens at 
 
 @torch.no_grad()
 def simulate(lights: Lights, screen: Screen, n: int) -> Simulation:
-    """Simulate the weighted sum of lights by n x n stratified rays each; by the fused kernel where it applies.
+    """Simulate the weighted sum of lights by n x n stratified rays each; by the fused kernel if it supports all.
 
     Kernel and plain form trace the same rays and agree to rounding.
     """
@@ -222,7 +223,7 @@ def simulate_plain(lights: Lights, screen: Screen, n: int) -> Simulation:
 
 
 def _as_fractions(lights: Lights, box: Tensor, tent: Tensor, flux: dict[str, float], count: int) -> Simulation:
-    """Return the sums as fractions of the source's light; light not launched missed the lens or met its underside."""
+    """Return the sums as fractions of the source's light; other light missed the lens or met its underside."""
     launched = sum(flux.values())
     whole = max(launched, 1.0)  # a cell on the rim of a beam counts or not: together a little more than the beam
     flux = {line: value / whole for line, value in flux.items()}
@@ -283,7 +284,7 @@ def ghost(lens: Lens) -> tuple[Interface, ...]:
 
 
 def _from_inside(exit: Interface) -> Interface:
-    """Return a face as the mirror that it is for light reflected inside the glass."""
+    """Return a face as a mirror for light inside the glass."""
     assert isinstance(exit.law, Refract)
     *glass, face = exit.losses
     return replace(exit, law=Reflect(), losses=(*glass, Reflection(face, exit.law)))
@@ -310,7 +311,7 @@ def ghost_light(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int,
 
 
 def _ghost_of_channel(channel: Channel, lens: Lens, screen: Screen, n: int, seed: int) -> GhostImage:
-    """Trace the ghost of one channel; its flux leaves the line of the ledger that counted its first reflection."""
+    """Trace the ghost of one channel; subtract its flux from the ledger's line of its first reflection."""
     picture = torch.zeros(screen.shape, dtype=torch.float64, device=lens.like.device)
     launched, lines = 0.0, dict.fromkeys((GHOST_ON, GHOST_OFF, REFLECTED, TOTAL_REFLECTION), 0.0)
     for rays in launch_strips(channel.source, lens, n, seed):
@@ -328,7 +329,7 @@ def _ghost_of_channel(channel: Channel, lens: Lens, screen: Screen, n: int, seed
 
 
 def trace_ghost(rays: Rays, lens: Lens) -> tuple[Rays, Tensor]:
-    """Return (ghost of rays from the source, behind the lens; True where its reflection at the back was total)."""
+    """Return (rays of the ghost behind the lens; True where their reflection at the back was total)."""
     entry, down, up, exit = ghost(lens)
     at_back = cross(cross(across(rays, lens.before), entry).rays, down)
     out = cross(cross(at_back.rays, up).rays, exit).rays

@@ -1,9 +1,9 @@
-"""Flux tubes: a grid of rays whose quads carry the light between them, cut exactly at the pixel borders.
+"""Flux tubes: a grid of rays whose quads carry the light and are clipped exactly at the pixel borders.
 
-The corners of a grid of tubes are traced to the screen.  A tube of flux F lands on two triangles with F / 2 each,
-spread evenly over their areas, and each pixel takes the fraction that falls into it.  The picture has no noise: its
-error is the error of linear interpolation between the corners and falls as the square of their distance.  The picture
-is differentiable in the landing points, whereas the count of rays in a pixel is not.
+The corners of a grid of tubes are traced to the screen.  A tube of flux F lands on two triangles.  Each carries F / 2,
+spread uniformly over its area, and each pixel receives the part inside it.  The picture has no noise: its error is that
+of linear interpolation between the corners and falls as the square of their distance.  The picture is differentiable in
+the landing points, whereas the number of rays in a pixel is not.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ MAX_BAND_ROWS = 256  # maximum rows of tubes traced at a time for a picture; eve
 MAX_BAND_TUBES = 1 << 19  # maximum tubes traced at a time for a picture, which limits its memory
 MAX_RAYS_PER_BAND = 1 << 17  # maximum rays traced at a time in plain torch: a megabyte per quantity
 PARTS_PER_SIDE = 4  # parts per side of a tube that is partly lit
-MIN_TRIANGLE_AREA = 1e-9  # smallest area of a triangle that is cut (pixel²); a smaller one falls into one pixel
-COARSE_GRID_POINTS = 65  # points per side of the coarse grid on which the rays to given points are found first
-MAX_BROYDEN_STEPS = 30  # maximum number of Broyden steps of that search
-RAY_TOLERANCE = 1e-8  # distance from its point at which a ray counts as found, as a fraction of the grid's extent
+MIN_TRIANGLE_AREA = 1e-9  # smallest area of a triangle that is clipped (pixel²); smaller ones count in one pixel
+COARSE_GRID_POINTS = 65  # points per side of the coarse grid on which `rays_to` solves first
+MAX_BROYDEN_STEPS = 30  # maximum number of Broyden steps of `rays_to`
+RAY_TOLERANCE = 1e-8  # largest distance between a ray found and its point, as a fraction of the grid's extent
 RELATIVE_DIFFERENCE_STEP = 1e-6  # step of the difference quotients, as a fraction of the grid's extent
-MIN_BROYDEN_DIVISOR = 0.1  # smallest divisor of Broyden's update relative to the squared step; below: no update
+MIN_BROYDEN_DIVISOR = 0.1  # smallest divisor of a Broyden update, relative to the squared step
 
 
 @dataclass(frozen=True)
@@ -51,15 +51,15 @@ class Tubes:
     flux: Tensor  # flux launched in each tube (rows, columns), as a fraction of the source's
 
     def landing(self, lens: Lens, plane: Receiver) -> Landed:
-        """Trace the corners to the receiver; the outlines already count in the flux, so that no corner is lost."""
+        """Trace the corners to the receiver, without outlines: `flux` already excludes the light that they stop."""
         return from_first_net(self.rays, lens.unbounded(), plane)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
-        """Return (flux in each pixel, row 0 = y max; Σ flux · (pixels outside the border)²) of whole tubes."""
+        """Return (flux in each pixel, row 0 = y max; Σ flux · (pixels outside the border)²) of tubes that arrive."""
         return collect(screen.pixels_of(corners.position.double()), self.arriving_flux(corners), screen.shape)
 
     def transmitted_flux(self, corners: Landed) -> Tensor:
-        """Return the flux of each tube (rows, columns) after losses at faces and in glass, even with lost corners."""
+        """Return the flux of each tube (rows, columns) after losses at faces and in glass, also with lost corners."""
         return self.flux * middle(corners.flux) if corners.taken else self.flux
 
     def arriving_flux(self, corners: Landed) -> Tensor:
@@ -73,11 +73,12 @@ class Tubes:
 
 @torch.no_grad()
 def launch_tubes(source: Emitter, lens: Lens, n: int) -> Tubes:
-    """Launch n x n tubes that hold all the light which gets through both faces of the lens.
+    """Launch n x n tubes that carry all the light which both faces of the lens transmit.
 
     If the net has different numbers of control points along x and y, about n² tubes are launched, in the proportion of
-    its spans under the light.  The sheet covers the beam's cross-section if all of the beam gets through, else the back
-    face; its rim is the rim of the light.  A partly lit tube carries the flux of its lit part, spread over all of it.
+    its spans under the light.  The sheet covers the beam's cross-section if the lens transmits all of the beam, else
+    the back face; its rim is the rim of the light.  A partly lit tube spreads the flux of its lit part over its whole
+    area.
     """
     sheet = _sheet(source, lens, n)
     flux: list[Tensor] = []
@@ -102,7 +103,7 @@ def picture(
 
     few: tubes per side of the sheet from which finer sheets are interpolated, where the lens cuts the beam.
     over_the_back: spread the tubes over the back face even where the lens does not cut the beam.  Pictures of lenses
-    that differ little then have similar errors, whether or not they just cut the beam.
+    that differ little then have similar errors, even if only some of them cut the beam.
     """
     sheet = _sheet(source, lens, n, few=few, over_the_back=over_the_back)
     flux = torch.zeros(screen.shape, dtype=torch.float64, device=lens.like.device)
@@ -123,7 +124,7 @@ class _Sheet:
 
 
 def _bands(count: int, size: int) -> Iterator[slice]:
-    """Yield the rows of corners of bands of `size` rows of tubes, `count` rows in total."""
+    """Yield the slices of rows of corners of bands of `size` rows of tubes; count: rows of tubes in total."""
     for first in range(0, count, size):
         yield slice(first, min(first + size, count) + 1)
 
@@ -153,7 +154,7 @@ def _tubes(source: Emitter, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tube
 
 
 def _density(source: Emitter, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | None) -> Tensor:
-    """Return each tube's flux per mm² of the vertex plane; lit: True for corners that are lit, None: all are."""
+    """Return each tube's flux per mm² of the vertex plane; lit: True for lit corners; None: all are lit."""
     density = source.irradiance(middle(x), middle(y), lens.entrance.z)
     if lit is not None:
         count = middle(lit.to(density))
@@ -165,12 +166,12 @@ def _density(source: Emitter, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | No
 
 
 def _sheet(source: Emitter, lens: Lens, n: int, few: int = SHEET_TUBES, over_the_back: bool = False) -> _Sheet:
-    """Return the sheet over the beam if all of the beam gets through, else or on request the sheet over the back."""
+    """Return the sheet over the beam; over the back face if the lens cuts the beam, or if `over_the_back` is True."""
     return (None if over_the_back else _over_the_beam(source, lens, n)) or _over_the_back(source, lens, n, few)
 
 
 def _over_the_beam(source: Emitter, lens: Lens, n: int) -> _Sheet | None:
-    """Return a sheet over all of the beam; None if the lens cuts it."""
+    """Return a sheet over the whole beam; None if the lens cuts the beam."""
     z = lens.entrance.z
     spot, centre = source.spot(z)
     if spot is None:
@@ -194,9 +195,9 @@ def _over_the_beam(source: Emitter, lens: Lens, n: int) -> _Sheet | None:
 
 
 def _over_the_back(source: Emitter, lens: Lens, n: int, few: int) -> _Sheet:
-    """Return a sheet whose rim meets the rim of the back face; a fine one is interpolated from a coarse one by splines.
+    """Return a sheet whose rim meets the rim of the back face; splines interpolate a fine sheet from a coarse one.
 
-    Only the rim must be exact: a tube may lie anywhere as long as it has the flux of its own quad.
+    Only the rim must be exact: a tube may lie anywhere as long as it carries the flux of its quad.
     """
     from scipy.interpolate import RectBivariateSpline  # slow to import, and not needed for a plan
 
@@ -218,7 +219,7 @@ def _over_the_back(source: Emitter, lens: Lens, n: int, few: int) -> _Sheet:
 
 
 def _proportioned(lens: Lens, light: Outline, n: int) -> Sides:
-    """Return the tubes per side: n, or over an oblong net about n² in the proportion of its spans inside `light`."""
+    """Return the tubes per side: n; for an oblong net about n² in all, in proportion to its spans inside `light`."""
     net = lens.nets[-1]
     if net.shape[0] == net.shape[1]:
         return n
@@ -240,7 +241,7 @@ def _partly_lit(source: Emitter, lens: Lens, x: tuple[Tensor, ...], y: tuple[Ten
 
 
 def _getting_through(source: Emitter, lens: Lens, x: Tensor, y: Tensor) -> Tensor:
-    """Return the flux density (n,) (1/mm²) at points of the first plane, zero where the lens cuts the light."""
+    """Return the flux density (n,) (1/mm²) at points of the first plane, zero where the lens blocks the light."""
     receiver = LevelPlane(lens.back.z + 1.0)  # any plane behind the lens
     if lens.losses is None and (fast := whole_kernel("trace.land", source, lens, receiver)):
         landed = fast(source, lens, receiver, x=x.double(), y=y.double())
@@ -276,10 +277,10 @@ def rays_to(
     """Find the rays that meet an interface of the lens at the points (x, y), a grid (rows, columns) in mm.
 
     number: number of the interface; None: the back.  Returns x and y (mm) at which the rays cross the vertex plane of
-    the first surface, and the rays at the interface, in front of it.
+    the first surface, and the rays at the interface, not yet deflected.
 
-    Broyden's method is used, from a Jacobian of difference quotients; on a fine grid start and Jacobian come from a
-    coarse one.
+    Broyden's method starts from a Jacobian of difference quotients.  On a fine grid the initial points and Jacobian
+    are interpolated from the solution on a coarse grid.
     """
     x, y = (p.to(lens.like.device) for p in (x, y))
     number = lens.number_of("back") if number is None else number
@@ -341,7 +342,7 @@ def _inverse_jacobian(arrive: Callable[..., Rays], step: float, p: Tensor, q: Te
 
 
 def _broyden_update(inverse: list[Tensor], step: tuple[Tensor, Tensor], shift: tuple[Tensor, Tensor]) -> list[Tensor]:
-    """Return Broyden's update of each inverse Jacobian B, so that B shift = step; shift: the last step of the hit."""
+    """Return Broyden's update of each inverse Jacobian B, so that B shift = step; shift: last change of the hits."""
     xx, xy, yx, yy = inverse
     (s_x, s_y), (m_x, m_y) = step, shift
     off_x, off_y = s_x - (xx * m_x + xy * m_y), s_y - (yx * m_x + yy * m_y)
@@ -410,7 +411,7 @@ def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple
 
 
 def _triangles(corner: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the three corners (2, 2 n m) of both triangles of each quad; the diagonal alternates between quads."""
+    """Return the three corners (2, 2 n m) of the two triangles of each quad; the diagonal alternates between quads."""
     p0, p1, p2, p3 = corner[:, :-1, :-1], corner[:, 1:, :-1], corner[:, 1:, 1:], corner[:, :-1, 1:]
     i, j = (torch.arange(k, device=corner.device) for k in p0.shape[1:])
     even = ((i[:, None] + j) % 2 == 0).expand_as(p0)
@@ -424,8 +425,8 @@ def _pieces(start: Tensor, end: Tensor, sizes: tuple[int, int]) -> tuple[Tensor,
     """Return (edge, s at its start, s at its end, column, row) of each piece of an edge between pixel borders.
 
     s runs from 0 to 1 along the edge.  Outside the screen (columns, rows) edges are not split.  The pixel of a piece
-    follows from the borders crossed before it.  Its midpoint would not do: where an edge meets the corner of a pixel a
-    piece has no length, and rounding would decide on its pixel, while the derivatives of its ends still count.
+    follows from the borders crossed before it.  The midpoint of the piece would fail: where an edge meets the corner of
+    a pixel a piece has no length, and rounding would select its pixel, although the derivatives of its ends count.
     """
     edges = torch.arange(start.shape[1], device=start.device)
     parts = [(edges, torch.zeros_like(start[0]), torch.full_like(edges, -1))]  # edges, starts s, axes of the borders

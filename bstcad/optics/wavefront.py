@@ -6,7 +6,7 @@ two of the direction cosines of the rays, and d = (W_x, W_y, sqrt(1 - W_x² - W_
 Principles of Optics, section 3.1).
 
 Sign: where W is larger the path is longer, and the wavefront lags behind; where W is smaller it runs ahead.  Rays go
-towards larger W: a diverging wave has W > 0 around its axis, like a positive Noll 4, and a converging one W < 0.
+towards larger W: a diverging wave has W > 0 around its axis, as Noll's Z_4 with c_4 > 0.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ SAMPLES_PER_SIDE = 129  # grid points per side of a Zernike circle, at which the
 Place = tuple[float, float]
 
 Z = Key("Plane behind the lens on which the wavefront is stated and measured.", "mm", -1e8, 1e8, example=40.0)
-WEIGHT = Key("Weight of the wavefront against the pictures.", "", 0.0, 1e9, example=2.0)
+WEIGHT = Key("Weight of the wavefront relative to the pictures.", "", 0.0, 1e9, example=2.0)
 LIGHT_DIRECTION = "Direction of the light, of any length."
-FOCUS = "Centre of the sphere: behind z light converges, before it diverges."
+FOCUS = "Centre of the sphere. Behind z, light converges to the focus; before z, light diverges from it."
 COEFFICIENTS = "Coefficients in waves (main wavelength), in Noll's order from j = 1."
 
 
@@ -80,10 +80,10 @@ class PlaneWave(_Wave):
         return torch.stack([torch.full_like(x, part) for part in self.normal])
 
     def complaints(self, back: float) -> Iterator[str]:
-        """Yield, besides the common reasons, a direction that does not lead away from the lens."""
+        """Yield the common reasons, and a sentence if the direction does not lead away from the lens."""
         yield from super().complaints(back)
         if not self.direction[2] > math.cos(MAX_RAY_ANGLE) * math.hypot(*self.direction):
-            yield "direction: it does not point along +z, away from the lens; give one such as [0.0, 0.0, 1.0]"
+            yield f"direction: {list(self.direction)} does not point along +z; give a vector such as [0.0, 0.0, 1.0]"
 
 
 @dataclass(frozen=True)
@@ -121,10 +121,10 @@ class SphericalWave(_Wave):
         return self.sense * from_focus / length(from_focus)
 
     def complaints(self, back: float) -> Iterator[str]:
-        """Yield, besides the common reasons, a focus in the plane, where a sphere has no wavefront."""
+        """Yield the common reasons, and a sentence if the focus is in the plane, where a sphere has no wavefront."""
         yield from super().complaints(back)
         if not abs(self.centre[2]) >= MIN_FOCUS_DISTANCE:
-            yield f"focus: it lies in the plane at z = {self.z:g}; move one of the two along z"
+            yield f"focus: the point lies in the plane at z = {self.z:g}; move the point or the plane along z"
 
 
 @dataclass(frozen=True)
@@ -132,13 +132,13 @@ class ZernikeWave(_Wave):
     """Wave W = λ Σ_j c_j Z_j((x - c_x) / a, (y - c_y) / a), Noll's orthonormal polynomials (zernike.py), j = 1, 2, ….
 
     c_j are waves RMS over the circle of radius a about (c_x, c_y).  The wave is not stated outside the circle, where
-    `path` and `directions` extrapolate the polynomials as far as these have rays.
+    `path` and `directions` extrapolate the polynomials where |∇W| < 1.
     """
 
     coefficients: Annotated[tuple[float, ...], Key(COEFFICIENTS, "", -1e6, 1e6, example=[0.0, 0.0, 0.0, 1.5])]
     radius: Annotated[float, Key("Radius of the circle.", "mm", 1e-3, 1e6, example=10.0)]
     z: Annotated[float, Z]
-    centre: Annotated[Place, Key("Middle of the circle.", "mm", -1e8, 1e8, example=[2.0, 0.0])] = (0.0, 0.0)
+    centre: Annotated[Place, Key("Centre of the circle.", "mm", -1e8, 1e8, example=[2.0, 0.0])] = (0.0, 0.0)
     weight: Annotated[float, WEIGHT] = 1.0
     kind: Annotated[Literal["zernike"], Key("A wave stated by Zernike coefficients over a circle.")] = "zernike"
 
@@ -173,10 +173,10 @@ class ZernikeWave(_Wave):
         return w, w_x / self.radius, w_y / self.radius
 
     def complaints(self, back: float) -> Iterator[str]:
-        """Yield, besides the common reasons, a missing list of coefficients."""
+        """Yield the common reasons, and a sentence if the list of coefficients is empty."""
         yield from super().complaints(back)
         if not self.coefficients:
-            yield "coefficients: the list is empty; give some, such as [0.0, 0.0, 0.0, 1.5], or kind = 'plane'"
+            yield "coefficients: the list is empty; give at least one, such as [0.0, 0.0, 0.0, 1.5], or kind = 'plane'"
 
 
 Wave = PlaneWave | SphericalWave | ZernikeWave

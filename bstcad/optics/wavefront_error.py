@@ -7,11 +7,11 @@ of Malus and Dupin S is the eikonal of the light on that plane, as W (wavefront.
     OPD = S - W,   ∇OPD = (d_x, d_y) - (w_x, w_y),
 
 with d and w the directions of the ray and of the goal wave at its position; a positive OPD is light that arrives late.
-An OPD at a reference sphere, or perpendicular to the goal direction, differs by the square of the angle of d and w.
+An OPD at a reference sphere, or perpendicular to the goal direction, differs to second order in the angle of d and w.
 
-Piston (a constant) is no error of a wavefront; tilt (a linear part in x and y) deflects the light, and moves the focus
-of a spherical wave.  Both are fitted by least squares, weighted by flux, and figures are given without piston and
-without piston and tilt.
+Piston (a constant) is not an error of a wavefront; tilt (a linear part in x and y) deflects the light, and moves the
+focus of a spherical wave.  Piston and tilt are fitted by least squares, weighted by flux; figures are given without
+piston, and without piston and tilt.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from bstcad.optics.wavefront import MM_PER_NM, Wave, length
 RAYS_PER_SIDE = 512  # rays per side of the light before the lens
 MAX_MAP_CELLS = 256  # largest number of cells per side of the map
 RAYS_PER_BAND = 1 << 17  # rays traced at a time: a megabyte for each quantity
-ROUNDINGS_PER_SEGMENT = 4  # roundings of a path segment: both ends, length and sum
+ROUNDINGS_PER_SEGMENT = 4  # roundings of a path segment: two ends, length and sum
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class ExitPupil:
 def exit_pupil(source: Emitter, lens: Lens, z: float, n: int = RAYS_PER_SIDE) -> ExitPupil:
     """Return the light of a point or parallel source that passes the lens, on the plane z (mm)."""
     if source.extent is not None:
-        raise ValueError("an extended source has no single wavefront; take one of its points or directions")
+        raise ValueError("an extended source has no single wavefront; pass one of its points or directions")
     lens, source = lens.plain(), source.central
     area = clear_window(source, lens)
     x, y = sampling.grid(area, n)
@@ -73,9 +73,9 @@ def exit_pupil(source: Emitter, lens: Lens, z: float, n: int = RAYS_PER_SIDE) ->
 
 
 def move_pupil(pupil: ExitPupil, motion: Motion, z: float) -> ExitPupil:
-    """Return the light of a pupil on the plane z (mm) after a motion, again on the plane z.
+    """Return the light of a pupil on the plane z (mm) after a motion, traced to the same plane z.
 
-    It is the light of a moved lens in the frame of the goal wave.
+    The motion brings the light of a moved lens into the frame of the goal wave.
     """
     position = torch.stack([pupil.x, pupil.y, torch.full_like(pupil.x, z)])
     turns, about = motion.rotation.tolist(), motion.point((0.0, 0.0, 0.0))
@@ -113,7 +113,7 @@ def optical_path(source: Emitter, lens: Lens, rays: Rays, z: float) -> tuple[Ray
 
 
 def path_from_reference(source: Emitter, z: float, rays: Rays, sense: int) -> Tensor:
-    """Return the path (mm) of rays to the first surface from their reference; z: its vertex, sense: of the light."""
+    """Return the path (mm) of rays from their reference to the first surface; z: vertex of the surface (mm)."""
     position = torch.stack([*rays.position[:2], rays.above(z)])
     return source.reference(position, z, sense)
 
@@ -178,7 +178,7 @@ def wavefront_error(source: Emitter, lens: Lens, wave: Wave, n: int = RAYS_PER_S
 
 @torch.no_grad()
 def residual(pupil: ExitPupil, wave: Wave, nm: float) -> Tensor:
-    """Return the OPD (n, n) without piston and tilt, in waves of nm, times sqrt(flux fraction); 0: ray not compared.
+    """Return the OPD (n, n) without piston and tilt, in waves of nm, times sqrt(flux fraction); 0 if not compared.
 
     The root of its sum of squares is the RMS.  Raises ValueError if no ray can be compared.
     """
@@ -214,7 +214,7 @@ class _Fit:
 
 
 def _least_squares(x: Tensor, y: Tensor, opd: Tensor, share: Tensor) -> _Fit:
-    """Return the flux-weighted plane fit; about the mean position its normal equations decouple."""
+    """Return the flux-weighted plane fit about the mean position, where piston and slopes decouple."""
     mean_x, mean_y = (float(total(share * p)) for p in (x, y))
     typical = float(opd[0])  # subtracted first, since paths are long and their differences short
     piston = typical + float(total(share * (opd - typical)))
