@@ -1,12 +1,12 @@
 """The penalty on the thickness of the glass between two freeform faces, everywhere inside the outline.
 
-If the front is tailored, a lens that is too thin cannot be corrected by a move of the back along z: both faces shape
-the light, and a move changes where the light of the front meets the back.  So the heights of both faces are penalised.
+If the front is tailored, a lens that is too thin cannot be corrected by a shift of the back along z: each face shapes
+the light, and a shift changes where the light from the front meets the back.  So the heights of both are penalised.
 
-In a cell of a grid no coarser than either net, each face depends on at most four by four control points, and lies
-between the lowest and the highest of them.  By this bound tiles of many cells are excluded in one pass over the nets,
-and then single cells.  In the cells left, the thickness is computed at points a quarter of a cell apart.  (Numpy, in
-one thread: the work is too small for more.)
+In a cell of a grid no coarser than either net, each face depends on at most 4 x 4 control points, and lies between
+the lowest and the highest of them.  With this bound, tiles of many cells are excluded in one pass over the nets, and
+then single cells.  In the remaining cells the thickness is computed at points a quarter of a cell apart.  (Numpy runs
+in one thread: the work is too small for several threads.)
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from bstcad.scene.blank import Bounds
 
 PENALTY_MARGIN = 0.01  # distance from a bound at which the penalty begins, relative to the bound
 QUARTER_RIM_POINTS = 1025  # points along a quarter of the rim
-CELL_POINTS = 4  # control points along each axis on which a cell may depend: those of two knot spans
-TILE_CELLS = 16  # cells along each axis in a tile
-CELL_ROUNDING = 1e-9  # rounding of the number of cells, so that nets as fine as the cells do not add one
+CELL_POINTS = 4  # control points per axis on which a cell may depend: it lies in at most two knot spans
+TILE_CELLS = 16  # number of cells per axis in a tile
+CELL_ROUNDING = 1e-9  # allowance in the number of cells per axis, so that rounding adds no cell to an exact number
 
 
 def unit(lens: Lens, bounds: Bounds) -> float:
-    """Return max(thinnest, PENALTY_MARGIN |z_back - z_front|) (mm), by which violations are divided; 1 if it is 0.
+    """Return max(thinnest, PENALTY_MARGIN |z_back - z_front|) (mm), the unit of the excess; 1 if this is 0.
 
-    It does not depend on the heights of the faces, and does not contribute to the gradient.
+    The unit does not depend on the heights of the faces, and so does not contribute to the gradient.
     """
     return max(bounds.thinnest, PENALTY_MARGIN * abs(lens.back.z - lens.front.z)) or 1.0
 
@@ -45,9 +45,9 @@ def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], flo
     """Return (penalty, its gradients (1/mm), largest excess) of the thickness t over its bounds.
 
     The excess is e = max(thinnest - t, t - thickest) / unit everywhere, and e = (edge - t) / unit along the rim.  The
-    penalty is the mean of max(e + m, 0)² over all points of the grid, m = PENALTY_MARGIN.  The largest excess is -m if
-    no point is closer to a bound.  The gradients are in the heights of front and back, by the number of the face; {} if
-    no point is close.  Both nets have the same precision.  Sums have fixed parts: no bit depends on threads.
+    penalty is the mean of max(e + m, 0)² over all points of the grid, with m = PENALTY_MARGIN.  The largest excess is
+    -m if every e < -m; then the gradients are {}.  The gradients with respect to the heights have the number of the
+    face as key.  The sums are divided into fixed parts, so that no bit depends on the number of threads.
     """
     length, square, worst = unit(lens, bounds), 0.0, -PENALTY_MARGIN
     front, back = lens.number_of("front"), lens.number_of("back")
@@ -69,9 +69,9 @@ def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], flo
 
 
 def _points_near_bounds(lens: Lens, bounds: Bounds, margin: float) -> Iterator[tuple[Tensor, Tensor, float, float]]:
-    """Yield x and y (mm) of points that may be within `margin` mm of a bound, the weight of one, the minimum thickness.
+    """Yield (x, y, weight of a point, minimum thickness) for points within `margin` of a bound, and some others; in mm.
 
-    Points of the rim have a mean of their own.
+    The points along the rim come last, with weights that have the sum 1 themselves.
     """
     grid = CellGrid.over(lens)
     for x, y in grid.near(lens, bounds, margin):
@@ -82,7 +82,7 @@ def _points_near_bounds(lens: Lens, bounds: Bounds, margin: float) -> Iterator[t
 
 
 def _excess(lens: Lens, x: Tensor, y: Tensor, bounds: Bounds) -> tuple[Tensor, Tensor]:
-    """Return the excess (mm) over the nearer bound of the thickness, and 1 if that is the maximum, -1 otherwise."""
+    """Return the excess (mm) of the thickness over the nearer bound, and 1 if this is the maximum, -1 otherwise."""
     front, back = (evaluate(net.heights, *net.along_net(x, y))[0] for net in (lens.front_net, lens.back_net))
     glass = (lens.back.z - lens.front.z) + back - front
     thin = bounds.thinnest - glass
@@ -113,13 +113,13 @@ class CellGrid:
 
     @property
     def points(self) -> int:
-        """Number of points of the grid at which the thickness counts."""
+        """Number of points of the grid at which the thickness is computed."""
         return math.prod(self.count) * len(QUARTERS) ** 2
 
     def near(self, lens: Lens, bounds: Bounds, margin: float) -> Iterator[tuple[Tensor, Tensor]]:
         """Yield x and y (mm) of the points in cells that may be within `margin` mm of a bound, inside the outline.
 
-        Points up to half of a cell's diagonal outside count too, so that the rim is covered.
+        Points up to half of a cell's diagonal outside the outline are included, so that the rim is covered.
         """
         reach = math.hypot(*self.size) / 2
         for cells in torch.from_numpy(self._near(lens, bounds, margin)).split(SPANS_AT_A_TIME):
@@ -132,7 +132,7 @@ class CellGrid:
                 yield x[within].to(lens.like), y[within].to(lens.like)
 
     def _near(self, lens: Lens, bounds: Bounds, margin: float) -> np.ndarray:
-        """Return indices (n, 2) of the cells that may be within `margin` of a bound, by their control points."""
+        """Return the indices (n, 2) of the cells whose control points may be within `margin` mm of a bound."""
         nets = lens.front_net, lens.back_net
         front, back = ((net.heights.detach().cpu().numpy(), self._first_points(net)) for net in nets)
         distance = lens.back.z - lens.front.z
@@ -145,7 +145,7 @@ class CellGrid:
         return np.argwhere(near)
 
     def _at(self, cells: Sequence[Tensor], s: float) -> tuple[Tensor, Tensor]:
-        """Return x and y (mm) of the points at the fraction s of each of some cells."""
+        """Return x and y (mm) of the points at the fraction s of the width and height of each cell."""
         x, y = ((k + s) * size - half for k, size, half in zip(cells, self.size, self.half, strict=True))
         return x, y
 
@@ -170,7 +170,7 @@ def _cell_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: n
     """Return the lowest (np.minimum) or highest (np.maximum) control point of each cell (mm)."""
     for axis, begin in enumerate(begins):
         heights = np.moveaxis(heights, axis, 0)
-        for step in (1, 2):  # extremes of two neighbours, then of four
+        for step in (1, 2):  # extremes of two neighbouring control points, then of four
             heights = extreme(heights[:-step], heights[step:])
         heights = np.moveaxis(heights[begin], 0, axis)
     return heights

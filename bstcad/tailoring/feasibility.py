@@ -1,15 +1,15 @@
 """Feasibility of two freeform faces: a check on coarse grids, before the long stages, that they can meet all goals.
 
-The goals determine the rays behind the lens (light_behind.py).  These determine where the light meets the back, and by
-which angle the front has to turn it towards these points.  A design is infeasible for one of three reasons: rays would
-have to cross between lens and target, light would have to leave the back outside of the outline, or the front would
-have to turn light by more than refraction can.
+The goals determine the rays behind the lens (light_behind.py).  These rays determine where the light meets the back,
+and by which angle the front has to deflect it.  A design is infeasible for one of three reasons: rays would have to
+cross between lens and target, light would have to leave the back outside of the outline, or the front would have to
+deflect light by more than refraction can.
 
-At an index of 1.49 a front can turn light by 48 degrees.  A back that turns it back by as much is nearly vertical, and
-faces that start so stay so.  Where the front would have to turn light by more than MAX_GENTLE_TURN, stage 1 therefore
-raises the dark parts of the furthest picture, which cause the largest turns; stage 2 uses the picture itself.  (Two
-faces 6 mm apart that have to turn light by 38 degrees, for a square and letters: RRMSD 0.34 and 0.63 after 100
-evaluations of each round without, 0.37 and 0.48 with it.)
+At an index of 1.49 a front can deflect light by up to 48 degrees.  A back that cancels this deflection is nearly
+vertical, and remains so in stage 2.  If the front would have to deflect light by more than MAX_GENTLE_TURN, stage 1
+therefore raises the dark parts of the furthest picture, which cause the largest deflections; stage 2 uses the picture
+itself.  (Example: two faces 6 mm apart that have to deflect light by 38 degrees, for a square and letters.  RRMSD 0.34
+and 0.63 after 100 evaluations per round without this floor, 0.37 and 0.48 with it.)
 """
 
 from __future__ import annotations
@@ -35,28 +35,28 @@ TRIAL_CELLS, TRIAL_PIXELS = 64, 128  # cells and pixels per side of the coarse g
 TRIAL_ITERATIONS = 100  # iterations of the coarse maps
 MAX_UNSERVED = 0.5  # largest fraction of the light that two faces may fail to serve
 REPORTED_FRACTION = 1e-3  # smallest fraction of the light that is reported as not served
-MAX_GENTLE_TURN = 30.0  # largest turn at the front without a floor under the furthest picture (degrees)
-TRIED_FLOORS = (0.1, 0.2, 0.4, 1.0)  # floors relative to the mean of the furthest picture; the first that suffices
-SOLUTION_NAMES = {1.0: "convex", -1.0: "concave"}  # names by the sign σ
+MAX_GENTLE_TURN = 30.0  # largest deflection at the front for which the furthest picture needs no floor (degrees)
+TRIED_FLOORS = (0.1, 0.2, 0.4, 1.0)  # floors, relative to the mean of the furthest picture, tried in this order
+SOLUTION_NAMES = {1.0: "convex", -1.0: "concave"}  # names of the solutions with the sign σ of light_behind.py
 
 
 @dataclass(frozen=True)
 class Demand:
-    """Angles and losses that the goals require of a lens, for one of the two solutions."""
+    """Deflections and losses that the goals cause in a lens, for one of the two solutions."""
 
     solution: float  # sign σ of light_behind.py
     angle: float  # largest angle to the axis at which light leaves the lens (degrees)
-    rms_angle: float  # RMS of this angle over the rays (degrees)
+    rms_angle: float  # RMS angle to the axis over the rays (degrees)
     crossed: float  # fraction of the light whose rays would cross between lens and target
     outside: float  # fraction of the light that would leave the back outside of the outline
-    turn: float  # largest angle by which the front turns light (degrees); NaN: not computed
-    limit: float  # largest angle by which a front can turn light (degrees)
+    turn: float  # largest angle by which the front deflects light (degrees); NaN: not computed
+    limit: float  # largest angle by which a front can deflect light (degrees)
     floor: float = 0.0  # irradiance, relative to the mean, to which stage 1 raises the furthest picture
-    lifted_turn: float = math.nan  # largest turn with this floor (degrees)
+    lifted_turn: float = math.nan  # largest deflection by the front with this floor (degrees)
 
     @property
     def rank(self) -> tuple[float, float]:
-        """Sort key, smallest for the best solution: the fraction not served, then the angles."""
+        """Sort key, smallest for the best solution: the fraction of the light not served, then the RMS angle."""
         lost = self.crossed + self.outside
         return (lost if lost > REPORTED_FRACTION else 0.0), self.rms_angle
 
@@ -64,33 +64,33 @@ class Demand:
         """Yield a sentence on the angles, then one per failure with its remedy; thickness: centre thickness (mm)."""
         yield (
             f"{SOLUTION_NAMES[self.solution]} solution: light leaves the lens at up to {self.angle:.3g} degrees from "
-            f"the axis, and the front turns it by up to {self.turn:.3g} degrees"
+            f"the axis, and the front deflects it by up to {self.turn:.3g} degrees"
         )
         if self.floor:
             yield (
                 f"stage 1 raises the dark parts of the furthest target to {100 * self.floor:g} % of its mean "
-                f"irradiance, so that the front turns light by up to {self.lifted_turn:.3g} degrees only"
+                f"irradiance, so that the front deflects light by at most {self.lifted_turn:.3g} degrees"
             )
         if self.crossed > REPORTED_FRACTION:
             yield (
                 f"rays of {100 * self.crossed:.3g} % of the light would have to cross between the lens and the nearest "
-                "target, and there the further targets are met only approximately; bring the nearest target closer to "
-                "the lens, or move the others further away"
+                "target, so the further targets get their pictures only approximately; bring the nearest target closer "
+                "to the lens, or move the others further away"
             )
         if self.outside > REPORTED_FRACTION:
             yield (
                 f"{100 * self.outside:.3g} % of the light would have to leave the back outside of lens.outline; "
-                "make the targets smaller, or the lens wider"
+                "make the targets smaller, or lens.outline wider"
             )
         if self.turn > self.limit:
             yield (
-                f"the front would have to turn light by {self.turn:.3g} degrees, but refraction turns it by at most "
-                f"{self.limit:.3g} degrees; make the lens thicker than {thickness:.3g} mm"
+                f"the front would have to deflect light by {self.turn:.3g} degrees, but refraction deflects it by at "
+                f"most {self.limit:.3g} degrees; make the lens thicker than {thickness:.3g} mm"
             )
 
 
 def find_demand(task: Task, lens: Lens) -> Demand:
-    """Return the demand of the task's solution, or else of the better one; lens: the blank, with both faces free."""
+    """Return the demand of the task's solution, or of the better one if the task states none; lens: the blank."""
     task = task.with_imaged_receivers(lens)
     both = (1.0,) if task.wave is not None else (1.0, -1.0)
     solutions = [_demand(task, sign, lens) for sign in (both if task.solution is None else (task.solution,))]
@@ -108,7 +108,7 @@ def find_demand(task: Task, lens: Lens) -> Demand:
 
 
 def _demand(task: Task, solution: float, lens: Lens) -> tuple[Demand, LightBehind]:
-    """Return the demand of a solution on coarse grids, without the turn, and its light behind the lens."""
+    """Return the demand of a solution on coarse grids, with turn = NaN, and its rays behind the lens."""
     knobs = task.knobs.model_copy(update={"transport_grid": TRIAL_CELLS, "transport_iterations": TRIAL_ITERATIONS})
     task = replace(with_pixels(task, TRIAL_PIXELS), knobs=knobs, solution=solution, progress=no_progress)
     light = light_behind.light_for_task(task)

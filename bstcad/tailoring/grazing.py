@@ -1,14 +1,14 @@
 """A penalty against total internal reflection, for designs that light their target up to the edge of its reach.
 
-Light that a face reflects totally misses the target and contributes no gradient, and near the critical angle a small
-ripple of the face suffices for it.  So the merit of a design whose target is cut to its reachable part has one more
-term, from the slopes of the face alone:
+Light that a face reflects totally misses the target and contributes no gradient.  Near the critical angle a small
+ripple of the face suffices for total reflection.  So the merit of a design whose target is cut to its reachable part
+has one more term, which depends on the slopes of the face alone:
 
     PENALTY_WEIGHT · mean over the light of max(0, u)²,    u = (η² sin² θ - sin² θ'_max) / (1 - sin² θ'_max)
 
-θ is the angle of incidence, and θ'_max the largest angle of refraction allowed (optics.reach.grazing_of): u = 0 there,
-and u = 1 at total internal reflection.  Within a knot span a slope is linear along its own axis and quadratic along the
-other, so the ends and the middles of spans show its extremes.
+θ is the angle of incidence, and θ'_max the largest angle of refraction allowed (optics.reach.grazing_of): u = 0 at
+θ'_max, and u = 1 at total internal reflection.  Within a knot span ∂z/∂x is linear in x and quadratic in y, and ∂z/∂y
+the reverse, so their values at the ends and centres of spans are close to the extremes.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from bstcad.tailoring.slope_map import face_grid, interpolate, lit_window, rays_
 
 PENALTY_WEIGHT = 100.0  # weight of the penalty relative to RRMSD²
 MAX_LIGHT_CELLS = 257  # largest number of cells per side of the grid from which the light is interpolated
-# u above which `without_reflection` penalises, and its largest accepted excess, as a fraction of 1 - PENALTY_START
+# value of u above which `without_reflection` adds its penalty; largest accepted (u - START) / (1 - START) after it
 PENALTY_START, ACCEPTED_EXCESS = 0.6, 0.5
 MAX_EVALUATIONS = 60  # largest number of evaluations of the penalty alone
 
 
 @dataclass(frozen=True)
 class Grazing:
-    """Penalty at the ends and middles of the knot spans of the last net, a function of its heights."""
+    """Penalty at the ends and centres of the knot spans of the last net, as a function of its heights."""
 
-    net: BSplineSurface  # net whose knots are used; its heights are not
-    at_face: Rays  # (3, m, n) rays that meet the face at these points of the lens it was made for, before refraction
+    net: BSplineSurface  # net whose knots are used; its heights are ignored
+    at_face: Rays  # (3, m, n) rays at these points before refraction, traced through the lens given to `of`
     weight: Tensor  # (m, n) fraction of the light at each point, sum 1
     eta: float  # ratio of the index before the face to that behind it
     angle: float  # θ'_max (rad)
@@ -59,7 +59,7 @@ class Grazing:
         x, y = np.meshgrid(*(low + pitch * _span_points(count) for (low, _), pitch, count in axes), indexing="ij")
         inside = (np.abs(x) <= window.width / 2) & (np.abs(y) <= window.height / 2)
         light = np.where(inside, interpolate(grid, grid.density[None], (x, y))[0].numpy(), 0.0)
-        weight = torch.from_numpy(maximum_filter(light, 5))  # spans that are lit in part count whole
+        weight = torch.from_numpy(maximum_filter(light, 5))  # a span that is lit in part gets its full weight
         rays, eta = rays_at(grid, (x, y)), own_lens.last_freeform.law.eta
         return cls(net, rays, weight / total(weight), eta=eta, angle=edge.angle)
 
@@ -80,15 +80,15 @@ class Grazing:
 
 
 def _span_points(m: int) -> np.ndarray:
-    """Return the ends and middles of the knot spans of m control points, in pitches."""
+    """Return the positions of the ends and centres of the knot spans of m control points, in control-point spacings."""
     ends = np.array([0.0, *(np.arange(1, m - 2) + 0.5), m - 1.0])
     return np.sort(np.concatenate([ends, (ends[1:] + ends[:-1]) / 2]))
 
 
 def without_reflection(lens: Lens, edge: Edge) -> Lens:
-    """Return the lens with its last net changed as little as needed for none of the light to be reflected totally.
+    """Return the lens with its last net changed just enough that the face reflects no light totally.
 
-    The penalty alone is minimised, and begins at u = PENALTY_START, where there is hardly any light.
+    The penalty alone is minimised; here it begins at u = PENALTY_START, which hardly any light reaches.
     """
     net, limit = lens.nets[-1], math.sin(edge.angle) ** 2
     penalty = replace(Grazing.of(edge, lens), angle=math.asin(math.sqrt(limit + PENALTY_START * (1 - limit))))

@@ -4,7 +4,7 @@ Behind a lens the rays of a point source or of collimated light are normal to wa
 Born and Wolf, Principles of Optics, section 3.1.2).  So their direction cosines on a plane A are the gradient of an
 eikonal.  The eikonal follows from a wavefront goal (`light_of_wave`), or from a picture on a second plane B
 (`between_targets`): light that crosses A at p shall meet B at t.  Let c be the direction cosines along A, and m the
-centroid of B's light.  Then
+centroid of the light on B.  The coordinate y in
 
     c(p, t) = (t - p) / |t - p|,    y = σ (c(p, t) - c(p, m)),
 
@@ -12,13 +12,13 @@ hardly depends on p for a fixed t, and p -> y is the gradient of a convex functi
 picture on A to the picture on B in the coordinates y.  The remaining dependence on p enters through the p that the
 previous round assigned to each t, as in slope_map.py.  In the convex solution, σ = 1, no two rays cross between the
 planes; in the concave solution, σ = -1, all do.  A is the nearest target, or the furthest one if the picture of the
-nearest has clearly more contrast: then rays are followed backwards.  If either picture has clearly more contrast, such
-as letters on black, the rays are those through its pixels.  Its black pixels then get no light at all, whatever the
-map does in the gaps between letters.
+nearest has clearly more contrast: then rays are followed backwards.  If one picture has clearly more contrast, such as
+letters on black, the rays pass through the corners of its pixels.  Its black pixels then get no light at all, whatever
+the map is in the gaps between letters.
 
 Between lens and nearest target the rays may cross, and then no lens can send them.  In the convex solution this happens
-where the light on B is much denser than on A, by more than the distances A-B and lens-A allow (an eigenvalue of ∂t/∂p
-above 1 + |AB| / |lens A|).  `without_crossings` returns the nearest rays that do not cross.
+where the light on A is much denser than on B (an eigenvalue of ∂t/∂p above 1 + |AB| / |lens A|).
+`without_crossings` returns the nearest rays that do not cross.
 """
 
 from __future__ import annotations
@@ -46,21 +46,21 @@ from bstcad.tailoring.slope_map import centroid, pixel_corners, resample_picture
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Points, Solver, grid_coordinates, solve
 
-MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds of the map; cells of the coarse ones: n // 4, minimum
-MAX_WAVE_ITERATIONS = 40  # largest number of iterations for the point of a wave whose ray meets a point of the target
+MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds of the map; cells per side of coarse ones: n / 4 or 64
+MAX_WAVE_ITERATIONS = 40  # largest number of iterations for the point of a wave that sends a ray to a given point
 WAVE_TOLERANCE = 1e-9  # change of this point at which the iterations have converged (mm)
-SOURCE_FLOOR = 0.02  # floor under the map's source picture, relative to the mean: a hole would be one in the map
-# Standard deviations (pixels) of the blur of the source picture, reduced in turn once the map is found.  For a portrait
-# with dark beside bright parts Newton's method ends at a mass error of 0.06 to 0.25 without, and of 0.003 with them.
+SOURCE_FLOOR = 0.02  # smallest irradiance of the map's source picture, relative to its mean: black would leave holes
+# Standard deviations (pixels) of the blur of the source picture, solved in this order.  For a portrait with dark parts
+# beside bright ones, Newton's method ends at a mass error of 0.06 to 0.25 without this blur, and at 0.003 with it.
 SOURCE_BLURS = (4.0, 2.0, 1.0)
-FINE_FACTOR = 2  # cells per side of the last map, relative to the transport's grid: letters cover much of a face
+FINE_FACTOR = 2  # cells per side of the last map, relative to the transport grid: letters get light from much of a face
 # Solver with floors under the target picture, relative to its mean, that are lowered in turn
 TARGETS_SOLVER = Solver(floors=(0.1, 0.03, 0.01, 0.003))
-CONTRAST_RATIO = 1.5  # ratio of contrasts above which the rays are those through the pixels of the sharper picture
+CONTRAST_RATIO = 1.5  # ratio of contrasts above which rays pass through pixel corners of the higher-contrast picture
 INTERSECTION_STEPS = 8  # Newton iterations for the intersection with a face
-CROSSING_TOLERANCE = 1e-4  # fraction of the light whose rays may cross, as rounding leaves it
+CROSSING_TOLERANCE = 1e-4  # fraction of the light up to which crossing rays count as rounding
 
-Picture = tuple[Screen, np.ndarray]  # screen, and flux in its pixels (rows, columns) of any sum
+Picture = tuple[Screen, np.ndarray]  # (screen, flux in its pixels (rows, columns), of any sum)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +72,12 @@ class LightBehind:
     picture: np.ndarray  # (r, c) flux of the tube between each four rays, row 0 = y max
 
     def reversed(self) -> LightBehind:
-        """Return these rays with both of their indices reversed."""
+        """Return the same rays, numbered backwards along both axes of the arrays."""
         position, direction = (v[:, ::-1, ::-1].copy() for v in (self.position, self.direction))
         return replace(self, position=position, direction=direction, picture=self.picture[::-1, ::-1])
 
     def positions_on(self, plane: Receiver) -> Points:
-        """Return x and y (mm) on a plane where the rays cross it, (c + 1, r + 1) each."""
+        """Return x and y (mm) of the points where the rays cross a plane, in its frame, each (c + 1, r + 1)."""
         (e_x, e_y, normal), (x, y) = _frame(plane), plane.origin
         off = np.array(plane.middle).reshape(3, 1, 1) - self.position
         off = _dot(normal, off) / _dot(normal, self.direction) * self.direction - off
@@ -113,16 +113,16 @@ class LightBehind:
     def directions_at(self, surface: Surface, x: Tensor, y: Tensor) -> Tensor:
         """Return the directions (3, m, n) in which light has to leave a surface at points x and y, (m, n) in mm.
 
-        They are interpolated linearly on the Delaunay triangles of the points where the rays meet the surface, so that
-        they vary linearly across the gap between two bright parts of a picture.  Outside the light they are those of
-        the nearest ray.  At most max(m, n) rays along each axis are used, at even spacing.
+        The directions are interpolated linearly on the Delaunay triangles of the points where the rays meet the
+        surface, and so vary linearly across the gap between two bright parts of a picture.  Outside the light the
+        direction of the nearest ray is used.  At most max(m, n) evenly spaced rays along each axis are used.
         """
         i, j = (np.linspace(0, m - 1, min(m, max(x.shape)), dtype=int) for m in self.position.shape[1:])
         every = np.ix_(np.arange(3), i, j)
         few = replace(self, position=self.position[every], direction=self.direction[every])
         met, directions = few.intersect(surface)[:2].reshape(2, -1).T, few.direction.reshape(3, -1).T
         at = np.stack([p.cpu().double().numpy().reshape(-1) for p in (x, y)], axis=-1)
-        with threadpool_limits(1, "blas"):  # LAPACK takes a 2 x 2 matrix of each triangle: one thread is faster
+        with threadpool_limits(1, "blas"):  # LAPACK inverts a 2 x 2 matrix per triangle: one thread is faster
             found = LinearNDInterpolator(met, directions)(at)
         outside = np.isnan(found[:, 0])
         found[outside] = directions[cKDTree(met).query(at[outside])[1]]
@@ -136,7 +136,7 @@ class LightBehind:
 
 
 def light_for_task(task: Task) -> LightBehind:
-    """Return the rays for the goals of a task: nearest target and wavefront, or nearest and furthest target."""
+    """Return the rays behind the lens for the nearest target and the wavefront, or the nearest and furthest target."""
     near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.receiver.plane.throw(0.0))
     if any(goal.receiver.plane.frame is None for goal in (near, far)):
         raise SceneError("target: a design for several targets needs planes; make each target a plane")
@@ -155,12 +155,12 @@ def light_for_task(task: Task) -> LightBehind:
 
 
 def corners(screen: Screen, parts: int) -> Points:
-    """Return x and y (mm) on a screen of the corners of its pixels cut into parts x parts, x first."""
+    """Return x and y (mm) of the corners of a screen's pixels, each divided into parts x parts; x is axis 0."""
     return pixel_corners(replace(screen, pixels=(parts * screen.columns, parts * screen.rows)))
 
 
 def subdivide(picture: np.ndarray, parts: int) -> np.ndarray:
-    """Return a picture with each pixel cut into parts x parts of equal flux."""
+    """Return a picture with each pixel divided into parts x parts of equal flux."""
     return np.kron(picture, np.ones((parts, parts)) / parts**2)
 
 
@@ -179,9 +179,9 @@ def _dot(vector: Vector, of: np.ndarray) -> np.ndarray:
 
 
 def light_of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength: float, parts: int) -> LightBehind:
-    """Return the rays of a wave through the pixels of a screen, cut into parts x parts; wavelength: nm.
+    """Return the rays of a wave through the corners of a screen's pixels, each divided into parts x parts.
 
-    SceneError if rays of the wave cross before the screen.
+    wavelength: nm.  SceneError if rays of the wave cross before the screen.
     """
     place, picture = in_space(screen.plane, *corners(screen, parts)), subdivide(picture, parts)
     if isinstance(wave, SphericalWave):  # each ray is the line through the focus
@@ -190,7 +190,7 @@ def light_of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength
     x, y = (torch.from_numpy(p) for p in place[:2])
     below = torch.from_numpy(wave.z - place[2])
     direction = wave.directions(x, y, wavelength)
-    for _ in range(MAX_WAVE_ITERATIONS):  # iterate the point of the wave's plane whose ray goes there
+    for _ in range(MAX_WAVE_ITERATIONS):  # iterate the point of the wave's plane from which the ray meets the corner
         path = below / direction[2]
         there = x + path * direction[0], y + path * direction[1]
         before, direction = direction, wave.directions(*there, wavelength)
@@ -208,9 +208,9 @@ def between_targets(
     """Return the rays through two pictures by transport on n x n cells.
 
     sign: σ, 1 for the convex and -1 for the concave solution.
-    The map leads from the near to the far picture, or back if the near one has clearly more contrast: a map to a
-    picture with holes converges more safely than a map from it.  The rays are about as dense as the cells, and denser
-    for a picture of high contrast, whose bright pixels have to resolve the other picture.
+    The map leads from the near to the far picture, or in reverse if the near one has clearly more contrast: a map to a
+    picture with holes converges more safely than a map from it.  The spacing of the rays is about that of the cells.
+    For a picture of high contrast it is smaller, since few bright pixels have to resolve the other picture.
     """
     contrasts = [float((p**2).mean() / p.mean() ** 2) for _, p in (near, far)]
     against = contrasts[0] > CONTRAST_RATIO * contrasts[1]  # True: rays are followed backwards, from far to near
@@ -255,9 +255,9 @@ def _normalised(way: np.ndarray) -> np.ndarray:
 
 
 def without_crossings(light: LightBehind, screen: Screen, surface: Surface, n: int) -> LightBehind:
-    """Return `light`, or if its rays cross between a surface and the screen the nearest light that does not.
+    """Return `light`, or if its rays cross between a surface and the screen, the nearest rays that do not.
 
-    Its flux on the surface is the same; the rays follow the optimal transport map from the screen, which crosses none.
+    The flux on the surface is the same.  The new rays follow the optimal transport map from the screen to the surface.
     """
     if light.crossed_fraction(surface) <= CROSSING_TOLERANCE:
         return light

@@ -1,13 +1,13 @@
 """Bounds on the tailored faces (scene/blank.py): curvature, slope and thickness, in stage 1, in stage 2 and at the end.
 
-A back that would come too near to the front, or cross it, is moved along +z as a whole: its slopes shape the light, its
-height hardly does, and the next rounds of stage 1 take the move into account.  If the front is tailored, a move changes
-the picture.  Then the minimum thickness is a bound like the others (clearance.py), even if the scene has none, and the
-back is moved only if a change of both faces does not suffice.
+A back that would be too near to the front, or cross it, is shifted along +z: the light depends on its slopes, hardly on
+its height, and the next rounds of stage 1 start from the shifted back.  If the front is tailored, a shift changes the
+picture.  Then the minimum thickness is a bound like the others (clearance.py), even if the scene has no bounds, and the
+back is shifted only if changes of both faces do not suffice.
 
 Stage 2 adds to its merit the mean squared excess over the bounds, on a grid four times finer than the knot spans.  Few
-spans are near a bound; differences of control points show which, and the others cost nothing.  The remaining excess is
-removed by minimising this penalty alone, which hardly changes the picture (`enforce_bounds`).
+spans are near a bound; differences of control points show which, and only these are evaluated.  The remaining excess
+is removed by minimising this penalty alone, which hardly changes the picture (`enforce_bounds`).
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ from bstcad.tailoring.minimise import lbfgs, minimise
 
 THICKNESS_POINTS = 513  # points per side at which the thickness is computed
 RELIEF_RESERVE = 0.02  # additional thickness for the changes of stage 2, relative to the sag range (PV) of the back
-BOUNDS_STAGE = "bounds on the back"  # name of a stage in the record
-BOUND_RESERVE = 1e-3  # distance to a bound, relative to it, for the rounding of files and points between the grid's
-# Weights of the mean squared relative excess, relative to RRMSD²: in the last round of a stage, the one before and so
-# on, and in an only round.  (A large weight from the start keeps the search near its start: the small lens of the
-# tests, with a minimum radius of 50 mm where it would take 20, ends at 0.015 with 1000 throughout, at 0.0033 with 10.)
+BOUNDS_STAGE = "bounds on the back"  # name in the record of the stage that enforces the bounds
+BOUND_RESERVE = 1e-3  # distance kept from a bound, relative to the bound: files round, and the grid misses extremes
+# Weights of the mean squared relative excess, relative to RRMSD²: by round, from the last one of a stage backwards,
+# and for a stage of one round.  (A large weight from the start keeps the search near its start: a small lens that
+# needs a radius of 20 mm but has a minimum of 50 mm ends at an RRMSD of 0.015 with 1000, and at 0.0033 with 10.)
 ROUND_WEIGHTS, ONLY_WEIGHT = (1000.0, 100.0, 10.0), 100.0
 REPAIR_EVALUATIONS = 100  # largest number of evaluations of the penalty alone
-HALVINGS = 10  # bisection steps between a lens that exceeds the bounds and one that does not
+HALVINGS = 10  # number of bisection steps between a lens that exceeds the bounds and a lens that meets them
 
 
 @torch.no_grad()
 def place_back(lens: Lens, z: float, least: float, bounds: Bounds | None = None) -> Lens:
-    """Return the lens with the plane of its back at `z` (mm), or just so far behind that the glass is `least` mm thick.
+    """Return the lens with the plane of its back at `z` (mm), or as far behind as a thickness of `least` mm requires.
 
-    With bounds, the minimum thickness at the rim and the maximum thickness are met too.  If they exclude each other,
-    the back violates both by the same length.
+    With bounds, the minimum thickness at the rim and the maximum thickness are met too.  If these are incompatible, the
+    thickness violates the minimum and the maximum by equal lengths.
     """
     x, y = thickness_points(lens)
     relative = lens.back.relative_sag_and_slope(x, y)[0]
@@ -87,14 +87,14 @@ def rim_points(lens: Lens) -> tuple[Tensor, Tensor]:
 
 
 def round_weight(number: int, rounds: int) -> float:
-    """Return the weight of the excess in a round of a stage."""
+    """Return the weight of the excess in round `number`, from 0, of the `rounds` rounds of a stage."""
     return ONLY_WEIGHT if rounds == 1 else ROUND_WEIGHTS[min(rounds - 1 - number, len(ROUND_WEIGHTS) - 1)]
 
 
 def active_bounds(lens: Lens, bounds: Bounds | None, least: float) -> Bounds | None:
-    """Return the bounds on the tailored faces: those of the scene; None: there are none.
+    """Return the bounds on the tailored faces; None: there are none.
 
-    If the front is tailored, a thickness of at least `least` mm is a bound even if the scene has none.
+    These are the bounds of the scene; without them a tailored front still requires a thickness of `least` mm.
     """
     return Bounds(thinnest=least) if bounds is None and lens.shapes("front") else bounds
 
@@ -103,9 +103,9 @@ def active_bounds(lens: Lens, bounds: Bounds | None, least: float) -> Bounds | N
 class Excess:
     """Excess of the tailored faces of a lens over their bounds."""
 
-    mean_square: float  # penalty: mean square over each face, relative to the bounds, from PENALTY_MARGIN before on
+    mean_square: float  # penalty E of `excess`
     gradients: tuple[Tensor, ...]  # gradients of the penalty in the heights (1/mm), (m, n) for each of Lens.nets
-    worst: float  # largest excess, relative to its bound; negative: there is none
+    worst: float  # largest excess, relative to its bound; negative: every bound is met
 
 
 def excess(lens: Lens, bounds: Bounds) -> Excess:
@@ -113,9 +113,8 @@ def excess(lens: Lens, bounds: Bounds) -> Excess:
 
     E = Σ_f mean max(q_f / b_f - 1 + m, 0)², m = PENALTY_MARGIN, over the tailored faces f and the bounds b_f > 0 on
     their quantities q_f, plus the penalty on the thickness.  A tool reaches the back from +z, where a valley of radius
-    R has the curvature κ = 1 / R of z.  It reaches the front from -z, where the heights are -z and curvatures change
-    their sign: a valley of the front, which bulges into the glass, is a ridge of z, κ = -1 / R.  |∇z| is the same from
-    both sides.
+    R has the curvature κ = 1 / R of z.  It reaches the front from -z, from where the heights are -z and the curvatures
+    have the opposite sign: a valley of the front is a ridge of z, with κ = -1 / R.  |∇z| is the same from both sides.
 
     Sums have fixed parts: no bit depends on the number of threads.
     """
@@ -170,7 +169,7 @@ def _shape_excess(net: BSplineSurface, outline: Outline, bounds: Bounds) -> tupl
 def _spans_near_bounds(
     net: BSplineSurface, outline: Outline, bounds: Bounds
 ) -> Iterator[tuple[Spans, Tensor, float, Callable[[Jet], Tensor]]]:
-    """Yield spans that may be near a bound, in blocks: spans, points inside the outline, bound, quantity."""
+    """Yield (spans, True for their points inside the outline, bound, quantity) for spans that may be near a bound."""
     for bound, upper_limit, quantity in (
         (bounds.concave, partial(bspline.curvature_bounds, net, 1.0), lambda jet: jet.curvatures[0]),
         (bounds.convex, partial(bspline.curvature_bounds, net, -1.0), lambda jet: -jet.curvatures[1]),
@@ -186,9 +185,9 @@ def _spans_near_bounds(
 def _thickness_excess(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]:
     """Return (penalty, its gradient, largest excess) of the thickness over its bounds, for a lens with one net.
 
-    The unit is the difference of the bounds, or the sag range of the back if less, so that a shift along z meets both.
+    The unit of the excess is the smaller of the difference of the bounds and the sag range (PV) of the back.
     """
-    assert bounds.thickest is not None, "without a maximum a move of the back meets the bounds"
+    assert bounds.thickest is not None, "without a maximum thickness a shift of the back meets the bounds"
     everywhere, net = thickness_points(lens), lens.back_net
     heights = net.relative_sag_and_slope(*everywhere)[0]
     room = min(bounds.thickest - bounds.thinnest, float(heights.max() - heights.min())) or 1.0
@@ -207,8 +206,8 @@ def _thickness_excess(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]
 def enforce_bounds(lens: Lens, bounds: Bounds) -> Lens:
     """Return the lens with its tailored faces and the position of its back changed as little as the bounds require.
 
-    The penalty alone is minimised, in the variables of stage 2.  If REPAIR_EVALUATIONS do not suffice, the faces get
-    flatter.  If the front is tailored, the back is moved only where changes of the faces do not suffice, since a move
+    The penalty alone is minimised, in the variables of stage 2.  If REPAIR_EVALUATIONS do not suffice, the faces are
+    flattened.  If the front is tailored, the back is shifted only if changes of the faces do not suffice, since a shift
     changes the picture.  SceneError if even a flat back exceeds a bound.
     """
     for place in (_unmoved, _with_back_moved) if lens.shapes("front") else (_with_back_moved,):
@@ -222,14 +221,14 @@ def enforce_bounds(lens: Lens, bounds: Bounds) -> Lens:
     flat = _with_back_moved(_flat(lens, bounds), bounds)
     if _exceeds(flat, bounds):
         raise SceneError(
-            "lens.max_thickness: with this front, not even a flat back meets lens.max_thickness and "
-            "lens.edge_thickness; raise the first or lower the second"
+            "lens.max_thickness: with this front, not even a flat back meets both lens.max_thickness and "
+            "lens.edge_thickness; raise lens.max_thickness or lower lens.edge_thickness"
         )
     return _nearest(lens, flat, bounds, _with_back_moved)
 
 
 def _nearest(lens: Lens, valid: Lens, bounds: Bounds, place: Callable[[Lens, Bounds], Lens]) -> Lens:
-    """Return the lens nearest to `lens`, which exceeds the bounds, on the line to `valid`, which meets them."""
+    """Return the lens nearest to `lens` that meets the bounds, on the line of heights from `lens` to `valid`."""
     start = _heights(lens)
     changes = [end - begin for end, begin in zip(_heights(valid), start, strict=True)]
     low, high = 0.0, 1.0

@@ -4,30 +4,30 @@ The merit is the weighted mean over the goals, of RRMSD² for a picture and of t
 
     M = (Σ_k w_k RRMSD_k² + w (RMS / λ)²) / (Σ_k w_k + w),    RRMSD_k² = Σ_ij |E^s_ij - E_ij|² / Σ_ij E_ij².
 
-All pixels have the same weight, lit or not.  The target E has the sum 1.  The picture E^s is relative to the light that
-the lens transmits, on the target and beside it, so that losses at faces and in the glass do not count, but light beside
-the target does.  (Reports scale both pictures to the sum 1.)
+All pixels have the same weight, lit or not.  The target E has the sum 1.  The picture E^s is divided by the flux that
+the lens transmits to the target and beside it, so that losses at faces and in the glass do not change the merit, but
+light beside the target does.  (Reports scale both pictures to the sum 1.)
 
 Two terms are added, averaged over the pictures: a penalty on light outside the target, and the fraction of the light
 that is lost.  Light outside the target changes no pixel and so has no gradient; the penalty is `overshoot` (1 / pixel²)
 times the mean square of its distance from the border in pixels.  Pictures and both terms are sums over the channels of
-the light.  For a source of finite size they are those of its centre, blurred (source_image.py).  The wavefront error
-of a ray is its optical path S to the plane of the wave less the phase W of the wave there (wavefront_error.py),
+the light.  For a source of finite size the picture is that of its centre, blurred (source_image.py).  The wavefront
+error of a ray is its optical path S to the plane of the wave minus the phase W of the wave there (wavefront_error.py),
 without piston.
 
 The Hessian: let e be the flux density on the last face, and E the irradiance of the target where its light lands.  A
-change δz of the face moves this light by L ∇δz, L the throw (mm), and so changes E by about E L Δδz.  The light of an
-area dA_b of the face falls on the area dA_t = (e / E) dA_b of the target, so that the squared error is
+change δz of the face moves this light by L ∇δz, where L is the throw (mm), and so changes E by about E L Δδz.  The
+light of an area dA_b of the face falls on the area dA_t = (e / E) dA_b of the target, so that the squared error is
 
     ∫ δE² dA_t  =  ∫ (E L Δδz)² (e / E) dA_b  =  L² ∫ e E (Δδz)² dA_b.
 
 As a quadratic form in δz this is the operator Δ e E Δ.  In the variable c with δz = Δ^-1 E^-1/2 c it becomes e, the
-identity for a uniform beam.  Pixels average over finer detail, which makes a weaker power of Δ better: 0.5 by
-measurement (letters are best with a still weaker power, portraits with a stronger one).  The weight E^-1/2 halves the
+identity for a uniform beam.  Pixels average over finer detail, so that a smaller power of Δ converges faster: 0.5 by
+measurement (the best power is still smaller for letters, larger for portraits).  The weight E^-1/2 halves the number of
 evaluations for pictures with dark parts.  Δ is diagonal in the cosine transform of the net.
 
 Near the critical angle L is not constant: dθ' = η cos θ / cos θ' dθ grows without bound, and some points of the face
-move their light many times further than most.  There the weight is divided by the excess of L.
+move their light many times further than most.  There the weight is divided by L / (3 median L).
 """
 
 from __future__ import annotations
@@ -63,24 +63,24 @@ from bstcad.optics.wavefront import MM_PER_NM, Wave
 from bstcad.optics.wavefront_error import path_from_reference
 from bstcad.tailoring.source_image import BlurOperator, ExtendedSource, blur_error, blurred, blurs, with_border
 
-LAPLACIAN_POWER = 0.5  # power of the Laplacian in the variable
-COARSE_LAPLACIAN_POWER = 0.75  # power of the Laplacian for coarse cells, which are wider than a pixel
-TARGET_BLUR = 1.0  # standard deviation of the blur of the target for the weight (pixels)
+LAPLACIAN_POWER = 0.5  # power of the Laplacian in `SobolevVariable`
+COARSE_LAPLACIAN_POWER = 0.75  # power of the Laplacian in `CoarseVariable`, whose knot spans are wider than a pixel
+TARGET_BLUR = 1.0  # standard deviation of the blur of the target before the local weight is computed (pixels)
 WEIGHT_SMOOTHING = 1.5  # standard deviation of the smoothing of the weight's logarithm (control points)
 MAX_LOCAL_WEIGHT = 4.0  # largest local weight; the smallest is 1 / MAX_LOCAL_WEIGHT
-MIN_THROW, MAX_THROW = 3.0, 96.0  # range of the throw, relative to its median, in which the weight falls with the throw
+MIN_THROW, MAX_THROW = 3.0, 96.0  # range of the throw / median in which the weight is proportional to 1 / throw
 THROW_STEP = 1e-6  # step of the difference quotients of the throw, relative to the distance to the target
-THROW_STRIDE = 8  # stride of the control points that are checked first: few lenses have a large throw anywhere
+THROW_STRIDE = 8  # every 8th control point is checked first, since few lenses have a large throw anywhere
 
 
 def landing(rays: Landed, aim: Tensor) -> Tensor:
-    """Return the mean of |P_t - P|² over the rays that land (mm²); Wang et al. 2023, Eq. 14, as a mean."""
+    """Return the mean of |P_t - P|² over the rays that land (mm²): the sum of Wang et al. 2023, Eq. 14, as a mean."""
     lit = rays.alive & (rays.flux > 0)
     miss = (rays.position[0] - aim[0]) ** 2 + (rays.position[1] - aim[1]) ** 2
     return total(torch.where(lit, miss, torch.zeros_like(miss))) / lit.sum()
 
 
-PictureError = Callable[[Tensor, Tensor], Tensor]  # function of a picture and its target, (rows, columns)
+PictureError = Callable[[Tensor, Tensor], Tensor]  # error (0-d) of a picture (rows, columns) relative to a target
 
 
 class Landings(NamedTuple):
@@ -94,13 +94,13 @@ class Landings(NamedTuple):
 class Merit:
     """Merit of pictures and of a wavefront, exact for flux tubes, and differentiable in the heights of all nets."""
 
-    light: RayTubes  # tubes of a point source, or of the centre of a source
+    light: RayTubes  # flux tubes of a point source, or of the centre of an extended source
     goals: tuple[Goal, ...]
     overshoot: float  # weight of light outside the border of a target (1 / pixel²)
-    wave: Wave | None = None  # wavefront goal, for the first channel; None: there is none
-    picture_error: PictureError | None = None  # error of a picture in place of RRMSD²
+    wave: Wave | None = None  # wavefront goal, rated with the first channel; None: no such goal
+    picture_error: PictureError | None = None  # error to minimise; None: RRMSD²
     blurs: tuple[tuple[BlurOperator, ...], ...] = ()  # blur by goal and channel; (): the source is a point
-    blur_errors: tuple[Tensor, ...] = ()  # error of the blur in each picture, (rows, columns); (): not measured
+    blur_errors: tuple[Tensor, ...] = ()  # error of each blurred picture, (rows, columns); (): not measured
 
     @classmethod
     def of(
@@ -112,10 +112,9 @@ class Merit:
         return cls(light, tuple(goals), overshoot, wave=wave)
 
     def with_blur(self, source: ExtendedSource, lens: Lens, seed: int | None = None) -> Merit:
-        """Return the merit for a source of finite size, if the channels of this one are the light of its centre.
+        """Return the merit for a source of finite size; the channels of this merit are the light of its centre.
 
-        seed: seed of the rays that measure the error of the blur, which takes almost a second per goal; None: not
-        measured.
+        seed: seed of the rays that measure the error of the blur, almost a second per goal; None: no measurement.
         """
         exact = lens.plain()
         merit = replace(self, blurs=tuple(blurs(source, exact, goal.receiver) for goal in self.goals))
@@ -136,7 +135,7 @@ class Merit:
 
     @cached_property
     def targets(self) -> tuple[Tensor, ...]:
-        """Target picture of each goal, (rows, columns), on the device of the light; a single one is normalised."""
+        """Target picture of each goal, (rows, columns), on the light's device; a single one is scaled to the sum 1."""
         pictures = tuple(torch.from_numpy(goal.picture).to(self.light.sheets[0].flux.device) for goal in self.goals)
         return tuple(picture / total(picture) for picture in pictures) if self._is_one else pictures
 
@@ -146,7 +145,7 @@ class Merit:
         return len(self.goals) == 1 and self.wave is None
 
     def landing(self, lens: Lens) -> Landings:
-        """Trace the corners of each sheet to the receivers; for a single receiver in one call of the kernels."""
+        """Trace the corners of each sheet to the receivers; a single picture goal takes one call of the kernels."""
         if self._is_one:
             return Landings((self.light.landing(lens, self.goals[0].receiver),))
         lens, pairs = _from_source(lens, self.wave), zip(self.light.channels, self.light.sheets, strict=True)
@@ -155,7 +154,7 @@ class Merit:
         return Landings(on_goals, None if self.wave is None else traced[0])
 
     def __call__(self, landings: Landings) -> tuple[Tensor, Tensor]:
-        """Return the merit of the landed corners, and the largest RRMSD of the normalised pictures."""
+        """Return the merit of the landed corners, and the largest RRMSD of the pictures scaled to the sum 1."""
         pictures = sum(goal.weight for goal in self.goals)
         weights = pictures + (self.wave.weight if self.wave else 0.0)
         merit, worst = torch.zeros(()), torch.zeros(())
@@ -170,10 +169,10 @@ class Merit:
         return merit, worst
 
     def picture(self, k: int, landed: Sequence[Landed]) -> tuple[Tensor, Tensor]:
-        """Return the picture of goal k and the penalty on light outside, both relative to the transmitted light."""
+        """Return the picture of goal k and the penalty on light outside it, each divided by the transmitted flux."""
         channels, screen = self.light.channels, self.goals[k].receiver
         pairs = list(zip(self.light.sheets, landed, strict=True))
-        # flux after the losses at faces and in the glass: a picture that is darker everywhere is no worse
+        # flux after the losses at faces and in the glass, so that they do not change the merit
         flux = weighted_sum(channels, (total(sheet.transmitted_flux(corners)) for sheet, corners in pairs))
         wider = with_border(screen, self.blurs[k][0].border) if self.blurs else screen
         images, penalties = zip(*(sheet.collect(corners, wider) for sheet, corners in pairs), strict=True)
@@ -184,7 +183,7 @@ class Merit:
         return weighted_sum(channels, smooth), self.overshoot * (outside / flux)
 
     def _goal_terms(self, k: int, landed: Sequence[Landed]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return RRMSD² of goal k (or `picture_error`), the penalty, the fraction lost, and the normalised RRMSD."""
+        """Return (RRMSD² or `picture_error`, penalty, fraction lost, RRMSD scaled to the sum 1) of goal k."""
         channels, sheets, target = self.light.channels, self.light.sheets, self.targets[k]
         image, penalty = self.picture(k, landed)
         if self.blur_errors:
@@ -202,7 +201,7 @@ class Merit:
     def _wavefront_error(self, rays: Rays, path: Tensor) -> Tensor:
         """Return (RMS / λ)² of the optical path differences without piston, weighted by the flux around each corner."""
         wave, wavelength = self.wave, self.light.channels[0].source.main_wavelength
-        assert wave is not None, "a merit without a wavefront has no such error"
+        assert wave is not None, "a merit without a wavefront goal has no wavefront error"
         above = rays.above(wave.z)
         further = -above / torch.where(rays.alive, rays.direction[2], torch.ones_like(above))
         x, y = (p + further * d for p, d in zip(rays.position[:2], rays.direction[:2], strict=True))
@@ -216,7 +215,7 @@ class Merit:
 
 
 def _from_source(lens: Lens, wave: Wave | None) -> Lens:
-    """Return the lens with tubes launched from the source if optical paths are needed."""
+    """Return the lens, with its tubes launched from the source if a wavefront goal needs optical paths."""
     if wave is None or not lens.freeform[0]:
         return lens
     return replace(lens, shaped=(0, *lens.freeform))
@@ -243,7 +242,7 @@ def _traced_corners(source: Emitter, sheet: Tubes, lens: Lens, measured: bool) -
 
 
 def _corner_flux(flux: Tensor) -> Tensor:
-    """Return the flux of tubes (m, n) divided among their corners, (m + 1, n + 1)."""
+    """Return the flux at the tube corners, (m + 1, n + 1): a quarter of the flux of each tube, (m, n), per corner."""
     m, n = flux.shape
     shared = flux.new_zeros((m + 1, n + 1))
     for i in (0, 1):
@@ -256,11 +255,11 @@ def _corner_flux(flux: Tensor) -> Tensor:
 class SobolevVariable:
     """Sobolev variable: heights h (m, n) in mm as a function of c (m, n), h = p C^T (λ^-q · C (w c) C^T) C.
 
-    C is the orthonormal cosine transform; λ_ij = 4 - 2 cos(π i / m) - 2 cos(π j / n) the Laplacian on the net, with
-    λ^-q = 0 for the piston; q the exponent; p the mean pitch in mm.
+    C is the orthonormal cosine transform, p the mean spacing of control points (mm), and q the exponent.
+    λ_ij = 4 - 2 cos(π i / m) - 2 cos(π j / n) are the eigenvalues of the Laplacian; λ^-q = 0 for the piston.
     """
 
-    weight: Tensor  # local step size w, (m, n)
+    weight: Tensor  # local weight w, (m, n)
     scale: Tensor  # p λ^-q, (m, n)
 
     @classmethod
@@ -268,7 +267,7 @@ class SobolevVariable:
         """Make the variable for the net of a surface."""
         x, y = map(laplacian, surface.shape)
         energy = x[:, None] + y
-        # numpy, in one thread: torch rounds a power differently where the work of a thread ends
+        # numpy, since the rounding of torch's powers depends on how the work is divided among threads
         power = torch.from_numpy(np.power(torch.where(energy > 0, energy, math.inf).numpy(), -exponent))
         scale = math.sqrt(math.prod(surface.pitch)) * power
         return cls(weight.to(surface.heights), scale.to(surface.heights))
@@ -291,10 +290,10 @@ class CoarseVariable:
     """Heights h (m, n) in mm of a net as a function of the variable c of a coarser net: h = P h'(c) Q^T.
 
     P (m, m') and Q (n, n') insert knots, so that h is the same spline on the finer net.  (The long cosines of the finer
-    net itself have zero slope at its rim, and would make a slope there by ripples all over the net.)
+    net have zero slope at its rim, so a slope at the rim would need ripples all over the net.)
     """
 
-    coarse: SobolevVariable
+    coarse: SobolevVariable  # variable of the coarser net
     along_x: csr_array  # matrix P
     along_y: csr_array  # matrix Q
 
@@ -318,7 +317,7 @@ class CoarseVariable:
 
 
 def _apply_both(left: csr_array, t: Tensor, right: csr_array) -> Tensor:
-    """Return left t right^T by scipy, in one thread, whose sums have a fixed order."""
+    """Return left t right^T with scipy, whose single thread sums in a fixed order."""
     within = np.ascontiguousarray((left @ t.cpu().numpy()).T)
     return torch.from_numpy(np.ascontiguousarray((right @ within).T)).to(t)
 
@@ -326,8 +325,8 @@ def _apply_both(left: csr_array, t: Tensor, right: csr_array) -> Tensor:
 def local_weight(source: Emitter, lens: Lens, goal: Goal, number: int | None = None) -> Tensor:
     """Return the weight w = (E / mean E)^-1/2 at each control point (m, n), smoothed and clamped.
 
-    E is the irradiance of the target where the light of the control point lands; w = 1 where it misses the screen.
-    number: index of the freeform interface in the lens; None: the back.
+    E is the irradiance of the target where light from the control point lands; before smoothing, w = 1 for light that
+    misses the screen.  number: index of the freeform interface in the lens; None: the back.
     """
     number, screen = lens.number_of("back") if number is None else number, goal.receiver
     net, onwards = lens.interfaces[number].net, lens.unbounded().interfaces[number:]
@@ -350,7 +349,7 @@ def local_weight(source: Emitter, lens: Lens, goal: Goal, number: int | None = N
 
 
 def control_point_axes(net: BSplineSurface) -> tuple[Tensor, Tensor]:
-    """Return x and y (mm) of the rows and columns of control points of a net, evenly spaced."""
+    """Return x (m,) and y (n,) of the control points of a net (m, n), evenly spaced (mm)."""
     x, y = (torch.linspace(*ends, m, dtype=torch.float64) for ends, m in zip((net.x, net.y), net.shape, strict=True))
     return x, y
 
@@ -358,8 +357,8 @@ def control_point_axes(net: BSplineSurface) -> tuple[Tensor, Tensor]:
 def _excess_throw(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, on_screen: np.ndarray) -> np.ndarray | None:
     """Return the throw relative to MIN_THROW times its median (m, n), at least 1; None if it is 1 everywhere.
 
-    The throw is the largest singular value of ∂t/∂p (mm), p(b, t) the slopes that send light from b to the target point
-    t; it is the inverse of the smallest singular value of ∂p/∂t.
+    The throw is the largest singular value of ∂t/∂p (mm), the inverse of the smallest one of ∂p/∂t; p(b, t) are the
+    slopes that send light from b to the target point t.
     """
     for some in (slice(None, None, THROW_STRIDE), slice(None)):
         rays = replace(at_net, **{key: getattr(at_net, key)[..., some, some] for key in ("position", "direction")})

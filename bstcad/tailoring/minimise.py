@@ -2,7 +2,7 @@
 
 A problem maps a list of parameter tensors to (merit, gradients, a figure such as RRMSD).  A method (`adam`, `lbfgs`)
 is a generator that yields a `Query` and is sent its `Evaluation`.  `minimise` runs a method on a problem and yields the
-state after each evaluation; to stop, do not ask for the next one.
+state after each evaluation; to stop, a caller ends its loop over these states.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Best:
 
 @dataclass(frozen=True)
 class Query:
-    """Request of a method for the merit at some parameters."""
+    """Request of a method for merit and gradients at some parameters."""
 
     parameters: list[Tensor]
     state: Any = None  # state from which the method makes this request again; None: it cannot resume here
@@ -46,7 +46,7 @@ class Evaluation:
 
     merit: float  # merit; infinite, with zero gradients, if merit or gradient was not finite
     gradients: list[Tensor]
-    best: Best  # best evaluation, this one included
+    best: Best  # best evaluation so far, including this one
 
 
 Method = Generator[Query, Evaluation, str]  # returns the reason why it ends
@@ -60,13 +60,13 @@ class Iterate:
     parameters: list[Tensor] | None  # parameters of the next query; None: the method has ended
     state: Any = None  # state from which, with `best`, the method can resume; None: it cannot resume here
     skipped: bool = False  # True if merit or gradient of this evaluation was not finite
-    reason: str = ""  # reason to end here: "evaluations", or that of the method; "": none
+    reason: str = ""  # reason to end here: "evaluations" or the reason that the method returns; "": none
 
 
 def minimise(problem: Objective, method: Method, evaluations: int, best: Best = Best()) -> Iterator[Iterate]:
     """Answer the queries of a method until it ends or the evaluations are used up; yield the state after each.
 
-    A value that is not finite is counted and not used.  best: the best of the evaluations before the method's state.
+    An evaluation that is not finite is counted as skipped.  best: best evaluation before the method's state.
     """
     if best.evaluations >= evaluations:
         return
@@ -96,18 +96,18 @@ class AdamState:
     """State of Adam between two steps."""
 
     step: int  # number of evaluations so far
-    taken: int  # number of steps taken, without those left out
+    taken: int  # number of steps taken, without those skipped for a non-finite gradient
     parameters: tuple[Tensor, ...]
     mean: tuple[Tensor, ...]  # running mean of the gradient
-    square: tuple[Tensor, ...]  # running mean of its square
+    square: tuple[Tensor, ...]  # running mean of the square of the gradient
 
 
 def adam(start: list[Tensor], rates: list[float], steps: int, state: AdamState | None = None) -> Method:
-    """Run Adam (Kingma and Ba 2014) with one learning rate per parameter tensor; leave out non-finite gradients.
+    """Run Adam (Kingma and Ba 2014) with one learning rate per parameter tensor; skip non-finite gradients.
 
     The rates fall to zero within `steps` as half a cosine: Adam's steps do not shrink with the gradient, and at a
-    constant rate the control points keep jumping by about that rate.  The method never ends.  Its result is the query
-    after the last evaluation: with new random rays in each step the best merit is a matter of chance.
+    constant rate the control points keep jumping by about this rate.  The method never ends by itself.  Its result is
+    the parameters of the last query: with new random rays in each step the best merit is a matter of chance.
     """
     parameters = [p.clone() for p in (start if state is None else state.parameters)]
     optimiser = torch.optim.Adam([{"params": [p], "lr": r} for p, r in zip(parameters, rates, strict=True)])
@@ -131,9 +131,9 @@ def adam(start: list[Tensor], rates: list[float], steps: int, state: AdamState |
         step += 1
 
 
-LBFGS_MEMORY = 12  # number of steps whose changes L-BFGS keeps
+LBFGS_MEMORY = 12  # number of steps whose changes of x and gradient L-BFGS keeps
 PLATEAU_STEPS = 10  # number of steps between two checks for a plateau
-PLATEAU_GAIN = 0.005  # relative decrease of the merit in these steps below which it is on a plateau
+PLATEAU_GAIN = 0.005  # relative decrease of the merit in PLATEAU_STEPS steps below which the search is on a plateau
 ARMIJO, WOLFE = 1e-4, 0.9  # constants c1 and c2 of the strong Wolfe conditions
 MAX_LINE_TRIALS = 20  # largest number of trials along a line
 
@@ -147,7 +147,7 @@ class LbfgsState:
     x: Tensor
     value: float
     gradient: Tensor
-    pairs: tuple[tuple[Tensor, Tensor, float], ...] = ()  # (change of x, of the gradient, their product), oldest first
+    pairs: tuple[tuple[Tensor, Tensor, float], ...] = ()  # (s, y, s · y): s change of x, y of gradient; oldest first
     steps: int = 0
     before: float = math.inf  # best merit at the last check for a plateau
 
@@ -155,9 +155,9 @@ class LbfgsState:
 def lbfgs(start: list[Tensor], evaluations: int, state: LbfgsState | None = None) -> Method:
     """Run limited-memory BFGS with a strong Wolfe line search (Nocedal and Wright 2006, algorithms 7.5, 3.5, 3.6).
 
-    Returns "plateau" if PLATEAU_STEPS steps lowered the merit by less than the fraction PLATEAU_GAIN, while more than
-    as many of the `evaluations` are left, or if there is no direction of descent.  Resumed from a state between two
-    steps it ends with the same result.  (The L-BFGS of torch.optim loads a compiler, which takes longer than a draft.)
+    Returns "plateau" if PLATEAU_STEPS steps lowered the merit by less than the fraction PLATEAU_GAIN while more than
+    PLATEAU_STEPS of the `evaluations` are left, or if no step lowers the merit.  A run resumed from a state has the
+    result of an uninterrupted run.  (The L-BFGS of torch.optim loads a compiler, which takes longer than a draft.)
     """
     sizes, best, resumable = [p.numel() for p in start], Best(), state
 
@@ -186,7 +186,7 @@ def lbfgs(start: list[Tensor], evaluations: int, state: LbfgsState | None = None
 
 
 def _step(at: Callable[[Tensor], Values], search: LbfgsState) -> Generator[Query, Evaluation, LbfgsState | None]:
-    """Take one step; return None if there is no direction of descent."""
+    """Return the state after one step; None if no step lowers the merit."""
     x, value, g, pairs = search.x, search.value, search.gradient, search.pairs
     direction = -_inverse_hessian_times(g, pairs)
     slope = dot(g, direction)
@@ -208,7 +208,7 @@ def _step(at: Callable[[Tensor], Values], search: LbfgsState) -> Generator[Query
 
 
 def _inverse_hessian_times(g: Tensor, pairs: Sequence[tuple[Tensor, Tensor, float]]) -> Tensor:
-    """Return H g by the two-loop recursion (algorithm 7.4); pairs: (s, y, s · y), oldest first."""
+    """Return H g, H the inverse Hessian, by the two-loop recursion (algorithm 7.4); pairs: as in `LbfgsState`."""
     q, alphas = g.clone(), []
     for s, y, curvature in reversed(pairs):
         alphas.append(dot(s, q) / curvature)
@@ -236,7 +236,7 @@ Along = Callable[[float], LineSearch]
 
 
 def _strong_wolfe(along: Along, start: LinePoint, step: float) -> LineSearch:
-    """Return a point with f <= f0 + c1 a f0' and |f'| <= c2 |f0'|, or the best of MAX_LINE_TRIALS (3.5)."""
+    """Return a point at a step a with f <= f0 + c1 a f0' and |f'| <= c2 |f0'| (algorithm 3.5), or else the last one."""
     before = start
     for _ in range(MAX_LINE_TRIALS):
         trial = yield from along(step)
@@ -248,17 +248,17 @@ def _strong_wolfe(along: Along, start: LinePoint, step: float) -> LineSearch:
             return (yield from _zoom(along, start, trial, before))
         nearest, farthest = step + 0.01 * (step - before.step), 10.0 * step
         lowest = _cubic_minimum(before, trial)
-        step = min(max(lowest, nearest), farthest) if lowest > step else farthest  # else no minimum ahead
+        step = min(max(lowest, nearest), farthest) if lowest > step else farthest  # far: no minimum ahead
         before = trial
     return before
 
 
 def _zoom(along: Along, start: LinePoint, low: LinePoint, high: LinePoint) -> LineSearch:
-    """Return a point as `_strong_wolfe` does, between two points that bracket it; `low` has the lower merit (3.6)."""
+    """Return the point of `_strong_wolfe` between two that bracket it (algorithm 3.6); `low` has the lower merit."""
     for _ in range(MAX_LINE_TRIALS):
         margin = 0.1 * abs(high.step - low.step)  # distance to keep from both ends
         nearest, farthest = sorted((low.step, high.step))
-        if not nearest < nearest + margin < farthest:  # the merit jumps: no number is left between them
+        if not nearest < nearest + margin < farthest:  # the merit jumps: no float is left between them
             break
         step = min(max(_cubic_minimum(low, high), nearest + margin), farthest - margin)
         trial = yield from along(step)

@@ -1,21 +1,21 @@
 """The variables of stage 2 for all nets of a lens together.
 
-For a point source or collimated light the slopes of both faces act nearly alike: light from the point q of the front
-meets the back at b(q), and a slope at q moves its landing point on a plane behind the lens nearly as far as the same
-slope at b(q).  In the heights of the two nets the merit is therefore a long narrow valley.  Its two directions separate
-if the back repeats each change h(q) of the front where the light arrives:
+For a point source or collimated light the slopes of both faces have nearly the same effect: light from the point q of
+the front meets the back at b(q), and a slope at q moves its landing point on a plane behind the lens nearly as far as
+an equal slope at b(q).  In the heights of the two nets the merit is therefore a long narrow valley.  Its two directions
+separate if the back repeats each change h(q) of the front where the light arrives:
 
     δz_front(q) = h(q),    δz_back(b(q)) = κ h(q),    κ = (n d_z - d_z,in) / (n d_z - d_z,out).
 
-Here n is the index, and d_z, d_z,in and d_z,out are the cosines of the ray with the axis in the glass, before and
-behind the lens.  Such a pair of changes leaves all optical paths, and so the wavefront behind the lens, unchanged to
-first order.  It moves b(q), and so changes the irradiance behind the lens only.  A change of the back alone changes the
-wavefront.  The variable c has one block for each,
+Here n is the index, and d_z, d_z,in and d_z,out are the cosines of the angles of the ray to the axis in the glass,
+before and behind the lens.  Such a pair of changes leaves all optical paths, and so the wavefront behind the lens,
+unchanged to first order.  It moves b(q), and so changes only the irradiance behind the lens.  A change of the back
+alone changes the wavefront.  The variable c has one block for the pair and one for the back alone,
 
     δz_front = f S_front c_1,    δz_back = S_back c_2 + R δz_front,
 
-with S as in merit.py, f a scale, and R the interpolation of κ h along the rays.  Two photographs end at an RRMSD of
-0.061 and 0.057 after 98 evaluations, and at 0.071 and 0.063 with independent blocks.
+with the Sobolev variable S of merit.py, a scale f, and the interpolation R of κ h along the rays.  Two photographs end
+at RRMSDs of 0.061 and 0.057 after 98 evaluations, and at 0.071 and 0.063 with independent blocks.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from bstcad.optics.trace import across, behind
 from bstcad.tailoring.merit import CoarseVariable, SobolevVariable, control_point_axes
 from bstcad.transport.mapping import grid_coordinates
 
-SCALE_FRACTION = 0.2  # f relative to the scale at which both blocks move the pictures equally far; by measurement
+SCALE_FRACTION = 0.2  # ratio, by measurement, of f to the scale at which both blocks move the pictures equally far
 # Standard deviation of the smoothing of q(b), in control points of the back.  In a gap between two parts of the light,
-# where few rays fall and some cross, q(b) jumps: without smoothing R makes ripples of 0.07 mm between the tubes.
+# where few rays fall and some cross, q(b) jumps: without smoothing R causes ripples of 0.07 mm between the tubes.
 POSITION_SMOOTHING = 3.0
-INTERPOLATION_POINTS = 4  # control points of the front along each axis in the interpolation at one of the back
+INTERPOLATION_POINTS = 4  # control points of the front per axis from which R interpolates at one of the back
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class NetVariables:
 
 
 def _multiply(matrix: csr_array, t: Tensor, like: Tensor) -> Tensor:
-    """Return matrix t by scipy, in one thread, whose sums have a fixed order."""
+    """Return matrix t with scipy, whose single thread sums in a fixed order."""
     return torch.from_numpy(matrix @ t.cpu().double().numpy().reshape(-1)).reshape(like.shape).to(like)
 
 
@@ -116,13 +116,13 @@ def _array(t: Tensor) -> np.ndarray:
 
 
 def _magnification(q: np.ndarray, points: np.ndarray, lit: np.ndarray) -> float:
-    """Return the mean of ∂x/∂q_x and ∂y/∂q_y of points (2, …), by least squares over the lit ones."""
+    """Return the mean of ∂x/∂q_x and ∂y/∂q_y of the points x, y (2, …), by least squares over the lit points."""
     p, at = ([axis[lit] - axis[lit].mean() for axis in each] for each in (points, q))
     return sum(float((u * v).sum() / (v * v).sum()) for u, v in zip(p, at, strict=True)) / 2
 
 
 def _smoothed(at: np.ndarray) -> np.ndarray:
-    """Smooth by a Gaussian of POSITION_SMOOTHING, with linear trends continued across the rim."""
+    """Smooth positions with a Gaussian of POSITION_SMOOTHING; linear trends continue across the rim."""
     wide = math.ceil(4 * POSITION_SMOOTHING)
     padded = np.pad(at, wide, mode="reflect", reflect_type="odd")
     return gaussian_filter(padded, POSITION_SMOOTHING)[wide:-wide, wide:-wide]

@@ -1,14 +1,14 @@
 """The reachable part of a target, which a design can light, computed before the design.
 
 Each point of the face reaches a part of the target that is known in closed form (optics/reach.py).  But the transport
-map decides which point lights which aim, and the point that it assigns to an aim is not always one that reaches it.  So
-three checks follow each other, each more expensive and only made if the one before is inconclusive:
+map decides which point of the face lights which point of the target (aim), and some points cannot reach their aim.  So
+there are three checks, each more expensive and only made if the previous check is inconclusive:
 
 1. Every lit point of the face reaches all of the lit target: then any map is feasible.
-2. Each aim is reached from the point at the same relative position in the face: transport maps do not cross rays, and
-   are close to this map.
-3. Coarse maps are computed, each for the part of the target that the last one could light.  The first is for the part
-   that any point of the face reaches.
+2. Each aim is reached from the point at the same relative position in the face: rays of transport maps do not cross,
+   so that these maps are close to the affine map.
+3. Coarse maps are computed, each for the part of the target that the previous map could light.  The first map is for
+   the part that at least one point of the face reaches.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import FaceGrid
 from bstcad.transport.mapping import Points, Solver
 
-FACE_CELLS, FACE_STRIDE = 33, 4  # cells per side of the face, and stride of those whose light is tried for all aims
-BOX_AIMS = 5  # aims per side, in the rectangle around the lit target, of the first check
+FACE_CELLS, FACE_STRIDE = 33, 4  # cells per side of the face; every 4th cell per axis is tried for all aims
+BOX_AIMS = 5  # aims per side of the first check, in the rectangle around the lit target
 MAX_AIMS = 64  # largest number of pixels along the longer side of the target at whose corners the reach is computed
-MAP_NET, MAP_CELLS, MAP_ITERATIONS = 33, 64, 40  # size and iterations of the coarse maps
+MAP_NET, MAP_CELLS, MAP_ITERATIONS = 33, 64, 40  # control points and cells per side, and iterations, of the coarse maps
 MAX_ROUNDS = 6  # largest number of coarse maps
 SETTLED_FRACTION = 1e-3  # change of the reachable light at which the rounds end, as a fraction of all light
 COARSE_FIT = Fit(bending=1e-2, steps=40, degree=3)  # fit of the face to a coarse map
@@ -80,7 +80,7 @@ def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT
 
 
 def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
-    """Return the goal resampled to at most `pixels` pixels along the longer side, by means over the pixels."""
+    """Return the goal resampled to at most `pixels` pixels along the longer side, as means over its pixels."""
     screen, picture = goal.receiver, goal.picture
     shrunk = max(1.0, max(screen.shape) / pixels)
     rows, columns = (max(round(n / shrunk), 1) for n in screen.shape)
@@ -90,7 +90,7 @@ def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
 
 
 def reach_from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver, law: Law, grazing: float) -> Tensor:
-    """Return `optics.reach.reach_margin` from each of the lit points of the face to each aim, (points, …).
+    """Return `optics.reach.reach_margin` from each lit point of the face to each aim, (points, …).
 
     aims: x and y of the aims (mm), of one shape (…).
     """
@@ -110,7 +110,7 @@ def same_order(grid: FaceGrid, aims: Points) -> Points:
 
 
 def _inside(corners: Tensor, screen: Screen, few: Screen) -> np.ndarray:
-    """Return True for the pixels of a screen, (rows, columns), where a function at the corners of `few` is positive."""
+    """Return True (rows, columns) for the pixels of a screen where a function at the corners of `few` is positive."""
     where = np.meshgrid(
         *(np.linspace(0, a, n + 1) for a, n in ((few.columns, screen.columns), (few.rows, screen.rows))), indexing="ij"
     )

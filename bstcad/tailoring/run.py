@@ -1,7 +1,7 @@
 """The task of a design, the steps that its stages yield, and the driver that runs the stages.
 
-A stage is an iterator of steps and knows nothing of time.  The driver takes the steps, measures time, saves states,
-reports progress, and stops when there is a reason to end.
+A stage is an iterator of steps, independent of time.  The driver runs the steps, measures time, saves states, reports
+progress, and stops when there is a reason to end.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class NetParameters:
 
 @dataclass(frozen=True)
 class Parameters:
-    """Parameters that tailoring changes: a blank and these determine the lens."""
+    """Parameters that tailoring changes; together with a blank they determine the lens."""
 
     nets: tuple[NetParameters, ...]  # freeform interfaces, in the order of Lens.freeform
     front: dict[str, float | Tensor]  # values by name, such as curvature (1/mm); empty for a plane or a net
-    back: float  # z of the plane of the back (mm); tailoring moves it even where the heights are given
+    back: float  # z of the plane of the back (mm); tailoring moves it even if the heights are fixed
 
     @classmethod
     def of(cls, lens: Lens) -> Parameters:
@@ -62,10 +62,10 @@ class Parameters:
 
 @dataclass(frozen=True)
 class RatedLens:
-    """Lens with its figures for the whole design: all pixels, all goals, and the light of the whole source."""
+    """Lens with its figures of merit for all pixels, all goals, and the light of the whole source."""
 
     rrmsd: float  # RRMSD by `Task.rrmsd`
-    figure: float  # square root of the merit of all goals (merit.py); equal to the RRMSD without a wavefront goal
+    figure: float  # square root of the merit of all goals (merit.py); without a wavefront goal equal to `rrmsd`
     lens: Parameters
 
     def beats(self, other: RatedLens) -> bool:
@@ -75,62 +75,62 @@ class RatedLens:
 
 
 SIGNIFICANT_RATIO = 1.05  # smallest ratio of two figures that is significant: STAGE_EFFORT has errors of 5 %
-BEST_LENS_STAGE = "back to the best lens before"  # name of a stage in the record
-WAVEFRONT_TUBES = 256  # tubes per side for the wavefront error of a lens between the stages
+BEST_LENS_STAGE = "back to the best lens before"  # name in the record of the return to an earlier lens
+WAVEFRONT_TUBES = 256  # flux tubes per side that measure the wavefront error of a lens between the stages
 TUBES_PER_SECOND = 4.7e6  # tubes traced per second, with the gradient of the merit, on a machine of pace 1
 RRMSD_SECONDS = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
 # Rays for the RRMSD of a lens between the stages, accurate to some 5 % for STAGE_EFFORT_PIXELS pixels per side.  The
 # error of the product of two pictures of n² stratified rays falls as (p / n)³ / p, so a target of p pixels per side
-# takes (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays per side.
+# needs (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays per side.
 STAGE_EFFORT, STAGE_EFFORT_PIXELS = Effort(rays=724, accuracy=0, witness=False), 512
-FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays where a scene has an accuracy or bounds
+FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays for scenes with tailoring.accuracy or bounds
 FLUX_EFFORT = Effort(rays=128, accuracy=1.0, witness=False)  # rays for the flux on the target alone
 
-Progress = Callable[[str, int, int, str], None]  # stage, done, total, text
-LensCallback = Callable[[Callable[[], Lens]], None]  # called with the function that makes the best lens so far
+Progress = Callable[[str, int, int, str], None]  # called with stage, units done, units in total, text
+LensCallback = Callable[[Callable[[], Lens]], None]  # called with a function that returns the best lens so far
 PACE_MEMORY = 4.0  # seconds of work over which the pace of the machine is averaged
 
 
 def no_progress(stage: str, done: int, total: int, text: str) -> None:
-    """Report no progress; the default `Progress`."""
+    """Report no progress; default of a `Progress`."""
 
 
 @dataclass(frozen=True)
 class Edge:
-    """Light at the edge of the reachable part of a target, which is close to total internal reflection."""
+    """Light at the edge of the reachable part of a target, where it is close to total internal reflection."""
 
-    light: Channel  # channel of the centre of the source with most of the flux
+    light: Channel  # channel with the largest flux, for the centre of the source
     angle: float  # largest angle to the normal at which light may leave the last face (rad)
 
 
 @dataclass(frozen=True)
 class Task:
-    """Everything that the stages need to know of a design: light, goals, settings and bounds."""
+    """Data of a design that its stages use: light, goals, settings and bounds."""
 
     channels: tuple[Channel, ...]  # light of the source; for a source of finite size, of its centre
-    goals: tuple[Goal, ...]  # targets; stage 1 with one freeform face uses the first alone
+    goals: tuple[Goal, ...]  # targets; stage 1 with one freeform face uses only the first
     knobs: ResolvedTailoring  # settings of the scene's [tailoring]
     min_thickness: float = 0.0  # minimum thickness of the glass everywhere (mm)
     free: tuple[str, ...] = ()  # names of the parameters of the front that are optimised
-    rim_sags: tuple[float, float] = (-math.inf, math.inf)  # range of the sag at the rim of such a front (mm)
+    rim_sags: tuple[float, float] = (-math.inf, math.inf)  # range of the front's sag at the rim (mm)
     progress: Progress = no_progress  # receives the progress within a step
     tidy: Callable[[], None] = lambda: None  # returns freed memory to the system between large allocations
-    sampled_sources: tuple[tuple[Channel, ...], ...] = ()  # light of the source at each size of stage 3; (): a point
+    sampled_sources: tuple[tuple[Channel, ...], ...] = ()  # light for each source size of stage 3; (): point source
     bounds: Bounds | None = None  # bounds on the shape of the tailored faces; None: no bounds
     extended_sources: tuple[ExtendedSource, ...] = ()  # source at each size of stage 3, for its blur
-    edge: Edge | None = None  # light at the edge of a target cut to its reachable part; None: all of it is reachable
-    # function of a picture (rows, columns) and of the target, both of sum <= 1, that stage 2 minimises; None: RRMSD²
+    edge: Edge | None = None  # light at the edge of a target cut to its reachable part; None: not cut
+    # function of a picture and the target, (rows, columns) and of sum <= 1, that stage 2 minimises; None: RRMSD²
     merit: Callable[[Tensor, Tensor], Tensor] | None = None
-    wave: Wave | None = None  # wavefront that the light shall have behind the lens; None: no such goal
+    wave: Wave | None = None  # required wavefront behind the lens; None: no wavefront goal
     preview: bool = False  # preview: one round per stage, no RRMSD by rays, no costly alternative
-    solution: float | None = None  # sign σ of light_behind.py, +1 or -1; None: the one with the smaller angles
+    solution: float | None = None  # sign σ of light_behind.py, +1 or -1; None: the solution with smaller deflections
     floor: float = 0.0  # irradiance, relative to the mean, to which stage 1 of two faces raises the furthest picture
-    # number of control points of the front as a function of that of the back; None: the front is not freeform
+    # control points per side of the front as a function of those of the back; None: the front is not freeform
     front_sides: Callable[[Sides], Sides | None] = lambda sides: None
 
     @property
     def heaviest(self) -> Channel:
-        """Channel with most of the light; stage 1 uses it alone."""
+        """Channel with most of the light; stage 1 uses only this channel."""
         return max(self.channels, key=lambda channel: channel.weight)
 
     @property
@@ -139,17 +139,17 @@ class Task:
         return len(self.goals) > 1 or self.wave is not None
 
     def sides(self, lens: Lens, sides: Sides) -> tuple[Sides, ...]:
-        """Return the numbers of control points of each net of a lens whose back has `sides`."""
+        """Return the control points per side of each net of a lens whose back has `sides`."""
         front = self.front_sides(sides)
         return tuple(sides if k == lens.number_of("back") or front is None else front for k in lens.freeform)
 
     @property
     def at_full_size(self) -> Task:
-        """Task with the sampled light of the whole source in place of that of its centre."""
+        """Task with the sampled light of the whole source instead of the light of its centre."""
         return replace(self, channels=self.sampled_sources[-1], sampled_sources=()) if self.sampled_sources else self
 
     def refined(self, lens: Lens, sides: Sides) -> Lens:
-        """Return the lens with its nets refined to the numbers of control points that go with `sides` on the back."""
+        """Return the lens with its nets refined to the control points per side that belong to `sides` on the back."""
         pairs = zip(lens.nets, self.sides(lens, sides), strict=True)
         return lens.with_nets(net.refined(count) for net, count in pairs)
 
@@ -159,10 +159,10 @@ class Task:
         return replace(self, goals=tuple(goals))
 
     def rrmsd(self, lens: Lens, effort: Effort | None = None) -> float:
-        """Return the RRMSD by independent rays on the CPU, the largest over the goals; NaN without light on a target.
+        """Return the largest RRMSD over the goals from independent rays, on the CPU; NaN without light on a target.
 
-        Tubes that tailored the lens would underestimate it.  effort: rays to use; None: FINE_EFFORT for a scene with an
-        accuracy or bounds, else STAGE_EFFORT.
+        The flux tubes used for tailoring would underestimate the RRMSD.  effort: rays to use; None: FINE_EFFORT for a
+        scene with an accuracy or bounds, else STAGE_EFFORT.
         """
         if effort is None and (self.knobs.accuracy is not None or self.bounds is not None):
             effort = FINE_EFFORT
@@ -171,13 +171,13 @@ class Task:
             rays = STAGE_EFFORT.rays * (pixels / STAGE_EFFORT_PIXELS**2) ** (1 / 3)
             effort = replace(STAGE_EFFORT, rays=round(rays))
         sources = () if self.sampled_sources else self.extended_sources
-        draw = sources[-1].draw if sources else None  # of the source at full size
+        draw = sources[-1].draw if sources else None  # samples the source at full size
         lens = lens.plain()
         values = [rrmsd_by_rays(lens, self.channels, goal, effort, draw=draw) for goal in self.goals]
         return math.nan if any(map(math.isnan, values)) else max(values)
 
     def rated(self, lens: Lens, rrmsd: float) -> RatedLens:
-        """Return the lens with its figure of merit, given its RRMSD by `rrmsd`."""
+        """Return the lens with its figure of merit; rrmsd: its RRMSD by `Task.rrmsd`."""
         figure = rrmsd
         if self.wave is not None:
             merit = Merit.of(self.channels, lens, WAVEFRONT_TUBES, goals=(), overshoot=0.0, wave=self.wave)
@@ -186,9 +186,9 @@ class Task:
         return RatedLens(rrmsd, figure, Parameters.of(lens))
 
     def better(self, latest: Lens, before: Lens) -> tuple[Lens, RatedLens]:
-        """Return the better of two lenses and its figures by FINE_EFFORT; `latest` if they differ too little.
+        """Return the better of two lenses with its figures by FINE_EFFORT; `latest` if the difference is insignificant.
 
-        STAGE_EFFORT does not resolve an RRMSD below about 0.01: it ranked a lens of 0.0070 before one of 0.0048.
+        STAGE_EFFORT does not resolve RRMSDs below about 0.01: by it 0.0070 seemed better than 0.0048.
         """
         now, then = (self.rated(lens, self.rrmsd(lens, FINE_EFFORT)) for lens in (latest, before))
         return (before, then) if then.beats(now) else (latest, now)
@@ -202,19 +202,19 @@ class Task:
 class StageStep:
     """State of a stage after one of its steps; the driver decides whether the stage goes on."""
 
-    make: Callable[[], Lens] | None  # function that makes the best lens so far; None: there is no lens yet
+    make: Callable[[], Lens] | None  # function that returns the best lens so far; None: there is no lens yet
     state: Any = None  # record from which the stage can resume here; None: it cannot
     mapping: Mapping | None = None  # transport map that the lens follows (stage 1)
-    # points (mm) of the last tailored face whose light goes to the corners of the target's pixels, x and y, each
-    # (columns + 1, rows + 1); None: the map of `mapping` begins on another surface
+    # x and y (mm), each (columns + 1, rows + 1), of the points of the last tailored face that light the corners of the
+    # target's pixels; None: `mapping` begins on another surface
     face_points: tuple[np.ndarray, np.ndarray] | None = None
-    progress: tuple[str, int, int, str] | None = None  # stage, done, total, text
-    rrmsd: float | None = None  # RRMSD of the lens by the tubes or rays that tailor it
+    progress: tuple[str, int, int, str] | None = None  # arguments of `Progress`; None: nothing to report
+    rrmsd: float | None = None  # RRMSD of the lens by the flux tubes or rays used for tailoring
     rays_rrmsd: float | None = None  # RRMSD of the lens by `Task.rrmsd`
-    at_full_size: bool = True  # True if `rays_rrmsd` is for the source at full size, False for a smaller one
+    at_full_size: bool = True  # True if `rays_rrmsd` is for the source at full size, False for a smaller source
     work: float = 0.0  # seconds that the step takes on a machine of pace 1; 0: unknown
     skipped: bool = False  # True if the step was left out because merit or gradient was not finite
-    part: str = ""  # name of the part of the design under way, for the list of times; "": none has begun
+    part: str = ""  # name of the current part of the design, for the list of times; "": no part has begun
     ends: bool = False  # True if the part ends with this step
     reason: str = ""  # reason to end the stage here: "evaluations", "plateau" or "accuracy"; "": none
 
@@ -226,11 +226,11 @@ class StageStep:
 
 
 Steps = Iterator[StageStep]
-Stage = Callable[[Task, Lens, Any], Steps]  # called with the task, the lens before, and a state to resume from or None
+Stage = Callable[[Task, Lens, Any], Steps]  # called with task, lens, and a state to resume from or None
 
 
 def maker(lens: Lens) -> Callable[[], Lens]:
-    """Return a function that returns `lens`, for `StageStep.make`."""
+    """Return a function without arguments that returns `lens`, for `StageStep.make`."""
     return lambda: lens
 
 
@@ -238,7 +238,7 @@ def maker(lens: Lens) -> Callable[[], Lens]:
 class Hooks:
     """Functions that a design calls while it runs; by default they do nothing."""
 
-    progress: Progress = no_progress  # called with stage, done, total and text
+    progress: Progress = no_progress  # reports progress
     save: Callable[[Any], None] = lambda state: None  # called with each state from which the design can resume
     interrupted: Callable[[], bool] = lambda: False  # returns True once the user wants the best lens so far
     on_lens: LensCallback = lambda make: None  # called after each step that has an RRMSD
@@ -253,8 +253,8 @@ class StageTime:
 
     name: str
     seconds: float
-    rrmsd: float | None  # RRMSD of the lens after it; None: not measured
-    cpu_seconds: float | None = None  # CPU time, summed over the processors; None: not measured
+    rrmsd: float | None  # RRMSD of the lens at the end of the stage; None: not measured
+    cpu_seconds: float | None = None  # CPU time, summed over processors (s); None: not measured
 
 
 @dataclass(frozen=True)
@@ -264,15 +264,15 @@ class DesignRecord:
     stages: tuple[StageTime, ...] = ()
     history: tuple[tuple[float, float], ...] = ()  # (seconds since the start, RRMSD)
     skipped: int = 0  # number of steps left out because merit or gradient was not finite
-    seconds: float = 0.0  # time since the start, summed over all runs that resumed the design
-    cpu_seconds: float = 0.0  # CPU time since a driver was made, summed over processors and runs
+    seconds: float = 0.0  # wall-clock time since the start, summed over all runs of a resumed design (s)
+    cpu_seconds: float = 0.0  # CPU time since a driver was made, summed over processors and runs (s)
 
 
 class Driver:
     """Driver of the stages of one design: keeps the time, the record and the best lens.
 
     limit: seconds for the whole run, including the work after tailoring, which takes `reserve` seconds on a machine of
-    pace 1.  record: the record of the earlier runs that this one resumes.
+    pace 1.  record: record of the earlier runs of a resumed design.
     """
 
     def __init__(
@@ -281,14 +281,14 @@ class Driver:
         processor: Callable[[], float] = time.process_time,
     ) -> None:  # fmt: skip
         self.hooks = hooks
-        self.pace = 1.0  # recent time of work here, relative to its time on a machine of pace 1
+        self.pace = 1.0  # recent time per work on this machine, relative to the reference machine of pace 1
         self.stopped = ""  # reason why tailoring ended: "evaluations", "plateau", "accuracy", "time" or "interrupt"
         self._limit, self._reserve, self._clock, self._before = limit, reserve, clock, record
         self._began = clock() if began is None else began
-        self._step = 0.0  # seconds of the last evaluation, the estimate for the next
+        self._step = 0.0  # seconds of the last evaluation, as an estimate for the next one
         self._last = clock()  # time at the end of the last step
         self._processor, self._spent = processor, processor()
-        self.best: RatedLens | None = None  # best lens at the ends of the parts of the stage under way
+        self.best: RatedLens | None = None  # best lens at the ends of the parts of the current stage
         self._record = record
 
     @property
@@ -299,13 +299,13 @@ class Driver:
 
     @property
     def reason_to_end(self) -> str:
-        """Reason to end now with the best lens so far: "interrupt", "time" (the rest is reserved) or ""."""
+        """Reason to end now with the best lens so far: "interrupt", "time" (only the reserve is left) or "" (none)."""
         late = self.record.seconds + self._step > self._limit - self.pace * self._reserve
         return self.reason_to_interrupt or ("time" if late else "")
 
     @property
     def reason_to_interrupt(self) -> str:
-        """Reason to end a stage that has no time limit of its own: "interrupt" or ""."""
+        """Reason to end a stage that has no time limit: "interrupt" or "" (none)."""
         return "interrupt" if self.hooks.interrupted() else ""
 
     def run(
@@ -313,9 +313,9 @@ class Driver:
     ) -> StageStep:
         """Run a stage until it ends or `why` returns a reason to end it; return its last step.
 
-        pack: makes the state to save from the state of a step.  best: the best lens before the stage; afterwards
-        `self.best` is the best at the end of any part.  A part may use fewer pixels or a smaller source, and so may end
-        with a lens that is worse.
+        pack: makes the state to save from the state of a step.  best: best lens before the stage.  Afterwards
+        `self.best` is the best lens at the start of the stage or the end of a part: a part that uses fewer pixels or a
+        smaller source may end with a worse lens.
         """
         self._last, self.best = self._clock(), best
         for step in stage:
@@ -359,23 +359,23 @@ class Driver:
         return step.reason
 
     def measure(self, seconds: float, expected: float) -> None:
-        """Update the pace by work that took `seconds` here and takes `expected` seconds on a machine of pace 1.
+        """Update the pace with work that took `seconds`, and would take `expected` seconds on a machine of pace 1.
 
-        The pace of a busy machine changes: work counts with the weight seconds / PACE_MEMORY against all before it.
+        The pace of a busy machine changes, so the weight of this work is seconds / PACE_MEMORY, at most 1.
         """
         share = min(1.0, seconds / PACE_MEMORY)
         self.pace += share * (seconds / expected - self.pace)
 
     def note(self, value: float) -> None:
-        """Append a point to the history."""
+        """Append an RRMSD, with the present time, to the history."""
         record = self.record
         self._record = replace(record, history=(*record.history, (record.seconds, value)))
 
     def end(self, name: str, value: float | None = None) -> None:
-        """Record the end of a part of the design, whose time began at the end of the part before."""
+        """Record the end of a part of the design; it began at the end of the previous part.  value: RRMSD, or None."""
         record = self.record
         spent = sum(stage.seconds for stage in record.stages)
-        cpu = None  # unknown for the first part: most of it was over when this driver was made
+        cpu = None  # unknown for the first part, most of which precedes this driver
         if record.stages:
             cpu = record.cpu_seconds - sum(stage.cpu_seconds or 0.0 for stage in record.stages)
         self._record = replace(record, stages=(*record.stages, StageTime(name, record.seconds - spent, value, cpu)))

@@ -1,4 +1,4 @@
-"""The slope fit of stage 1: the surface whose slopes send each ray to its aim, by linear least squares.
+"""The slope fit of stage 1: a linear least-squares fit of a surface to the slopes that send each ray to its aim.
 
 Wang et al. 2023 minimise Σ |P_t - P|² by Adam (baselines/paper.py).  For a ray that meets the face at a known point,
 the normal that sends it to its aim follows from Snell's law in closed form.  The spline is linear in its heights, so
@@ -26,28 +26,28 @@ from bstcad.optics.unfolding import image_from_last_net
 from bstcad.tailoring.merit import Spectrum
 
 BLOCK_POINTS = 1 << 22  # number of points whose slopes and residuals are in memory together: 0.3 GB
-DEPENDENCE_TOLERANCE = 1e-12  # fraction of a monomial's squared slopes below which the rest of it is rounding
+DEPENDENCE_TOLERANCE = 1e-12  # fraction of a monomial's squared slopes that is rounding if orthogonalisation leaves it
 
 
 @dataclass(frozen=True)
 class Fit:
     """Settings of a slope fit."""
 
-    # weight of the bending energy of the change of the surface, (spacing · curvature)², relative to slope²: it shapes
-    # the parts without rays
+    # weight of the bending energy (spacing · curvature)² of the change of the surface, relative to slope²; this energy
+    # determines the surface where no ray falls
     bending: float = 1e-4
     steps: int = 8  # number of conjugate-gradient steps
-    degree: int = 0  # degree of a polynomial that is fitted first, and extrapolates where no ray falls; 0: none
-    unlit: float = 0.0  # weight of a point without light, which keeps its present slopes, relative to one with light
+    degree: int = 0  # degree of a polynomial that is fitted first and extrapolates where no ray falls; 0: no polynomial
+    unlit: float = 0.0  # weight of a point without light, fitted to its present slopes; the weight of a lit point is 1
 
 
 def fit_slopes(
     surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: Tensor, weight: Tensor, fit: Fit = Fit()
 ) -> BSplineSurface:
-    """Return the surface that minimises Σ w |∇h(x, y) - (z_x, z_y)|² / Σ w, and a bending energy of its change.
+    """Return the surface that minimises Σ w |∇h(x, y) - (z_x, z_y)|² / Σ w plus a bending energy of its change.
 
-    The change starts at zero, from the given surface with the polynomial of the fit added, and is found by conjugate
-    gradients in the variable of `Spectrum`.  x, y (mm), the slopes z_x, z_y and the weights are (n,).
+    The change is relative to the given surface plus the polynomial of the fit, and is found by conjugate gradients from
+    zero, in the variable of `Spectrum`.  x, y (mm), the slopes z_x, z_y and the weights are (n,).
     """
     pitch_x, pitch_y = surface.pitch
     u, v = surface.along_net(x, y)
@@ -90,9 +90,9 @@ def blocks(count: int) -> Iterator[slice]:
 
 
 def conjugate_gradients(normal: Callable[[Tensor], Tensor], x: Tensor, residual: Tensor, steps: int) -> Tensor:
-    """Return x after `steps` steps towards normal(x) = b, with `normal` symmetric and positive.
+    """Return x after `steps` steps towards normal(x) = b; `normal` is linear, symmetric and positive definite.
 
-    residual: b - normal(x) at the start.  The steps end earlier if the residual is rounding alone.
+    residual: b - normal(x) at the start.  The iteration ends earlier if the residual consists of rounding.
     """
     p, rho = residual, total(residual**2)
     tolerance = rho * torch.finfo(rho.dtype).eps ** 2
@@ -114,11 +114,11 @@ Samples = tuple[Tensor, ...]
 def with_polynomial(
     start: Tensor, monomials: list[Tensor], sample: Callable[[Tensor], Samples], data: Samples, weight: Tensor
 ) -> Tensor:
-    """Return start + Σ b_k monomial_k with the b that minimise Σ w |sample - data|², by modified Gram-Schmidt.
+    """Return h = start + Σ b_k monomial_k with the b_k that minimise Σ w |sample(h) - data|², by modified Gram-Schmidt.
 
-    sample: linear function of heights, such as their slopes at the points of the data.  Each monomial is made
-    orthogonal to those before it in its weighted samples.  (LAPACK's solvers divide their sums among threads, which
-    changes their rounding.)
+    sample: linear function of heights, such as the slopes at the points of the data.  The weighted samples of each
+    monomial are made orthogonal to those of the previous ones.  (LAPACK's solvers divide their sums among threads,
+    which changes their rounding.)
     """
     root = weight.sqrt()
 
@@ -126,7 +126,7 @@ def with_polynomial(
         return torch.cat([s * root for s in samples])
 
     left = weighted(tuple(z - now for z, now in zip(data, sample(start), strict=True)))
-    basis: list[tuple[Tensor, Tensor]] = []  # (weighted samples, heights), orthonormal in the first
+    basis: list[tuple[Tensor, Tensor]] = []  # (weighted samples, heights); the samples are orthonormal
     for h in monomials:
         q = weighted(sample(h))
         before = total(q * q)
@@ -144,7 +144,7 @@ def with_polynomial(
 
 
 def monomials(surface: BSplineSurface, degree: int) -> list[Tensor]:
-    """Return heights of nearly x^i y^j, 1 <= i + j <= degree, x and y from -1 to 1 across the net."""
+    """Return nets whose heights are x^i y^j, 1 <= i + j <= degree, with x and y from -1 to 1 across the net."""
     x, y = (torch.linspace(-1.0, 1.0, count).to(surface.heights) for count in surface.shape)
     powers = ((i, j) for i in range(degree + 1) for j in range(degree + 1 - i) if i + j > 0)
     return [x[:, None] ** i * y[None, :] ** j for i, j in powers]
@@ -153,7 +153,7 @@ def monomials(surface: BSplineSurface, degree: int) -> list[Tensor]:
 def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: Receiver, repeats: int = 3) -> Lens:
     """Return the lens whose last net sends `rays` (…) to `aim` (2, …) mm on the plane, by fits of the slopes.
 
-    repeats: number of fits; each changes the sag, and so the points where the rays meet the face.
+    repeats: number of fits; each fit changes the sag, and so the points where the rays meet the face.
     """
     plane = image_from_last_net(lens, plane)
     coming = across(rays, lens.interfaces[: lens.freeform[-1]])

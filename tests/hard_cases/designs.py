@@ -36,7 +36,7 @@ CLOSE = "Some light meets the back"  # beginning of the remark on light next to 
 # What two faces cannot do, as it is said before stage 2.
 CROSSED, IN_GLASS = (
     "would have to cross between the lens and the nearest target",
-    "the front would have to turn light by",
+    "the front would have to deflect light by",
 )
 
 
@@ -131,7 +131,7 @@ DESIGNS: dict[str, Hard] = {
     "deflection of 33 to 38 degrees": Hard("thu", _aside(600.0), rrmsd=0.2, says=(MISSED, CLOSE, LIFTED)),
     "deflection no face can make": Hard(
         "thu", _aside(1500.0),
-        refused="target: no light reaches the target, as a face of index 1.488 turns light by at most 47.8",
+        refused="target: no light reaches the target, as a face of index 1.488 deflects light by at most 47.8",
     ),
     "source 5 mm before": Hard("disk", {"source.position": [0.0, 0.0, 10.0]}, rrmsd=0.12, says=(MOVED, SIDES, LIFTED),
                                bench=True),
