@@ -21,37 +21,37 @@ from bstcad.optics.irradiance import Screen
 
 # --- the end of the convergence curve ---------------------------------------------------------------------------------
 
-LAST_TENTH_RATIO = 1.1  # RRMSD relative to its final value, below which the time counts for the last tenth of the error
-FITTED_FRACTION = 0.5  # last fraction of the time of tailoring to the irradiance, to which the power law is fitted
+LAST_TENTH_RATIO = 1.1  # RRMSD divided by its final value, below which time counts for the last tenth of the error
+FITTED_FRACTION = 0.5  # fraction of the time of tailoring to the irradiance, at its end, that is fitted
 MIN_FIT_POINTS = 5  # smallest number of points for a fit
-MIN_R_SQUARED = 0.9  # smallest R² of a line in logarithms that counts as a power law
-MAX_HALVING = 10.0  # largest factor of the time for half of the error that is reported
+MIN_R_SQUARED = 0.9  # smallest R² of the fit in logarithms that counts as a power law
+MAX_HALVING = 10.0  # largest reported factor by which the time grows if the error is halved
 
 History = Sequence[tuple[float, float]]  # (seconds since the start, RRMSD)
-StageResults = Sequence[tuple[float, float | None]]  # one after the other: (seconds, RRMSD after it if judged)
+StageResults = Sequence[tuple[float, float | None]]  # stages in order: (seconds, RRMSD at the end or None)
 
 
 @dataclass(frozen=True)
 class ConvergenceEnd:
-    """End of a convergence curve; RRMSD by the rays or tubes that tailor, at each evaluation.
+    """End of a convergence curve: RRMSD at each evaluation, by the rays or tubes of tailoring.
 
-    Near its end the curve is fitted by RRMSD ∝ t^-p, t the time of all evaluations: half of the error takes 2^(1/p)
-    times as long in all.
+    Near its end the curve is fitted by RRMSD ∝ t^-p, t the total time of the evaluations: to halve the error, t must
+    grow by the factor 2^(1/p).
     """
 
     rrmsd: float  # RRMSD at the end
     last_tenth_seconds: float  # time since the RRMSD was last above LAST_TENTH_RATIO times its final value
     last_tenth: float  # `last_tenth_seconds` divided by the time from the start to the end of the curve
     power: float | None  # exponent p, zero if the curve does not fall; None: too few points
-    fit: float | None  # R² of the line in logarithms
-    halving: float | None  # factor 2^(1/p) of the time; None: no line fits, or it is more than MAX_HALVING
+    fit: float | None  # R² of the fit in logarithms; None: too few points
+    halving: float | None  # factor 2^(1/p) of the time; None: the fit is poor, or the factor exceeds MAX_HALVING
 
 
 def ending(history: History, stages: StageResults, since: float = 0.0) -> ConvergenceEnd | None:
     """Return the end of a design's history; None if no stage tailored the irradiance.
 
-    stages: stages whose RRMSD by rays is in the history too, and is left out.
-    since: time (s) from the start at which the design began to use the light that it has at the end.
+    stages: results of all stages; their RRMSD by rays, also in the history, is left out.
+    since: time (s) from the start at which tailoring began to use its final channels of light.
     """
     ends = np.cumsum([seconds for seconds, _ in stages])
     judged = {value for _, value in stages if value is not None}
@@ -72,9 +72,9 @@ def ending(history: History, stages: StageResults, since: float = 0.0) -> Conver
 def _last_points(
     seconds: np.ndarray, values: np.ndarray, ends: np.ndarray, since: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (time, values) of the last points, since `since` and within the last stage.
+    """Return (time, values) of the last points, after `since` and within the last stage.
 
-    Each evaluation of a stage counts with the median time, so that other work of the machine has no effect.
+    Each evaluation counts with the median time of its stage, so that other work of the machine has no effect.
     """
     stage = np.searchsorted(ends, seconds)
     steps = np.zeros(len(seconds))
@@ -103,7 +103,7 @@ def _fit_power(time: np.ndarray, values: np.ndarray) -> tuple[float | None, floa
 RIM_RATIO = 64  # side of the target divided by the width of its rim
 EDGE_QUANTILE = 0.9  # quantile of the gradient above which a pixel is at an edge
 MIN_EDGE_GRADIENT = 0.02  # smallest gradient at an edge, per pixel, relative to the brightest pixel
-TONE_QUANTILE = 0.1  # quantile of the irradiance below which a pixel is dark; bright above 1 - TONE_QUANTILE
+TONE_QUANTILE = 0.1  # quantile of the irradiance below which a pixel is dark; it is bright above 0.9
 
 
 def remaining(picture: np.ndarray, target: np.ndarray, per_unit: tuple[float, float]) -> dict[str, Any]:
@@ -127,7 +127,7 @@ def masks(target: np.ndarray) -> dict[str, np.ndarray]:
 
     rim: the outermost 1/64 of the side, at least one pixel, at all four sides.  edges: the tenth of all pixels where
     the gradient (central differences) is largest, if it is at least 2 % of the brightest pixel per pixel.
-    darkest, brightest: the tenth of all pixels, and all that equal the last of them.  rest: all others.
+    darkest, brightest: a tenth of all pixels, and the pixels equal to the last of these.  rest: all others.
     """
     steep = np.hypot(*np.gradient(target))
     dark, bright = np.quantile(target, (TONE_QUANTILE, 1 - TONE_QUANTILE))
@@ -149,12 +149,12 @@ def _in_rim(side: int) -> np.ndarray:
 
 
 def _octaves(error: np.ndarray, per_unit: float) -> list[dict[str, Any]]:
-    """Return the energy of the cosine transform (orthonormal: Parseval) by octaves of the wave vector, coarse to fine.
+    """Return the energy of the cosine transform (orthonormal: Parseval) by octaves of frequency, coarse to fine.
 
     frequency: lower and upper limit in cycles per pixel (the finest octave extends to 0.71, along the diagonals).
-    period: on the target, in its unit, the coarse end first.  error: fraction of the squared error.  The mean is in no
-    octave, as both pictures have the same sum.  The cosine transform is not periodic, so a difference between opposite
-    sides adds no high frequencies.
+    period: limits on the target, in its unit, the longer first.  error: fraction of the squared error.  The mean is in
+    no octave, as the two pictures have the same sum.  The cosine transform is not periodic, so a difference between
+    opposite sides adds no high frequencies.
     """
     energy = dctn(error, norm="ortho") ** 2
     along = (np.arange(side) / (2 * side) for side in error.shape)
@@ -180,7 +180,7 @@ MIN_UNLIT_FRACTION = 5e-3  # smallest unlit fraction of the lit area that is rep
 
 
 def unlit(target: np.ndarray, irradiance: np.ndarray, screen: Screen) -> dict[str, Any]:
-    """Return the fraction of the lit area that stays dark, and the position of the largest such patch; {} if small.
+    """Return the fraction of the lit area that stays dark, and the position of the largest dark patch; {} if small.
 
     share: the fraction.  place: the ranges of x and y, as text.
     """
@@ -201,7 +201,7 @@ def unlit(target: np.ndarray, irradiance: np.ndarray, screen: Screen) -> dict[st
 
 
 def lifted(target: np.ndarray, irradiance: np.ndarray) -> dict[str, float]:
-    """Return the light on the dark parts of the target (fraction of all), and its level (relative to the mean).
+    """Return the excess light on the dark parts of the target (fraction of all), and its level (relative to the mean).
 
     A smooth face cannot divide its light without some light in between.
     """
@@ -219,15 +219,15 @@ TILE_PIXELS = 16  # side of a tile (pixels)
 class ControlCells:
     """Number of cells of the control net that light each pixel; there is one cell per control point.
 
-    Where the light of k cells falls on a tile of the target, k control points shape it, and can make about k cosines of
-    the tile, the coarsest first.  The energy of the other cosines is a lower bound of the squared error.
+    Where the light of k cells falls on a tile of the target, k control points shape it, and can produce about the k
+    coarsest cosines of the tile.  The energy of the other cosines is a lower bound of the squared error.
     """
 
     a_pixel: np.ndarray = field(repr=False)  # number of cells that light each pixel, (rows, columns), row 0 = y max
     target: np.ndarray = field(repr=False)  # target picture, (rows, columns)
 
     def floor(self, finer: float = 1.0) -> float:
-        """Return the RRMSD if each tile has as many of its lowest cosines as cells light it.
+        """Return the RRMSD if each tile shows as many of its coarsest cosines as cells light it.
 
         finer: factor of the number of control points per side.
         """

@@ -38,11 +38,11 @@ def _at_interfaces(rays: Rays, lens: Lens) -> list[Rays]:
 # --- rays for figures -------------------------------------------------------------------------------------------------
 
 FAN_RAYS = 15  # number of rays in `fan`
-GRID_LINES = 33  # number of grid lines in `ray_map`, each way
+GRID_LINES = 33  # number of grid lines in each direction in `ray_map`
 
 
 def fan(source: Emitter, lens: Lens, plane: Receiver) -> np.ndarray:
-    """Return polylines (rays, k, 3) in mm, launched in y = 0: source, each surface, the plane; rays that arrive."""
+    """Return polylines (rays, k, 3) in mm of the rays in y = 0 that arrive: source, each surface, the plane."""
     half = clear_window(source, lens).width / 2
     x = torch.linspace(-0.98 * half, 0.98 * half, FAN_RAYS, dtype=torch.float64)
     return _polylines(source.rays(x, torch.zeros_like(x), lens.entrance.z, 1.0), lens, plane)[0]
@@ -68,9 +68,9 @@ def _polylines(rays: Rays, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.
 
 
 def ray_map(source: Emitter, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.ndarray]:
-    """Return a regular grid on the vertex plane of the front, and its landing points on the plane, (k, k, 2) mm each.
+    """Return a regular grid on the vertex plane of the front, and where its rays land on the plane, (k, k, 2) mm each.
 
-    NaN without light, and where the ray is lost.
+    The values are NaN where there is no light, and where the ray is lost.
     """
     area = clear_window(source, lens)
     line = torch.linspace(-0.499, 0.499, GRID_LINES, dtype=torch.float64)
@@ -85,7 +85,7 @@ def ray_map(source: Emitter, lens: Lens, plane: Receiver) -> tuple[np.ndarray, n
 # --- clear apertures needed -------------------------------------------------------------------------------------------
 
 NEEDED_RAYS = 513  # rays per side
-ROUND_RATIO = 1.01  # largest radius of the light, relative to its half width and half height, that counts as round
+ROUND_RATIO = 1.01  # largest ratio of the radius to half width and half height of light that counts as round
 EXTENT_POINTS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # points of an extended source, in half extents
 FULL_APERTURE = 0.99  # extent of the light, relative to the clear aperture, from which on it fills the face
 
@@ -136,7 +136,7 @@ def rrmsd_of_ripple(channel: Channel, lens: Lens, screen: Screen, face: Literal[
     """Return the RRMSD between the pictures of a lens with and without the ripple of a face; 0 without a ripple.
 
     channel: light of one point of the source.  `Ripple.heights` fade towards the rim; the RRMSD, which is proportional
-    to a small height, is divided by this factor.
+    to small heights, is divided by `Ripple.fading`.
     """
     net = getattr(lens, face)
     waves = ripple(net)
@@ -164,7 +164,7 @@ class MountLosses:
 
 @torch.no_grad()
 def mount_losses(lens: Lens, channels: Sequence[Channel], flange: tuple[float, float] | None = None) -> MountLosses:
-    """Return the losses of a lens at its mount; flange: z (mm) of both ends of its opening; None: no flange."""
+    """Return the losses of a lens at its mount; flange: z (mm) of the two ends of its opening; None: no flange."""
     uncut = passing = blocked = 0.0
     n = max(MIN_MOUNT_RAYS, math.ceil(MOUNT_RAYS / math.sqrt(len(channels))))
     for channel in channels:
@@ -206,7 +206,7 @@ class Margins:
     """Worst cases over all rays that carry light to the back."""
 
     tir_margin_deg: float | None  # critical angle minus angle of incidence (degrees), < 0: reflected; None: no such ray
-    newton_slope_min: float | None  # |F'(t)| at a tailored face, the divisor of the Newton step: 1 normal, 0 grazing
+    newton_slope_min: float | None  # smallest |F'(t)| at a tailored face, divisor of a Newton step; 0: grazing
     non_finite: int  # number of control points, hits and landing points that are not finite
 
 
@@ -243,8 +243,8 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
 
 # --- blur by an extended source ---------------------------------------------------------------------------------------
 
-MIN_DISTANCE_RATIO = 2.5  # smallest target distance relative to the width of lens or picture (plate a tenth as thick)
-MAX_NEARER_RATIO = 0.9  # largest width of the detail on a nearer target, relative to that on this one, that is reported
+MIN_DISTANCE_RATIO = 2.5  # smallest target distance / width of lens or picture (plate thickness: width / 10)
+MAX_NEARER_RATIO = 0.9  # largest reported ratio of the finest detail on a nearer target to that on the target
 
 
 @dataclass(frozen=True)
@@ -292,7 +292,7 @@ class FinestDetail:
     pixel: float  # side p, in `unit`
     distance: float  # distance L (mm)
     nearer_distance: float | None  # distance L' (mm) of a nearer target that can have the same picture; None: no gain
-    nearer_width: float | None  # width w on that target, in `unit`
+    nearer_width: float | None  # width w on the nearer target, in `unit`
     of: str  # size of the source: its key in the scene, or the assumption
     assumed: bool  # True if the scene does not state the size
     unit: str = "mm"  # unit of the receiver

@@ -41,10 +41,10 @@ FACE_POINTS = 64  # points per side of the last face from which light is traced
 GHOST_RAYS_PER_SIDE, GHOST_SMOOTHING = 128, 0.7  # rays per side for a ghost; smoothing of its picture (cells)
 FIELD_CELLS = 24  # cells per side of the target, in which the fields are averaged
 FIELD_SMOOTHING = (0.8, 2.0, 6.0, 24.0)  # smoothing of fields (cells), wider where light is scarce
-MIN_CELL_FLUX = 1e-4  # smoothed flux of a cell, relative to the mean, below which a field is unknown
-MIN_LIGHT_SHIFT = 1e-6  # shift up to which light counts as not moved (pixels)
-HALF_SHARP_WIDTH = 1.3  # light of a control cell (pixels) at which edges are half as sharp, measured
-MAX_SHARPNESS = 0.75  # fraction of the jump at an edge that the finest cells make, measured on the templates
+MIN_CELL_FLUX = 1e-4  # smoothed flux of a cell / mean, below which a field needs wider smoothing
+MIN_LIGHT_SHIFT = 1e-6  # largest shift that counts as zero (pixels)
+HALF_SHARP_WIDTH = 1.3  # width of a control cell's light (pixels) at which edges are half as sharp, measured
+MAX_SHARPNESS = 0.75  # fraction of the jump at an edge that the finest cells reproduce, measured
 MAX_SAMPLED_PIXELS = 1 << 19  # largest number of pixels; of larger pictures some rows are sampled
 PADDING = 4  # dark pixels around a picture, within which the ringing of its spline ends
 AIRY_SIGMA = 0.376  # standard deviation of the Gaussian with the FWHM of a diffraction image, in λ L / D
@@ -80,7 +80,7 @@ class Reference:
     ) -> Reference:
         """Trace light from FACE_POINTS x FACE_POINTS points of the lit part of the last face.
 
-        control_points: number in the finished lens, if `lens` is a coarser one.
+        control_points: number of control points of the finished lens; None: that of `lens`.
         """
         half_x, half_y = lens.apertures[1].half_extent
         for few in (32, FACE_POINTS):  # the first grid finds the lit part
@@ -199,8 +199,8 @@ class Spline:
     """Picture as a function of x and y, for shifts by fractions of a pixel.
 
     Light that is uniform in each pixel and jumps between pixels changes in proportion to a small shift; light as smooth
-    as a cubic spline changes with the square of a small blur.  A lens whose control cells light less than a pixel makes
-    most of such a jump; a lens whose cells light several pixels makes none.  `sharp` is the weight of the jumps.
+    as a cubic spline changes with the square of a small blur.  If the control cells of a lens light less than a pixel,
+    it reproduces most of such a jump; if they light several pixels, none.  `sharp` is the weight of the jumps.
     """
 
     padded: np.ndarray  # picture with a dark margin, (rows, columns)
@@ -266,7 +266,7 @@ def difference(changed: np.ndarray, before: np.ndarray) -> float:
 def _trace_through(
     lens: Lens, channel: Channel, screen: Screen, points: tuple[Tensor, Tensor]
 ) -> tuple[Landed, Tensor]:
-    """Trace light through points of the last face; return where it lands (flux 1 before losses), and its density."""
+    """Trace light through points of the last face; return (landed rays of flux 1 before losses, flux density)."""
     lens, source = channel.through(lens), channel.source
     p, q, _ = rays_to(source, lens, *points)
     rays = source.rays(p, q, lens.entrance.z, 1.0)

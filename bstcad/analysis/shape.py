@@ -22,7 +22,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.sampling import sample_rim
 
 GRID_POINTS = 1025  # points per side of the grid for thickness, and along a quarter of the rim
-HEIGHT_ROUNDING = 1e-13  # rounding of the heights, relative to the largest
+HEIGHT_ROUNDING = 1e-13  # rounding of the heights, relative to the largest height
 SMOOTH_RATIO = 2.0  # largest ratio of the slope energies of the two highest octaves of a net without ripple
 AT_BOUND = 0.97  # fraction of a bound above which a point counts as at the bound (the penalty begins at 0.99)
 MIN_CURVATURE, MAX_RADIUS = 1e-9, 1e9  # curvature below which a face is flat (1/mm), and its radius (mm)
@@ -32,8 +32,8 @@ OUTLINE_ROUNDING = 1e-9  # relative rounding of the outline, so that the last po
 def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
     """Return thickness, sag range, slope, radii and departure from the best sphere of the back; mm and degrees.
 
-    A radius is None if the back has no such curvature.  Keys front_… are those of a tailored front, seen from outside
-    like the back: its valleys are concave.
+    A radius is None if the back has no such curvature.  Keys front_… describe a tailored front, seen from outside as
+    the back is: valleys are concave.
     """
     x, y = _points(lens.outline, grid)
     front, back = _sags(lens, x, y)
@@ -188,8 +188,8 @@ def _octave(face: BSplineSurface) -> np.ndarray:
 def least_squares(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the least-squares coefficients (k,) of columns (n, k) for values (n,).
 
-    The normal equations of columns scaled to length 1 are solved, and again for the residual.  For columns that are not
-    nearly dependent this is as accurate as singular values, and several times faster.
+    The normal equations of columns scaled to length 1 are solved, and solved again for the residual.  For columns that
+    are not nearly dependent this is as accurate as a singular value decomposition, and several times faster.
     """
     lengths = np.sqrt(np.einsum("ij,ij->j", columns, columns))
     normal = columns.T @ columns / np.outer(lengths, lengths)
@@ -254,7 +254,7 @@ def survey(lens: Lens, concave: float | None = None, convex: float | None = None
 def survey_front(
     lens: Lens, concave: float | None = None, convex: float | None = None, slope: float | None = None
 ) -> Survey:
-    """Find the extremes of a freeform front; from outside, from -z, a ridge of z is a valley."""
+    """Find the extremes of a freeform front; seen from outside, from -z, a ridge of z is a valley."""
     found = survey(replace(lens, back=lens.front), concave=convex, convex=concave, slope=slope)
     return Survey(concave=found.convex, convex=found.concave, slope=found.slope)
 

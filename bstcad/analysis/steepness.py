@@ -3,7 +3,7 @@
 To refract a ray from direction d to d', a face of relative index η = n / n' needs a normal along η d - d'.
 A face z(x, y) is less steep than 90 degrees, and tailoring makes it no steeper than MAX_SLOPE_DEG; light that needs
 more misses its aim.  This concerns wide beams: light at 60 degrees in PMMA, sent straight on, would need an overhanging
-face.  Light that no slope turns far enough is left out here (optics/reach.py).
+face.  Light that no slope deflects far enough is not counted here (see optics/reach.py).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from bstcad.optics.trace import across
 from bstcad.optics.tubes import rays_to
 from bstcad.optics.unfolding import image_screen
 
-MAX_SLOPE_DEG = 70.0  # largest slope angle that tailoring makes (degrees); optics.reach has it as a tangent
+MAX_SLOPE_DEG = 70.0  # largest slope angle that tailoring makes (degrees); its tangent is optics.reach.MAX_SLOPE
 MAX_POINTS_PER_SIDE = 65  # largest number of points per side
 
 

@@ -76,8 +76,8 @@ def top_hat(
     """Return the figures of a picture (rows, columns): irradiance, or flux per pixel, on any scale.
 
     pixel: width and height of a pixel (mm).  wanted: fraction of each pixel inside the outline, (rows, columns), for
-    the efficiency Σ wanted E / Σ E times on_picture, the fraction of all light in the picture.  Pixels may be negative
-    by noise of mean zero.  ValueError if a value is not finite, if there is no light, or unless 0 < epsilon < eta < 1.
+    the efficiency Σ wanted E / Σ E times on_picture, the fraction of all light in the picture.  Noise of mean zero may
+    make pixels negative.  Raises ValueError if a value is not finite, without light, or unless 0 < epsilon < eta < 1.
     """
     if not 0 < epsilon < eta < 1:
         raise ValueError(f"epsilon = {epsilon:g} and eta = {eta:g} are not possible levels; give 0 < epsilon < eta < 1")
@@ -86,7 +86,7 @@ def top_hat(
         raise ValueError("the picture has values that are not finite; give 0 for unknown pixels")
     maximum, light = _maximum(e), float(e.sum())
     if not (maximum > 0 and light > 0):
-        raise ValueError("the picture has no light, or none on five of 3 x 3 pixels; give more light or more pixels")
+        raise ValueError("the picture has no light, or no 3 x 3 pixels with five lit; give more light or more pixels")
     area = pixel[0] * pixel[1]
     flat, foot = e[e > eta * maximum], int((e > epsilon * maximum).sum())
     return TopHat(
@@ -108,7 +108,7 @@ def plateau_uniformity(e: np.ndarray, maximum: float) -> float:
     """Return U_P = ΔE / E_max by the histogram of the irradiance E (any shape), at most 1.
 
     The width of the bins is that of Freedman and Diaconis (1981) for the n pixels above E_max / 2, 2 IQR n^-1/3, and at
-    least E_max / MAX_BINS.  From the highest bin above E_max / 2 the half maximum is sought on both sides, interpolated
+    least E_max / MAX_BINS.  From the highest bin above E_max / 2 the half maximum is sought on each side, interpolated
     between the centres of bins.  Without a plateau the number of pixels rises down to E = 0.
     """
     upper = e[e > PLATEAU_LEVEL * maximum]
@@ -132,7 +132,7 @@ def _half_width(count: np.ndarray, half: float) -> float:
 
 @dataclass(frozen=True)
 class FlatTop:
-    """Figures of the light on a target with a flat profile, as the report has them; levels relative to the maximum."""
+    """Figures of the light on a target with a flat profile, as in the report; levels relative to the maximum."""
 
     key: str  # key of the target: target, target[0], …
     uniformity: float  # U_0.9: RMS deviation divided by the mean, where the light is above 0.9; 0 if uniform
@@ -146,6 +146,6 @@ class FlatTop:
     def of(
         cls, key: str, picture: np.ndarray, pixel: tuple[float, float], inside: np.ndarray, on_picture: float
     ) -> FlatTop:
-        """Return the figures of a picture; pixel: width, height (mm); inside: fraction of each in the profile."""
+        """Return the figures of a picture; pixel: width, height (mm); inside: fraction of each pixel in the profile."""
         found = top_hat(picture, pixel, inside, on_picture=on_picture)
         return cls(key, **{each.name: float(getattr(found, each.name)) for each in fields(cls) if each.name != "key"})

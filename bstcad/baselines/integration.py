@@ -1,9 +1,9 @@
 """Point-by-point integration of a ray mapping: the traditional construction of a surface from a transport map.
 
-Wang et al. 2023 compare their tailoring with it (sections 1 and 3.3; their source is Luo et al. 2010).  The map is
+Wang et al. 2023 compare their tailoring with this construction (sections 1 and 3.3, after Luo et al. 2010).  The map is
 theirs, from the plane of the front's vertex to points of the target (slope_map.py).  Rays through a grid of that plane
-are traced up to the back.  At a point of a ray, Snell's law and the aim of the ray give the slopes p = ∂z/∂x and
-q = ∂z/∂y of the back.  From an initial point a each point gives the next one b, where ray b meets
+are traced up to the back.  At a point of a ray, Snell's law and the aim of the ray give the slopes p = ∂z/∂x and q =
+∂z/∂y of the back.  From the initial point on, each point a gives the next point b, at which ray b meets
 
     z_b - z_a = (p_a + p_b) / 2 (x_b - x_a) + (q_a + q_b) / 2 (y_b - y_a)
 
@@ -43,7 +43,7 @@ from bstcad.tailoring.slope_fit import conjugate_gradients, monomials, with_poly
 from bstcad.transport.mapping import Mapping
 
 MAX_STARTS = 3  # maximum number of initial points, each moved along +z as far as the distance from the front requires
-FITTED_POINTS_PER_CELL = 4  # points per side of a control cell to which the coarser nets are fitted; the last: all
+FITTED_POINTS_PER_CELL = 4  # fitted points per side of a control cell of the coarser nets; the last net uses all
 # Fits of the coarsest net, the nets in between and the last: weight of the second differences relative to heights,
 # conjugate-gradient iterations, and degree of a polynomial that is fitted first.  The first fit extrapolates smoothly
 # where no light falls; the last follows the points.
@@ -57,7 +57,7 @@ class SurfacePoints:
     """Points of the back on the rays of a grid."""
 
     position: Tensor  # (3, n, n) mm; z is relative to the plane of the initial point
-    reached: Tensor  # (n, n) bool, False: this ray, or one before it on its line, is lost before the back
+    reached: Tensor  # (n, n) bool, False: the ray, or an earlier ray of its line, is lost before the back
 
 
 def steps(task: Task, lens: Lens, state: None = None) -> Iterator[StageStep]:
@@ -104,7 +104,7 @@ def march(coming: Rays, aim: Tensor, plane: Receiver, law: Law, z: float, first:
     middle = aim.shape[-1] // 2
     if not bool(coming.alive[middle, middle]):
         raise SceneError(
-            "source: its ray through the middle of the first surface does not reach the back, where point-by-point "
+            "source: the ray through the centre of the first surface does not reach the back, where point-by-point "
             'integration begins; move the source, or choose tailoring.method = "least-squares"'
         )
     grid = _Grid.of(coming, aim, z)  # x along the first axis
@@ -128,7 +128,7 @@ def _transposed(t: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class _Grid:
-    """Rays, in order along the first axis, in parallel lines along the second, with their aims."""
+    """Rays and their aims: the first axis counts the rays along a line, the second counts the lines."""
 
     origin: Tensor  # (3, rays, lines) mm, intersection with the plane of the initial point; z is zero
     direction: Tensor  # (3, rays, lines) unit vectors
@@ -194,7 +194,7 @@ def _outwards(grid: _Grid, position: Tensor, reached: Tensor, plane: Receiver, l
 def fit_net(surface: BSplineSurface, points: SurfacePoints, used: Tensor, levels: tuple[Sides, ...]) -> BSplineSurface:
     """Fit nets by least squares, min Σ |h(x, y) - z|² over the points used, (n, n) bool, one level after another.
 
-    Each net starts from the surface of the net before, the first from a plane; only the last uses all points.
+    Each net starts from the surface of the previous net, the first from a plane; only the last uses all points.
     """
     nets = levels if len(levels) > 1 else 2 * levels
     fits = (COARSEST_FIT, *(MIDDLE_FIT for _ in nets[1:-1]), FINEST_FIT)

@@ -1,6 +1,6 @@
-"""The procedure of the paper: both stages by Adam on raw control points (Wang et al. 2023, sections 2.3 and 3).
+"""The procedure of the paper: stages 1 and 2 by Adam on raw control points (Wang et al. 2023, sections 2.3 and 3).
 
-It is the baseline of the other qualities.  Where the paper gives no number, the choice is stated here or in quality.py:
+The other qualities are compared with it.  Where the paper gives no number, the choice is stated here or in quality.py:
 steps per level, learning rates that fall to zero in each level, and the learning rate of stage 2.
 """
 
@@ -31,12 +31,12 @@ from bstcad.tailoring.run import Parameters, StageStep, Task, maker
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Mapping, Solver
 
-STAGE1_RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # mm per step, by control points per side (section 3.2)
-FRONT_RATES = {  # change of the front's parameters per step
+STAGE1_RATES = {33: 0.02, 129: 0.004, 513: 0.008}  # learning rates (mm per step) by control points per side
+FRONT_RATES = {  # learning rates of the front's parameters, per step
     "curvature": 0.001,  # 1/mm (section 3.2)
     "conic_constant": 0.02,  # chosen here, since the fronts of the paper are spheres
 }
-STAGE2_RATE = 2e-4  # mm per step; chosen here, since the paper does not state it
+STAGE2_RATE = 2e-4  # learning rate (mm per step); chosen here, since the paper does not state it
 MAX_RAYS_PER_CONTROL_POINT = 8  # rays per control point in each direction, limited to save rays on the coarsest net
 
 
@@ -116,7 +116,7 @@ def transport(task: Task, lens: Lens) -> Mapping:
 def tent_average(target: Tensor) -> Tensor:
     """Return a picture of constant irradiance in each pixel after tent binning: [1, 6, 1] / 8 along both axes.
 
-    In comparison with it, instead of the sharp picture, a perfect lens has merit zero.
+    Compared with this picture, instead of the sharp one, a perfect lens has merit zero.
     """
     for _ in range(2):  # each pass filters one axis and transposes
         target = torch.nn.functional.pad(target, (1, 1))
@@ -190,7 +190,7 @@ def random_bundles(channels: tuple[Channel, ...], lens: Lens, count: int, seed: 
 
 
 def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = ()) -> Lens:
-    """Return the lens with these heights and the free parameters of the front, which follow in this order."""
+    """Return the lens with new values of (heights, free parameters of the front in the order of `free`)."""
     heights, *shape = parameters
     front = lens.front.with_parameters(**dict(zip(free, shape, strict=True)))
     return lens.with_front(front).with_back(lens.back.with_parameters(heights=heights))
