@@ -1,11 +1,11 @@
-"""Closed triangle mesh of a lens on a structured grid, measures of any closed mesh, and its files; lengths in mm.
+"""Closed triangle mesh of a lens on a structured grid, measures of any closed mesh, and mesh files; lengths in mm.
 
 Every vertex lies on the lens, and the faces share the nodes of the rim, so that the mesh is closed by construction.
-The chordal error falls with the square of the node spacing; it is measured until the grid meets its tolerance.
+The chordal error falls with the square of the node spacing; the grid is refined until the error meets the tolerance.
 
 Files: STL, which states no unit (its user must set mm), 3MF, which states millimetres, and previews for web pages and
-slicers.  For two million triangles trimesh takes 2 s of CPU to write STL (this module 0.3), 8 s to read it (1) and 2 s
-to find that it is closed (0.7); lib3mf takes 2.3 s to write 3MF (2.5, but equal bytes each time).
+slicers.  CPU seconds for two million triangles, with those of this module in parentheses: trimesh writes STL in 2
+(0.3), reads it in 8 (1) and finds in 2 that it is closed (0.7); lib3mf writes 3MF in 2.3 (2.5, always equal bytes).
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from bstcad.optics.surfaces import MIN_COS2, Recess, Surface, sag, sampled
 from bstcad.runs import files
 from bstcad.scene.scene import FLOAT32_ROUNDING
 
-MIN_MESH_CELLS = 16  # smallest number of grid cells each way
+MIN_MESH_CELLS = 16  # smallest number of grid cells per side
 DEFAULT_MAX_TRIANGLES = 2_000_000  # largest number of triangles by default: 100 MB of STL
 MAX_TRIANGLES = 32_000_000  # largest number of triangles if a scene states a tolerance: 1.6 GB of STL
-GOAL_FRACTION = 0.95  # chordal error that a mesh aims at, relative to the tolerance; float32 rounds vertices
+GOAL_FRACTION = 0.95  # goal of the chordal error, as a fraction of the tolerance, because float32 rounds vertices
 CELL_MARGIN = 1.1  # ratio of estimated to allowed cells above which no finer mesh is tried; estimates have errors
 WALL_NORMAL_Z = 1e-6  # largest |z| of the unit normal of a facet of the wall
 MAX_FACET_SAMPLES = 100_000_000  # largest number of points at which the facets of a mesh are compared with the lens
@@ -57,9 +57,9 @@ class Mesh:
 
 
 def lens_mesh(lens: Lens, cells: int) -> Mesh:
-    """Return the lens as a closed mesh of `cells` grid cells each way (even); see `fit_mesh`."""
+    """Return the lens as a closed mesh of `cells` grid cells per side (an even number); see `fit_mesh`."""
     if cells < 2 or cells % 2:
-        raise ValueError(f"mesh: {cells} cells each way; give an even number of at least 2")
+        raise ValueError(f"mesh: the number of cells per side is {cells}; give an even number of at least 2")
     x, y = nodes(lens.outline, cells)
     grid = np.arange(x.size, dtype=np.int32).reshape(x.shape)
     border, z = rim(grid), sag(lens.back, x, y)
@@ -83,10 +83,10 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
 
 
 def _recessed_front(front: Recess, around: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, indices of those below the lens's rim, and triangles of a front and of the plane around it.
+    """Return the mesh of a front and of the plane around it: vertices, indices of the plane's outer rim, triangles.
 
-    around: vertices of the lens's rim (k, 3).  The grid over the front has as many nodes on its rim, and the plane lies
-    between the two.  Indices continue those of `grid`.
+    around: vertices of the lens's rim (k, 3), below which the outer rim lies.  The grid over the front has k nodes on
+    its rim, too, and the plane's triangles join the two rims.  Indices continue those of `grid`.
     """
     x, y = nodes(front.outline, len(grid) - 1)
     z = sag(front.optical, x, y)
@@ -106,7 +106,7 @@ def nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _triangles(grid: np.ndarray, rising: np.ndarray) -> np.ndarray:
-    """Return two triangles per cell, (2 n², 3), counterclockwise; rising: use the diagonal from the first corner."""
+    """Return two triangles per cell, (2 n², 3), counterclockwise.  rising (n, n): see `_diagonals`."""
     a, b, c, d = _cell_corners(grid)
     rising = rising[..., None]
     first = np.where(rising, np.stack([a, b, c], axis=-1), np.stack([a, b, d], axis=-1))
@@ -120,10 +120,10 @@ def _cell_corners(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def _diagonals(outline: Outline, surface: Surface, points: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
-    """Choose the diagonal of each cell that is nearer to the face: True (n, n) for the one from the first corner.
+    """Choose the diagonal of each cell that is nearer to the face: True (n, n) for the diagonal from the first corner.
 
     A diagonal along a ridge has at most half the error of a diagonal across it, so that fewer triangles suffice.  On a
-    disc, cells on the diagonals of the grid are divided towards its centre: their outer corners lie on a circle, and
+    disc, cells on the grid's diagonals are divided towards the centre, because their outer corners lie on a circle and
     the other diagonal would make degenerate triangles.
     """
     k = np.arange(len(points[0]) - 1)
@@ -159,7 +159,7 @@ def _has_plane_front(lens: Lens) -> bool:
 
 
 def fit_mesh(lens: Lens, tolerance: float, max_triangles: int | None = None) -> tuple[int, Mesh]:
-    """Return the number of cells each way, nearly the smallest, that meets a chordal tolerance (mm), and the mesh.
+    """Return nearly the smallest number of cells per side that meets a chordal tolerance (mm), and the mesh.
 
     If `max_triangles` (default DEFAULT_MAX_TRIANGLES) do not suffice, the finest mesh of DEFAULT_MAX_TRIANGLES is
     returned, or of `max_triangles` if that is smaller.
@@ -193,7 +193,7 @@ def largest_coordinate(lens: Lens) -> float:
 
 
 def max_cells(lens: Lens, max_triangles: int | None = None) -> int:
-    """Return the largest number of cells each way for a number of triangles, by default DEFAULT_MAX_TRIANGLES."""
+    """Return the largest number of cells per side for at most `max_triangles` (None: DEFAULT_MAX_TRIANGLES)."""
     faces, total = 2 if _has_plane_front(lens) else 4, DEFAULT_MAX_TRIANGLES if max_triangles is None else max_triangles
     # triangles per cell along one side of the grid: 8 of the wall, and 4 of the fan over a plane front or 8 of the
     # plane around a front
@@ -213,7 +213,7 @@ def is_closed(mesh: Mesh) -> bool:
 
 
 def volume_and_area(mesh: Mesh) -> tuple[float, float]:
-    """Return volume (mm³), a sixth of the sum of the triple products of corners, and area (mm²) of a closed mesh."""
+    """Return the volume (mm³; the sum of the corners' triple products / 6) and area (mm²) of a closed mesh."""
     middle = mesh.vertices.mean(0)
     parts = [
         (np.einsum("ij,ij", corners[:, 0] - middle, normals), np.linalg.norm(normals, axis=1).sum())
@@ -226,7 +226,7 @@ def volume_and_area(mesh: Mesh) -> tuple[float, float]:
 def chordal_error(mesh: Mesh, lens: Lens) -> float:
     """Return the largest distance (mm) between the lens and the facets, at their centres and points between corners.
 
-    A net may bend in each knot span: an edge has two points per span or more (at most MAX_FACET_SAMPLES in all).
+    Since a net may bend in each knot span, edges have at least two points per span (at most MAX_FACET_SAMPLES in all).
     """
     max_parts = max(1, int((MAX_FACET_SAMPLES / 2 / max(len(mesh.faces), 1)) ** 0.5))
     radius = float(lens.outline.radius) if isinstance(lens.outline, Circle) else 0.0
@@ -240,7 +240,7 @@ def chordal_error(mesh: Mesh, lens: Lens) -> float:
 
 
 def vertex_error(mesh: Mesh, lens: Lens) -> float:
-    """Return the largest distance (mm) of a vertex from the nearer face: |Δz| / sqrt(1 + |∇z|²), by its tangent plane.
+    """Return the largest distance (mm) of a vertex from the nearer face's tangent plane: |Δz| / sqrt(1 + |∇z|²).
 
     The distance along z would contain the rounding of x and y, multiplied by |∇z|.
     """
@@ -277,15 +277,15 @@ class FaceNumbers(NamedTuple):
     ends2: float  # r² (mm²) of Surface.outline, outside of which the face is a plane
     per_detail: float  # smooth parts per mm: 1 / Surface.detail
     net: np.ndarray  # heights h of the control points, (m, n), mm; (0, 0): a surface of revolution
-    x: float  # corner of the net (mm)
-    y: float  # corner of the net (mm)
+    x: float  # x of the net's first corner (mm)
+    y: float  # y of the net's first corner (mm)
     per_x: float  # control points per mm along x
     per_y: float  # control points per mm along y
 
 
 @njit(inline="always")
 def _basis(u, m):
-    """Return span and weights of three control points, as bspline.basis: numba's cache misses changes elsewhere."""
+    """Return the span and weights of its control points, as bspline.basis; numba's cache misses changes elsewhere."""
     if u < 1.5:
         k, s = 0, 2.0 - math.sqrt(4.0 - 2.0 * u)
     elif u > m - 2.5:
@@ -316,7 +316,7 @@ def _sag(face, x, y):
 
 @njit(cache=True, nogil=True)
 def _distance_from_face(a, b, c, parts, face):
-    """Return the largest distance along z (mm) of a face from a triangle, at its centre and a grid of 2 x `parts`."""
+    """Return the largest distance along z (mm) of a face from a triangle: at its centre, 2 `parts` steps per edge."""
     n = 2 * parts
     worst = abs(_sag(face, (a[0] + b[0] + c[0]) / 3, (a[1] + b[1] + c[1]) / 3) - (a[2] + b[2] + c[2]) / 3)
     for i in range(n):
@@ -330,10 +330,10 @@ def _distance_from_face(a, b, c, parts, face):
 
 @njit(cache=True, nogil=True)
 def _chordal_error(vertices, faces, max_parts, radius, back, front):
-    """Return the largest distance (mm) of the lens from triangles, along their normals.
+    """Return the largest distance (mm) of the lens from triangles, along the triangles' normals.
 
     A triangle whose unit normal has |z| <= WALL_NORMAL_Z belongs to the wall: a cylinder of the given radius, or planes
-    (radius 0).  Edges have one part per smooth part of the face, at most `max_parts`.
+    (radius 0).  Each edge is divided into one part per smooth part of the face, at most `max_parts`.
     """
     worst = 0.0
     for k in range(len(faces)):
@@ -360,7 +360,7 @@ VERTEX_XML = b'<vertex x="%.10g" y="%.10g" z="%.10g"/>\n'
 TRIANGLE_XML = b'<triangle v1="%d" v2="%d" v3="%d"/>\n'
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 MAX_PROBES = 4096  # largest number of occupied slots that a corner may meet in the hash table, half of which is free
-STL_HEADER = b"bstcad, binary STL, lengths in mm"  # header, which must not begin with "solid"
+STL_HEADER = b"bstcad, binary STL, lengths in mm"  # header, which must not start with "solid"
 MAX_LINE_BYTES = 90  # longest line of a 3MF model (bytes)
 CLEAR_RGBA, MIRROR_RGBA = "#A9D3EE80", "#C9CED4FF"  # sRGB and opacity of clear material and of a mirror
 ARCHIVE_TIME = (1980, 1, 1, 0, 0, 0)  # time of the files in a 3MF package, so that equal meshes give equal bytes
@@ -374,14 +374,14 @@ class Label:
     title: str = ""
     material: str = "glass"
     colour: str = CLEAR_RGBA  # #RRGGBBAA
-    remark: str = ""  # a sentence
+    remark: str = ""  # description, a sentence; "" for none
 
 
 DEFAULT_LABEL = Label()
 
 
 def write_stl(mesh: Mesh, path: str | Path) -> None:
-    """Write the mesh as binary STL: 80 bytes of header, the count, 50 bytes per triangle in float32."""
+    """Write the mesh as binary STL: a header of 80 bytes, the number of triangles, 50 bytes per triangle (float32)."""
     with Path(path).open("wb") as file:
         file.write(STL_HEADER.ljust(80) + np.uint32(len(mesh.faces)).tobytes())
         for corners, normals in mesh.facets():
@@ -400,10 +400,12 @@ def read_stl(path: str | Path) -> Mesh:
         raise ValueError(f"{path.name}: cannot be read ({error}); give the path of an STL file") from error
     count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
     if len(data) != 84 + STL_TRIANGLE.itemsize * count or not count:
-        raise ValueError(f"{path.name}: {len(data)} bytes, no binary STL of {max(count, 0)} triangles; write it again")
+        raise ValueError(
+            f"{path.name}: is not a binary STL of {max(count, 0)} triangles ({len(data)} bytes); write it again"
+        )
     corners = np.frombuffer(data, STL_TRIANGLE, offset=84)["corners"].reshape(-1, 3)
     if not np.isfinite(corners).all():
-        raise ValueError(f"{path.name}: a corner is not finite; write it again")
+        raise ValueError(f"{path.name}: a corner is not finite; write the file again")
     corners = np.ascontiguousarray(corners) + np.float32(0)  # -0 becomes 0
     bits = corners.view(np.uint32)
     first, same = _weld(bits)
@@ -416,7 +418,7 @@ def read_stl(path: str | Path) -> Mesh:
 def _weld(bits):
     """Group equal corners, float32 (n, 3) seen as uint32, by hash: (first corner of each group, group of each corner).
 
-    Both are empty if a corner meets MAX_PROBES occupied slots, which happens on no real surface.
+    The two arrays are empty if a corner meets MAX_PROBES occupied slots, which no real surface causes.
     """
     size = 1 << 16
     while size < 2 * len(bits):
@@ -459,7 +461,7 @@ Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relations
 
 
 def model_3mf(mesh: Mesh, label: Label = DEFAULT_LABEL) -> Iterator[bytes]:
-    """Yield the 3MF core model of the mesh, in millimetres, in parts: one object of one material with its colour."""
+    """Yield parts of the 3MF core model of the mesh, in millimetres: one object of one material and colour."""
     about = {"Title": label.title or label.name, "Description": label.remark, "Application": "bstcad"}
     metadata = "".join(f'<metadata name="{key}">{escape(text)}</metadata>\n' for key, text in about.items() if text)
     yield (
@@ -507,8 +509,8 @@ def _archive_member(name: str) -> zipfile.ZipInfo:
 def preview_files(lens: Lens, label: Label) -> Iterator[tuple[str, bytes]]:
     """Yield names and bytes of preview.glb and preview.3mf, which have few triangles and state their chordal error.
 
-    Web pages (glTF) and slicers (3MF) cannot show a million triangles.  The normals of the glTF are those of the
-    surface itself, so that its shading shows the whole relief.
+    Web pages (glTF) and slicers (3MF) cannot show a million triangles.  The glTF states the normals of the exact
+    surface, so that shading shows the whole relief.
     """
     mesh = lens_mesh(lens, max_cells(lens, PREVIEW_TRIANGLES))
     off = chordal_error(mesh, lens)
@@ -522,7 +524,7 @@ def preview_files(lens: Lens, label: Label) -> Iterator[tuple[str, bytes]]:
 def _glb(mesh: Mesh, lens: Lens, label: Label, off: float) -> bytes:
     """Encode the mesh as binary glTF, in metres, y upwards; off: chordal error (mm), which the extras state.
 
-    A vertex on an edge of the lens is repeated for each face and for each facet of the wall, with its normal.
+    A vertex on an edge of the lens is repeated with the normal of each face, and of each facet of the wall, there.
     """
     import trimesh  # takes most of a second
     from trimesh.visual import TextureVisuals

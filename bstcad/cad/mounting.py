@@ -1,7 +1,7 @@
-"""Lenses in a body, as one part: a scene's [mount], a plate with an array of lenses, an insert's block.
+"""Lenses and a body as one part: a scene's [mount], a plate with an array of lenses, the block of an insert.
 
-The body is any cadquery solid.  A prism over the lens's rim is cut out of it, which is quick, since no net is involved.
-Then the walls of that opening are replaced by walls between the faces of the body and of the lens, with shared edges.
+The body is any cadquery solid.  First, a prism over the lens's rim is cut out, which is quick, since it has no net.
+Then the walls of this opening are replaced by walls between the faces of the body and of the lens, with shared edges.
 The optical faces keep the control points of the design.
 """
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 WALL_TOLERANCE = 1e-6  # largest distance (mm) between a lens's wall and an edge of the body that lies on it
 COSINE_TOLERANCE = 1e-12  # largest deviation from 1 of |z| of the unit normal of a plane z = const
 EDGE_FRACTIONS = (0.0, 0.31, 0.77, 1.0)  # fractions of an edge's length at which its distance from a wall is measured
-INVALID_PART = "mount: body and lens make no valid solid; move the body's edges away from the lens's rim"
+INVALID_PART = "mount: body and lens do not form a valid solid; move the body's edges away from the lens's rim"
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class PlacedLens:
 
 
 def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[PlacedLens]) -> NamedSolid:
-    """Return the body with each lens in an opening of the lens's shape, all one solid.
+    """Return one solid of the body and the lenses, each in an opening of the lens's shape.
 
-    Around each lens the body must lie between two planes z = const that meet the lens's wall.  A plane may also lie
-    above the rim of the back or below the rim of the front, but may not cut it; a plane front may lie in the lower one.
-    Raises ValueError in one sentence otherwise.
+    Around each lens, the body must lie between two planes z = const that meet the lens's wall.  A plane may also lie
+    above the rim of the back or below the rim of the front, but may not cut a rim; a plane front may lie in the lower
+    plane.  Raises ValueError in one sentence otherwise.
     """
     import cadquery
 
@@ -87,10 +87,10 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[PlacedLe
 
 
 def _solid(shape: cadquery.Shape, name: str) -> cadquery.Solid:
-    """Return the one solid in a shape; ValueError if there is not exactly one."""
+    """Return the only solid in a shape; ValueError if there is not exactly one."""
     solids = shape.Solids()
     if len(solids) != 1:
-        raise ValueError(f"mount: {name} is {len(solids)} solids; give one solid that reaches all around each lens")
+        raise ValueError(f"mount: {name} has {len(solids)} solids; give one solid that extends all around each lens")
     return solids[0]
 
 
@@ -137,7 +137,7 @@ class _Opening:
         return cadquery.Solid.extrudeLinear(low, [], cadquery.Vector(0, 0, box.zlen + 2))
 
     def find_faces(self, faces: Sequence[cadquery.Face]) -> tuple[set[int], _BodyPlane, _BodyPlane]:
-        """Return the indices of the opening's walls among the body's faces, and its upper and lower plane."""
+        """Return the indices of the opening's walls among the body's faces, and the body's upper and lower plane."""
         inner: set[int] = set()
         planes: dict[bool, list[_BodyPlane]] = {True: [], False: []}
         for k, face in enumerate(faces):
@@ -148,13 +148,13 @@ class _Opening:
                 normal = face.normalAt().z if face.geomType() == "PLANE" else 0.0
                 if abs(abs(normal) - 1) > COSINE_TOLERANCE:
                     raise ValueError(
-                        f"{self.name}: the body meets it in a face that is not a plane z = const; make it one"
+                        f"{self.name}: the body meets the lens in a face other than a plane z = const; make it a plane"
                     )
                 planes[normal > 0].append(_BodyPlane(k, around.index(True), face.toPln().Location().Z()))
         if [len(planes[above]) for above in (True, False)] != [1, 1]:
             raise ValueError(
-                f"{self.name}: the body must surround it between two planes z = const, but {len(planes[True])} upper "
-                f"and {len(planes[False])} lower planes meet it; give the body the shape of a plate there"
+                f"{self.name}: the body must surround the lens between two planes z = const, but {len(planes[True])} "
+                f"upper and {len(planes[False])} lower planes meet it; give the body the shape of a plate there"
             )
         return inner, planes[True][0], planes[False][0]
 
@@ -172,7 +172,7 @@ class _Opening:
         if self.draft and below_front is not False:
             raise ValueError(
                 f"{self.name}: draft and bevel need a wall of the lens below the flange, but the flange's lower face, "
-                f"z = {lower:g} mm, leaves none; leave them out, or move the flange up"
+                f"z = {lower:g} mm, leaves none; omit draft and bevel, or move the flange up"
             )
         tops = [walls.rail_on(lens.back, loop) for loop in self.loops]
         inner = [walls.rail_on(lens.front.around, hole) for hole in holes]
@@ -206,10 +206,10 @@ class _Opening:
 
 
 def check_fit(lens: Lens, rim: Sequence[LoopPiece], planes: tuple[float, float], name: str) -> tuple[bool, bool | None]:
-    """Return True if the body's upper plane lies above the back's rim, and True if its lower one is below the front's.
+    """Return (True if the upper plane is above the back's rim, True if the lower plane is below the front's rim).
 
-    The second is None if the front lies in the lower plane.  planes: z of lower and upper plane in the lens's frame
-    (mm).  Raises ValueError if a plane cuts a rim, or the body misses the wall.
+    The second is None if the front lies in the lower plane.  planes: z of the body's lower and upper plane in the
+    lens's frame (mm).  Raises ValueError if a plane cuts a rim, or the body misses the wall.
     """
     lower, upper = planes
     high, low = (sag(face, *rim_points(lens, rim)) for face in (lens.back, lens.front))
@@ -220,19 +220,19 @@ def check_fit(lens: Lens, rim: Sequence[LoopPiece], planes: tuple[float, float],
         if cuts and not (flat and face == "front"):
             raise ValueError(
                 f"{name}: the flange's {side} face, z = {z:g} mm, cuts the rim of the {face}, which runs from z = "
-                f"{heights.min():.4g} to {heights.max():.4g} mm; put it below or above that"
+                f"{heights.min():.4g} to {heights.max():.4g} mm; move it below or above this range"
                 + (", or into the plane of a plane front" if face == "front" else "")
             )
     if (np.minimum(upper, high) - np.maximum(lower, low)).min() < MIN_WALL:
         raise ValueError(
             f"{name}: the flange, from z = {lower:g} to {upper:g} mm, misses the lens's wall, from z = {low.max():.4g} "
-            f"to {high.min():.4g} mm; move the flange there"
+            f"to {high.min():.4g} mm; move the flange to this height"
         )
     return bool(upper > high.max()), None if flat else bool(lower < low.min())
 
 
 def _replace_loops(face: cadquery.Face, replacements: dict[int, list[Loop]] | None) -> TopoDS_Face:
-    """Return a plane face of the body with other loops for some of its wires; None: without change."""
+    """Return a plane face of the body, its wires replaced by loops, by index of the wire; None: an unchanged face."""
     if replacements is None:
         return face.wrapped
     loops: list[Loop] = []
@@ -251,7 +251,7 @@ def _is_forward(shape: TopoDS_Shape) -> bool:
 
 
 def part_of(lens: Lens, mount: Mount) -> NamedSolid:
-    """Return the part in the frame of the mount's datum, with names of faces; ValueError if lens and flange misfit."""
+    """Return the part in the frame of the mount's datum, with names of faces; ValueError if the lens does not fit."""
     trim, draft = None if mount.rim is None else wire(mount.rim), Draft(mount.draft, mount.bevel)
     try:
         if mount.flange is None:
@@ -260,7 +260,7 @@ def part_of(lens: Lens, mount: Mount) -> NamedSolid:
             found = mounted(body(mount.flange), [PlacedLens(lens, trim, draft=draft)])
     except (Standard_Failure, StdFail_NotDone) as error:
         raise ValueError(
-            f"mount: OpenCASCADE cannot build it ({type(error).__name__}); make bevel or draft smaller, or omit them"
+            f"mount: OpenCASCADE cannot build the part ({type(error).__name__}); reduce or omit bevel and draft"
         ) from error
     return found._replace(solid=found.solid.translate((0, 0, -mount.origin(lens.front_vertex))))
 
@@ -298,7 +298,7 @@ def body(flange: Flange) -> cadquery.Workplane:
 def _bevelled(plate: cadquery.Solid, bevel: float, lean: float) -> cadquery.Solid:
     """Return a plate with bevels of a height (mm) along z, at 45 degrees; lean: inward slope of its walls, mm per mm.
 
-    Workplane.chamfer does not state which of its two lengths belongs to which face.
+    Workplane.chamfer is not used, because it does not define which of its two lengths belongs to which face.
     """
     import cadquery
 
@@ -311,7 +311,7 @@ def _bevelled(plate: cadquery.Solid, bevel: float, lean: float) -> cadquery.Soli
 
 
 def write_if_it_fits(lens: Lens, mount: Mount, path: str | Path, name: str, facts: Part) -> None:
-    """Write part.step with the statements of [part]; no file if it cannot be built: `part_of` gives the reason."""
+    """Write part.step with the data of [part]; write nothing if the part cannot be built (`part_of` says why)."""
     try:
         part = part_of(lens, mount)
     except ValueError:

@@ -1,10 +1,10 @@
 """Exact OCC surfaces of the optical faces of a lens, and conversion of arrays to OCC and back.
 
-Each face has an OCC surface of its own kind, without a fit: the poles and knots of the back are the control points and
-knots of the design.  All OCC arrays (TColgp, TColStd) are built in this module, because OCC 8 moves those names.
+Each face becomes an OCC surface of the same kind, without a fit: the poles and knots of the back are the control points
+and knots of the design.  All OCC arrays (TColgp, TColStd) are built in this module, because OCC 8 moves their classes.
 
-Large nets are passed to OCC and back as bytes of its binary files (BinTools), exact to the last bit.  One by one, the
-poles of 2049 x 2049 control points take 6 s to pass in, and nearly as long to read back.
+Large nets are passed to OCC and back as bytes of OCC's binary files (BinTools), exact to the last bit.  Passing
+2049 x 2049 poles one by one takes 6 s, and reading them back nearly as long.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Conic, Sphere
 
-PATCH_MARGIN = 1.02  # ratio of a patch's width to the outline's: the rim touches no border of the patch
-PARABOLA_TOLERANCE = 1e-10  # deviation (mm) from its parabola below which a sphere is written as that parabola
+PATCH_MARGIN = 1.02  # ratio of a patch's width to the outline's, so that the rim does not touch the patch's boundary
+PARABOLA_TOLERANCE = 1e-10  # deviation (mm) of a sphere from a parabola, below which the parabola is written
 
 ParameterMap = Callable[[np.ndarray, np.ndarray], np.ndarray]  # map from (x, y) in mm to (u, v) of a patch, (…, 2)
 
@@ -43,11 +43,11 @@ class Patch:
 
     surface: Geom_Surface
     outward: bool  # True if the normal of the surface, ∂u x ∂v, points out of the lens
-    uv: ParameterMap | None = None  # None: a plane, on which OCC needs no edges in (u, v)
+    uv: ParameterMap | None = None  # map to (u, v); None: a plane, on which OCC needs no curves in (u, v)
 
 
 def back_patch(lens: Lens) -> Patch:
-    """Return the back: Σ B_i(u) B_j(v) P_ij on the design's net and knots (3, 1, …, 1, 3), normal towards +z."""
+    """Return the back, Σ B_i(u) B_j(v) P_ij with the net P and the knots of the design; normal towards +z."""
     return _net_patch(lens.back_net.plain(), lens.outline, outward=True)
 
 
@@ -69,21 +69,21 @@ def net_parameters(face: BSplineSurface) -> ParameterMap:
 
 
 def _check_round(surface: BSplineSurface, radius: float) -> None:
-    """Raise ValueError unless x(u) and y(v) are linear with one pitch inside the rim: a circle is one in (u, v)."""
+    """Raise ValueError unless x(u) and y(v) are linear with equal pitch up to the rim, then a circle in (u, v), too."""
     (x0, x1), (y0, y1) = surface.x, surface.y
     dx, dy = surface.pitch
     if abs(dx - dy) > 1e-12 * dx:
-        raise ValueError(f"lens: control points {dx:g} mm apart in x, {dy:g} in y; give a round lens a square net")
-    reach = min(-x0, x1, -y0, y1) - 1.5 * dx  # the end spans, where x(u) is quadratic, are 1.5 control points wide
+        raise ValueError(f"lens: the net's pitch is {dx:g} mm in x, {dy:g} mm in y; give a round lens a square net")
+    reach = min(-x0, x1, -y0, y1) - 1.5 * dx  # the end spans, where x(u) is quadratic, are 1.5 pitches wide
     if radius > reach + 1e-9 * dx:
         raise ValueError(
             f"lens: the net's linear part ends at {reach:g} mm, inside the rim at {radius:g} mm; "
-            "let the net reach two spans past the rim"
+            "extend the net to two spans beyond the rim"
         )
 
 
 def front_patch(lens: Lens) -> Patch:
-    """Return the front as an OCC surface of its own kind; its normal may point inwards."""
+    """Return the front's optical part as an OCC surface of the same kind, whose normal may point into the lens."""
     front, outline = lens.front.plain().optical, lens.front.outline or lens.outline
     if front.level:
         return level_patch(front.z)
@@ -98,16 +98,16 @@ def level_patch(z: float) -> Patch:
 
 
 def _sphere_patch(front: Sphere, outline: Outline) -> Patch:
-    """Return a sphere with its polar axis along ±x and u = π at the vertex: no pole (x = ±R), no seam on the patch.
+    """Return a sphere with polar axis ±x and u = π at the vertex, so that no pole (x = ±R) or seam is on the patch.
 
     With s = sign(c): x = s R sin v, y = -R cos v sin u, z - z_centre = s R cos v cos u; normal away from the centre.
-    A sphere with its centre 10⁵ mm away would lose digits.  It is written as the parabola z0 + c r²/2, from which it
-    deviates by c³ r⁴/8 < PARABOLA_TOLERANCE.
+    With a centre 10⁵ mm away, digits would be lost.  Such a sphere is written as the parabola z0 + c r²/2 if it
+    deviates from the parabola by c³ r⁴/8 < PARABOLA_TOLERANCE.
     """
     (c, _), r = front.conic(), float(np.hypot(*outline.farthest))
     if abs(c) * r >= 1:
         raise ValueError(
-            f"lens.front: a sphere of radius {1 / abs(c):g} mm ends inside the lens's rim at {r:g} mm; flatten it"
+            f"lens.front: a sphere of radius {1 / abs(c):g} mm ends inside the rim at {r:g} mm; increase the radius"
         )
     if abs(c) ** 3 * r**4 / 8 < PARABOLA_TOLERANCE:
         return _conic_patch(Conic(front.z, c, -1.0), outline)
@@ -124,9 +124,9 @@ def _sphere_patch(front: Sphere, outline: Outline) -> Patch:
 def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]:
     """Return poles (3, 3, 3) in mm and weights (3, 3) of a conic over |u| <= a, |v| <= b (mm).
 
-    With K = (1 + k) c², w = 1 + K (u² + v²) / 4: x = u / w, y = v / w, z = z0 + c/2 (u² + v²) / w.  These are
-    homogeneous quadratics, so that a rational patch of degree 2 x 2 is exactly the conic, projected from its far
-    vertex.  The blossom of u² over [-a, a] is a² (1, -1, 1).
+    With K = (1 + k) c², w = 1 + K (u² + v²) / 4: x = u / w, y = v / w, z = z0 + c/2 (u² + v²) / w.  In homogeneous
+    coordinates these are quadratic, so that a rational patch of degree 2 x 2 is exactly the conic; (u, v) is its
+    projection from its far vertex.  The blossom of u² on [-a, a] is a² (1, -1, 1).
     """
     ends, blossom = np.array([-1.0, 0.0, 1.0]), np.array([1.0, -1.0, 1.0])
     square = a * a * blossom[:, None] + b * b * blossom[None, :]
@@ -139,7 +139,7 @@ def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]
 
 
 def _conic_patch(front: Conic, outline: Outline) -> Patch:
-    """Return a rational patch (see `conic_net`): in (u, v) circles about the axis are circles, straight sides arcs."""
+    """Return a rational patch (`conic_net`).  Circles about the axis are circles in (u, v), straight sides are arcs."""
     (c, k), (a, b) = front.conic(), outline.half_extent
     bend = (1 + k) * c**2  # K
 
@@ -151,8 +151,8 @@ def _conic_patch(front: Conic, outline: Outline) -> Patch:
     ends = np.maximum(uv(a, 0.0) + uv(0.0, b), 0.0 if outline.is_round else uv(a, b))
     if not np.isfinite(ends).all() or not (abs(bend) / 4 * (PATCH_MARGIN * ends) ** 2).sum() < 1:
         raise ValueError(
-            f"lens.front: a conic of constant {k:g} and radius {1 / abs(c):g} mm turns too sharply before the rim, "
-            f"{np.hypot(*outline.farthest):g} mm from the axis; flatten it"
+            f"lens.front: a conic of constant {k:g} and radius {1 / abs(c):g} mm is too steep inside the rim, "
+            f"{np.hypot(*outline.farthest):g} mm from the axis; increase the radius"
         )
     half_u, half_v = PATCH_MARGIN * ends
     net, weights = conic_net(front, half_u, half_v)
@@ -197,7 +197,7 @@ def _knot_arrays(full: np.ndarray) -> tuple[TColStd_Array1OfReal, TColStd_Array1
 def bspline_surface(
     net: np.ndarray, knots_u: np.ndarray, knots_v: np.ndarray, weights: np.ndarray | None = None
 ) -> Geom_BSplineSurface:
-    """Return the B-spline surface of a control net (m, n, 3) in mm and full knots; rational with weights (m, n)."""
+    """Return the B-spline surface of a net (m, n, 3) in mm and full knot vectors, rational with weights (m, n)."""
     m, n = net.shape[:2]
     if weights is None and m * n > SMALL_NET:
         return _surface_of(surface_bytes(net, knots_u, knots_v))
@@ -255,9 +255,9 @@ def knots_of(surface: Geom_BSplineSurface) -> tuple[np.ndarray, np.ndarray]:
 
 # ---- nets as bytes of OCC's binary files -----------------------------------------------------------------------------
 
-SMALL_NET = 4096  # largest number of control points that are passed one by one
-# A surface without weights: its kind (9: B-spline), four flags (rational and periodic in u and v), degrees, numbers of
-# poles and of distinct knots in u and v; then the poles, v changing fastest, and each knot with its multiplicity.
+SMALL_NET = 4096  # largest number of control points that are passed to OCC one by one
+# Kind of a surface (9: B-spline), four flags (rational and periodic in u and v), degrees, numbers of poles and of
+# distinct knots in u and v.  The poles follow, v changing fastest, then each knot with its multiplicity.
 SURFACE_HEADER = struct.Struct("<B4B2H4i")
 BSPLINE_KIND = 9
 KNOT_RECORD = np.dtype([("value", "<f8"), ("count", "<i4")])
@@ -278,7 +278,7 @@ def from_bytes(data: bytes) -> TopoDS_Shape:
 
 
 def surface_bytes(net: np.ndarray, *full_knots: np.ndarray) -> bytes:
-    """Encode the B-spline surface of a control net (m, n, 3) in mm and full knots as in a binary file of OCC."""
+    """Encode the B-spline surface of a net (m, n, 3) in mm and full knot vectors as in a binary file of OCC."""
     distinct = [np.unique(knots, return_counts=True) for knots in full_knots]
     degrees = (len(knots) - m - 1 for knots, m in zip(full_knots, net.shape, strict=False))
     sizes = *net.shape[:2], *(len(values) for values, _ in distinct)
@@ -294,11 +294,11 @@ def _face_on(surface: Geom_Surface) -> TopoDS_Face:
 
 
 def _surface_of(own: bytes) -> Geom_BSplineSurface:
-    """Decode a surface from its bytes, which replace those of the placeholder in the file of a face."""
+    """Decode a surface: its bytes replace the bytes of a placeholder surface in the file of a face."""
     data = _PLACEHOLDER_FILE.replace(surface_bytes(*_PLACEHOLDER_NET), own, 1)
     return BRep_Tool.Surface_s(TopoDS.Face_s(from_bytes(data)))
 
 
-_PLACEHOLDER_NET = (np.zeros((2, 2, 3)), *[np.array([0.0, 0.0, 1.0, 1.0])] * 2)  # control net and knots
+_PLACEHOLDER_NET = (np.zeros((2, 2, 3)), *[np.array([0.0, 0.0, 1.0, 1.0])] * 2)  # control net and knot vectors
 _PLACEHOLDER_FILE = to_bytes(_face_on(bspline_surface(*_PLACEHOLDER_NET)))
-SURFACE_OFFSET = _PLACEHOLDER_FILE.index(surface_bytes(*_PLACEHOLDER_NET))  # bytes before the surface in such a file
+SURFACE_OFFSET = _PLACEHOLDER_FILE.index(surface_bytes(*_PLACEHOLDER_NET))  # bytes before it in a file

@@ -1,6 +1,6 @@
-"""Lenses on cadquery's Workplane: `import bstcad.cad.plugin` gives it two methods.
+"""Two methods of cadquery's Workplane for lenses, which `import bstcad.cad.plugin` adds.
 
-Workplane.lens(design) puts a lens at each point of the stack, as `sphere` and `box` do with their solids.
+Workplane.lens(design) puts a lens at each point of the stack, as `sphere` and `box` put their solids.
 Workplane.mounted(design) joins the solid under construction with a lens at each point.
 """
 
@@ -19,7 +19,7 @@ from bstcad.cad.solid import lens_solid
 def lens(
     self: cadquery.Workplane, design: Any, trim: cadquery.Wire | None = None, holes: Sequence[Any] = ()
 ) -> cadquery.Workplane:
-    """Return a Workplane with a lens at each point of the stack, which is the origin of the lens's scene.
+    """Return a Workplane with a lens at each point of the stack; the origin of the lens's scene lies at the point.
 
     design: a bstcad.Design or a bstcad.Lens; trim, holes: see Design.solid.
     """
@@ -30,9 +30,9 @@ def lens(
 def mounted(
     self: cadquery.Workplane, design: Any, z: float = 0.0, trim: cadquery.Wire | None = None, holes: Sequence[Any] = ()
 ) -> cadquery.Workplane:
-    """Return a Workplane with one solid: the solid of the chain and a lens at each point; see bstcad.mounted.
+    """Return a Workplane with one solid: the chain's solid joined with a lens at each point; see bstcad.mounted.
 
-    Only x and y of the points are used; z: height (mm) of the origin of the lens's scene.
+    Only x and y of the points are used.  z: height (mm) of the origin of the lens's scene.
     """
     lenses: list[PlacedLens] = []
 

@@ -1,9 +1,9 @@
-"""Reading of the lens in a STEP file by OCC, in a second process, because OCC may crash over a damaged file.
+"""Reading of the lens in a STEP file by OCC, in a second process, because a damaged file may crash OCC.
 
-A lens that another program has moved is read in its own frame, together with its placement: its axis is z, and light
-enters through the front, towards +z.  Outline and clear apertures follow from the edges.  The edges are compared with
-the faces that they bound: OCC's own checks look at the ends of an edge and a few points between, and accept a solid
-whose rim runs the wrong way around its circle.
+A lens that another program has moved is read in its own frame, together with the placement of that frame: the axis is
+z, and light enters through the front, towards +z.  Outline and clear apertures follow from the edges.  The edges are
+compared with the faces that they bound: OCC's own checks examine only the ends of an edge and a few points between
+them, and accept a solid whose rim runs the wrong way around its circle.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ GRID_TOLERANCE = 1e-9  # largest deviation (mm) of a net of bstcad from a unifor
 AXIAL_TOLERANCE = 1e-9  # largest deviation (mm or rad) of a wall from an outline about the axis
 CIRCLE_TOLERANCE = 1e-6  # largest deviation (mm) of an edge from its circle or rectangle
 LEVEL_TOLERANCE = 1e-7  # largest distance (mm) of the plane around a front from the front's edge
-APERTURE_DECIMALS = 9  # decimals of a clear aperture in mm; finer ones are rounding of the file's coordinates
-POINTS_PER_EDGE = 129  # points on each edge of a face
-POINTS_PER_SPAN = 4  # points per knot span of an edge: one pole of a curve affects three spans
+APERTURE_DECIMALS = 9  # decimals of a clear aperture (mm); further ones are rounding errors of the coordinates
+POINTS_PER_EDGE = 129  # number of points sampled along each edge of a face
+POINTS_PER_SPAN = 4  # number of points sampled per knot span of an edge; one pole of a curve affects three spans
 
 OccFace = tuple[TopoDS_Face, BRepAdaptor_Surface]
 
@@ -60,14 +60,14 @@ class StepLens:
     control_points: np.ndarray  # control points of the back as read by OCC, (m, n, 3), x along the first axis
     back: BSplineSurface
     front: Surface
-    outline: Outline  # outline of a bare lens; for other walls, the extent of the back's edge
+    outline: Outline  # outline of a bare lens; with other walls, the circle or rectangle around the back's edge
     edge: np.ndarray | None  # points along the edge of the back, (n, 2), mm; None: a bare lens
     faces: tuple[TopoDS_Face, TopoDS_Face]  # front and back
     placement: Placement = field(default_factory=identity)  # placement of the lens's frame in the file
 
     @property
     def clear(self) -> tuple[Outline, Outline]:
-        """Clear apertures of front and back, from the edges of these faces; see `clear_apertures`."""
+        """Clear apertures of front and back, from the edges of the two faces; see `clear_apertures`."""
         front, back = clear_apertures(*map(outer_edge, self.faces))
         return self.front.outline or front, back
 
@@ -87,7 +87,7 @@ def quiet_occ() -> Iterator[None]:
 
 
 def parts_of(shape: TopoDS_Shape, kind: TopAbs_ShapeEnum) -> list[TopoDS_Shape]:
-    """Return the solids, faces, edges or vertices of a shape, each once, as cadquery does, whose import takes 1.4 s."""
+    """Return the solids, faces, edges or vertices of a shape, each once, without cadquery (its import takes 1.4 s)."""
     parts = TopTools_IndexedMapOfShape()
     TopExp.MapShapes_s(shape, kind, parts)
     return [parts(i) for i in range(1, parts.Extent() + 1)]
@@ -98,7 +98,7 @@ def solid(path: Path) -> TopoDS_Solid:
     reader = STEPControl_Reader()
     with quiet_occ():
         if reader.ReadFile(str(path)) != IFSelect_RetDone:
-            raise ValueError(f"{path.name}: OpenCASCADE cannot read it, so it is damaged; write it again")
+            raise ValueError(f"{path.name}: OpenCASCADE cannot read this damaged file; write it again")
         reader.TransferRoots()
     shape = reader.OneShape()
     solids = [] if shape.IsNull() else parts_of(shape, TopAbs_SOLID)
@@ -108,7 +108,7 @@ def solid(path: Path) -> TopoDS_Solid:
 
 
 def read(path: str | Path, shape: TopoDS_Solid | None = None) -> StepLens:
-    """Read the lens in a STEP file, or in its `shape` if known; ValueError in one sentence if there is not just one."""
+    """Read the lens in a STEP file.  shape: solid of the file, if already read.  ValueError unless it has one lens."""
     path = Path(path)
     try:
         found, placement = in_own_frame(shape or solid(path))
@@ -118,7 +118,7 @@ def read(path: str | Path, shape: TopoDS_Solid | None = None) -> StepLens:
 
 
 def lens(step_lens: StepLens, index: float) -> Lens:
-    """Return the lens of a file with a refractive index, for tracing."""
+    """Return the lens of a file, with a refractive index, for ray tracing."""
     return Lens(step_lens.front, step_lens.back, step_lens.outline, index)
 
 
@@ -128,7 +128,7 @@ def is_valid(solid: TopoDS_Solid) -> bool:
 
 
 def gaps(solid: TopoDS_Solid) -> float:
-    """Return the largest tolerance (mm) of edges and vertices, which OCC's reader enlarges until curves meet faces."""
+    """Return the largest tolerance (mm) of edges and vertices; OCC's reader increases each until curves meet faces."""
     return ShapeAnalysis_ShapeTolerance().Tolerance(solid, 1)
 
 
@@ -138,8 +138,8 @@ def gaps(solid: TopoDS_Solid) -> float:
 def in_own_frame(solid: TopoDS_Solid) -> tuple[TopoDS_Solid, Placement]:
     """Return the solid of a lens in the frame of the lens, and the placement of that frame in the file.
 
-    If the back is a height over x and y in the frame in which the file defines the solid, that frame is the lens's.
-    Otherwise it is the frame of the back's net.  A solid without such a net keeps the frame of its definition.
+    The frame of the lens is the frame in which the file defines the solid, if the back is a height z(x, y) there.
+    Otherwise, it is the frame of the back's net.  A solid without such a net keeps the frame of its definition.
     """
     stated = _placement(solid.Location())
     defined = TopoDS.Solid_s(solid.Located(TopLoc_Location()))
@@ -151,7 +151,7 @@ def in_own_frame(solid: TopoDS_Solid) -> tuple[TopoDS_Solid, Placement]:
     if not frame.moves:
         return defined, stated
     if not _looks_along_net(face):
-        why = "its freeform face looks against the normal of its net, u x v, as in a mirror image"
+        why = "its freeform face points against the normal u x v of the net, as in a mirror image"
         raise ValueError(f"{why}; export the lens as bstcad wrote it")
     return TopoDS.Solid_s(defined.Moved(_location(frame.inverse))), stated.after(frame)
 
@@ -177,7 +177,7 @@ def _lens_in(solid: TopoDS_Solid) -> StepLens:
     faces = _faces(solid)
     nets = _freeform_faces(faces)
     if (found := _back_face(nets)) is None:
-        raise ValueError(f"{len(nets)} B-spline faces; a lens has one, or two that face away from each other")
+        raise ValueError(f"{len(nets)} B-spline faces; give a lens with one, or two that face away from each other")
     (back_face, back), fronts = found, [face for face in nets if face is not found]
     net = patches.net_of(back.BSpline())
     middle = (net[0, 0, :2] + net[-1, -1, :2]) / 2
@@ -206,7 +206,7 @@ def _freeform_faces(faces: Sequence[OccFace]) -> list[OccFace]:
 
 
 def _back_face(nets: Sequence[OccFace]) -> OccFace | None:
-    """Return the freeform face through which light leaves: of two the one that looks along its net's normal."""
+    """Return the only freeform face, or of two the face that points along its net's normal; None if there is none."""
     backs = [face for face in nets if len(nets) == 1 or _looks_along_net(face[0])]
     return backs[0] if len(backs) == 1 and len(nets) <= 2 else None
 
@@ -217,7 +217,7 @@ def _looks_along_net(face: TopoDS_Face) -> bool:
 
 
 def is_freeform(surface: BRepAdaptor_Surface) -> bool:
-    """True if a surface has more control points than 3 x 3 (a conic, a nearly flat sphere) and is not a ruled wall."""
+    """True for a B-spline that is not a ruled wall, with more control points than the 3 x 3 of conics and parabolas."""
     return _is_patch(surface) and surface.NbUPoles() * surface.NbVPoles() > 9
 
 
@@ -226,19 +226,19 @@ def _is_patch(surface: BRepAdaptor_Surface) -> bool:
 
 
 def freeform_surface(face: TopoDS_Face) -> BSplineSurface:
-    """Return the height over (x, y) of a face from its vertex; ValueError unless bstcad could have written its net."""
+    """Return the surface of a face, heights from its vertex; ValueError unless bstcad could have written its net."""
     surface = BRepAdaptor_Surface(face)
     return _uniform_net(surface, patches.net_of(surface.BSpline())).from_vertex()
 
 
 def _uniform_net(surface: BRepAdaptor_Surface, net: np.ndarray) -> BSplineSurface:
-    """Return the height of a net; ValueError unless it is plain, of degree 2 x 2, uniform in its knots, x and y."""
+    """Return the surface of a net; ValueError unless it is of degree 2 x 2, not rational, uniform in knots, x and y."""
     patch = surface.BSpline()
     (m, n), degrees = (patch.NbUPoles(), patch.NbVPoles()), (patch.UDegree(), patch.VDegree())
     if degrees != (2, 2) or min(m, n) < MIN_SIDE or patch.IsURational() or patch.IsVRational():
         raise ValueError(
-            f"the freeform face is of degree {degrees[0]} x {degrees[1]} on a net of {m} x {n}; "
-            "bstcad reads plain nets of degree 2 x 2"
+            f"the freeform face has degree {degrees[0]} x {degrees[1]} and a net of {m} x {n}; "
+            "give a file written by bstcad, with a net of degree 2 x 2 without weights"
         )
     for axis, full, count in zip("xy", patches.knots_of(patch), (m, n), strict=True):
         off = np.abs(full - knots(count))
@@ -257,7 +257,7 @@ def _uniform_net(surface: BRepAdaptor_Surface, net: np.ndarray) -> BSplineSurfac
 
 
 def _looks_up(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> bool:
-    """True if the outward normal of a face points towards +z in the middle of its parameters."""
+    """True if the outward normal of a face points towards +z at the centre of its parameter range."""
     u = (surface.FirstUParameter() + surface.LastUParameter()) / 2
     v = (surface.FirstVParameter() + surface.LastVParameter()) / 2
     [[_, along_u, along_v]] = points_and_tangents(surface, [u], [v])
@@ -265,7 +265,7 @@ def _looks_up(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> bool:
 
 
 def _front_face(rest: Sequence[OccFace]) -> OccFace:
-    """Return a front that is not a net: a sphere, a patch of 3 x 3, or the smallest plane z = const that looks down."""
+    """Return the face of a front without a net: sphere, patch of 3 x 3, or smallest plane z = const that faces -z."""
     planes = [face for face in rest if face[1].GetType() == Kind.GeomAbs_Plane]
     level = [face for face in planes if abs(face[1].Plane().Axis().Direction().Z()) > 1 - AXIAL_TOLERANCE]
     if len(level) > 1:
@@ -273,12 +273,12 @@ def _front_face(rest: Sequence[OccFace]) -> OccFace:
         level = sorted(facing_down, key=lambda face: float(np.hypot(*outer_edge(face[0]).T).max()))
     curved = [face for face in rest if face[1].GetType() == Kind.GeomAbs_Sphere or _is_patch(face[1])]
     if not (curved or level):
-        raise ValueError("no plane, sphere or flat patch faces the light; give a file written by bstcad")
+        raise ValueError("no plane, sphere or conic faces the light; give a file written by bstcad")
     return (curved or level)[0]
 
 
 def _front_outline(front: Sphere | Conic, face: TopoDS_Face, others: Sequence[OccFace]) -> Circle | None:
-    """Return the outline of a curved front with a plane z = const around it; None if it ends on walls."""
+    """Return the outline of a curved front with a plane z = const around it; None if the front ends at walls."""
     edge = _bounding_outline(outer_edge(face))
     if front.level or not isinstance(edge, Circle):
         return None
@@ -295,7 +295,7 @@ def _is_level(surface: BRepAdaptor_Surface, z: float) -> bool:
 
 
 def _front_surface(face: TopoDS_Face, surface: BRepAdaptor_Surface, others: Sequence[OccFace]) -> Surface:
-    """Return a front that is not a net, with its outline if there is a plane around it; others: the other faces."""
+    """Return the surface of a front without a net, with an outline if a plane surrounds it.  others: other faces."""
     if surface.GetType() == Kind.GeomAbs_Plane:
         return Plane(surface.Plane().Location().Z())
     curved = _sphere(face, surface) if surface.GetType() == Kind.GeomAbs_Sphere else _conic(surface.BSpline())
@@ -313,11 +313,11 @@ def _sphere(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> Sphere:
 
 
 def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
-    """Return z0, c and k of the poles and weights of a patch of 3 x 3 (see patches.conic_net).
+    """Return the conic with the poles and weights of a patch of 3 x 3 (see patches.conic_net).
 
-    Let Q = a² + b² of the half widths, and scale the weights to mean 1 of corner and middle.  There w = 1 ± K Q / 4
-    with K = (1 + k) c², and the heights are z0 + c/2 Q / w and z0 - c/2 Q / w.  The parabola of a nearly flat sphere is
-    read as that sphere.
+    Let Q = a² + b² for half widths a and b, and scale the weights at corner and centre to the mean 1.  They are then
+    w = 1 ± K Q / 4 with K = (1 + k) c², and the heights there are z0 ± c/2 Q / w.  The parabola that represents a
+    nearly flat sphere is read as the sphere.
     """
     net, weights = patches.net_of(patch), patches.weights_of(patch)
     if net.shape != (3, 3, 3) or (patch.UDegree(), patch.VDegree()) != (2, 2):
@@ -331,7 +331,7 @@ def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
     found = Conic(z, c, bend / c**2 - 1) if c else Conic(z)
     poles, expected = patches.conic_net(found, a, b)
     if not (np.abs(poles - net).max() <= GRID_TOLERANCE and np.abs(expected - weights).max() <= GRID_TOLERANCE):
-        raise ValueError("the front is a patch of 3 x 3 and no conic; give a file written by bstcad")
+        raise ValueError("the front is a patch of 3 x 3 but not a conic; give a file written by bstcad")
     deviation = abs(c) ** 3 * size**2 / 8  # deviation from its parabola, on a patch wider than a round front
     return Sphere(z, c) if bend == 0 and deviation < 10 * patches.PARABOLA_TOLERANCE else found
 
@@ -339,7 +339,7 @@ def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
 def sample(step_lens: StepLens, x: np.ndarray, y: np.ndarray, *, of: str = "back") -> tuple[np.ndarray, np.ndarray]:
     """Return points (n, 3) of a re-read net at (x, y) (mm), evaluated by OCC, and its unit normals towards +z.
 
-    of: "back", or "front" of a lens whose front is a net.  (u, v) follow from (x, y) by the closed form for uniform
+    of: "back", or "front" if the front is a net.  (u, v) are computed from (x, y) with the closed form for uniform
     control points; x and y of the returned points show whether the net of the file is uniform.
     """
     number = ("front", "back").index(of)
@@ -368,7 +368,7 @@ def points_and_tangents(surface: Any, u: Sequence[float], v: Sequence[float]) ->
 
 
 def _outline_of_walls(walls: Sequence[BRepAdaptor_Surface]) -> Outline | None:
-    """Return the outline whose walls are exactly these faces; None for others, as with a flange or with draft."""
+    """Return the outline whose walls are exactly these faces; None if there is none, as with a flange or draft."""
     if all(wall.GetType() == Kind.GeomAbs_Cylinder for wall in walls):
         radii = [_radius(wall) for wall in walls]
         return Circle(max(radii)) if radii and max(radii) - min(radii) <= AXIAL_TOLERANCE else None
@@ -418,7 +418,7 @@ def clear_apertures(front: np.ndarray, back: np.ndarray) -> tuple[Outline, Outli
         corner = round(corner, APERTURE_DECIMALS) if corner > CIRCLE_TOLERANCE else 0.0
         rim = Rounded(width, height, corner_radius=corner) if corner else Rectangle(width, height)
     if not (off := np.abs(rim.depth(*back.T)).max()) <= CIRCLE_TOLERANCE:
-        raise ValueError(f"the edge of the back lies up to {off:.2g} mm off any circle or rectangle about the axis")
+        raise ValueError(f"the back's edge is up to {off:.2g} mm off a circle or rectangle about the axis; give it one")
     inset = float(rim.depth(*front.T).max())
     return rim.inset(round(inset, APERTURE_DECIMALS)) if inset > CIRCLE_TOLERANCE else rim, rim
 
@@ -435,14 +435,14 @@ def _bounding_outline(points: np.ndarray) -> Outline:
 
 
 def points_on_edges(solid: TopoDS_Shape) -> np.ndarray:
-    """Return the ends and middles of all edges, (n, 3), mm, in any order."""
+    """Return the ends and midpoints of all edges, (n, 3), mm, in any order."""
     edges = map(TopoDS.Edge_s, parts_of(solid, TopAbs_EDGE))
     curves = (BRepAdaptor_Curve(edge) for edge in edges if not BRep_Tool.Degenerated_s(edge))  # the apex of a cone is
     return np.concatenate([_curve_points(curve, np.array([0.0, 0.5, 1.0])) for curve in curves])
 
 
 def edge_deviations(shape: TopoDS_Shape, lens: Lens) -> tuple[tuple[float, str], tuple[float, str]]:
-    """Return the largest distance (mm) of an edge from a face it bounds, and from the lens's wall, each with where."""
+    """Return the largest distances (mm) of edges from faces they bound, and from the wall, each with its position."""
     spans = max(max(lens.back_net.shape) - 2, math.ceil(2 * max(lens.outline.half_extent) / lens.front.detail))
     fractions = np.linspace(0.0, 1.0, POINTS_PER_SPAN * spans + 1)
     from_faces, from_wall = [], []

@@ -1,8 +1,8 @@
 """Writing of STEP files with name and description of the part: AP242, or AP214 for older programs.
 
-OCC writes the solid with the names of its faces, colour, material and profile tolerances (its XCAF document).  Units in
-its model are corrected: OCC states metres for the width of a tolerance in mm, and g³ cm² for a density in g/cm³.  Area,
-volume and centroid are added as properties of the part; OCC itself would need a second representation of the solid.
+OCC writes the solid with the names of its faces, colour, material and profile tolerances (an XCAF document).  Units in
+OCC's model are corrected: it states metres for the width of a tolerance in mm, and g³ cm² for a density in g/cm³.
+Area, volume and centroid are added as properties of the part; OCC would need a second representation of the solid.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ if TYPE_CHECKING:
 
 SCHEMAS = {"AP242": "AP242DIS", "AP214": "AP214IS"}  # schema -> its name in OCC
 NO_FACTS = Part()
-TIME_VARIABLE = "SOURCE_DATE_EPOCH"  # variable with the time to state (seconds since 1970): equal lenses, equal bytes
+TIME_VARIABLE = "SOURCE_DATE_EPOCH"  # variable that fixes the file's time (seconds since 1970), for equal bytes
 MILLI, METRE = StepBasic_SiPrefix.StepBasic_spMilli, StepBasic_SiUnitName.StepBasic_sunMetre
 DENSITY_EXPONENT = -3.0  # exponent of the length in a density
 
@@ -95,8 +95,8 @@ def write_lens(
 ) -> None:
     """Write the exact solid of the lens with the names of its faces, area, volume and centroid.
 
-    part: facts that the file states; None: only a colour.  properties: of the lens; None: computed.
-    Raises ValueError if the faces of the lens bound no solid.
+    part: data that the file states; None: only a colour.  properties: area, volume and centroid; None: computed.
+    Raises ValueError if the faces of the lens do not bound a solid.
     """
     part = part or Part(colour=LENS_COLOUR if lens.passes.enters else MIRROR_COLOUR)
     shape, faces = lens_shape(lens)
@@ -110,11 +110,11 @@ def encode(
     faces: Sequence[str] = (),
     properties: MassProperties | None = None,
 ) -> Iterator[bytes]:
-    """Yield the text of the STEP file of a shape, one product called `name`, in parts.
+    """Yield parts of the text of a shape's STEP file, with one product called `name`.
 
     part: number, author, colour and material, and the tolerances of the faces "back" and "front".
     faces: names of all faces, in the order of shape.Faces(); (): no names.
-    properties: area, volume and centroid, by which a reader of the file can check the shape.
+    properties: area, volume and centroid, with which a reader of the file can check the shape.
     """
     writer = STEPCAFControl_Writer()  # OCC's variables exist only once a writer does
     with _settings(schema=SCHEMAS[part.schema]), quiet_occ():
@@ -140,7 +140,7 @@ def encode(
 
 @contextmanager
 def _settings(schema: str) -> Iterator[None]:
-    """Set OCC's variables, which hold for the whole process, for one file; then restore them."""
+    """Set OCC's process-wide variables for one file, then restore them."""
     settings = {"write.step.schema": schema, "write.stepcaf.subshapes.name": "On"}
     before = {key: Interface_Static.CVal_s(key) for key in settings}
     try:
@@ -190,7 +190,7 @@ def _document(shape: TopoDS_Shape, part: Part, faces: Sequence[str]) -> TDocStd_
 
 
 def _add_profile(document: TDocStd_Document, faces: TDF_LabelSequence, width: float) -> None:
-    """Add a profile tolerance of a surface without a datum: a zone of a width (mm) about the surface as written."""
+    """Add a profile tolerance without a datum: a zone of `width` (mm) centred on the written surface of the faces."""
     tools = XCAFDoc_DocumentTool.DimTolTool_s(document.Main())
     label, tolerance = tools.AddGeomTolerance(), XCAFDimTolObjects_GeomToleranceObject()
     tolerance.SetType(Tolerance.XCAFDimTolObjects_GeomToleranceType_ProfileOfSurface)
@@ -203,19 +203,19 @@ def _add_profile(document: TDocStd_Document, faces: TDF_LabelSequence, width: fl
 
 
 def _first_entity(model: StepData_StepModel, kind: type) -> Any:
-    """Return the first entity of a kind: one of the product's, which precede its shape."""
+    """Return the first entity of a kind: an entity of the product, since these precede the entities of the shape."""
     entities = (model.Value(i) for i in range(1, model.NbEntities() + 1))
     return next(entity for entity in entities if isinstance(entity, kind))
 
 
 def _correct_units(model: StepData_StepModel) -> None:
-    """Set the unit of tolerances to mm and of a density to g/cm³; both follow the shape and the product's category."""
+    """Set the units of tolerances (mm) and density (g/cm³), searching from the end back to the product's category."""
     for entity in (model.Value(i) for i in range(model.NbEntities(), 0, -1)):
         if isinstance(entity, StepBasic_ProductRelatedProductCategory):
             return
         if isinstance(entity, StepDimTol_GeometricTolerance):
             entity.Magnitude().UnitComponent().NamedUnit().SetPrefix(MILLI)
-        elif isinstance(entity, StepBasic_DerivedUnit):  # the density's, the only one
+        elif isinstance(entity, StepBasic_DerivedUnit):  # unit of the density, the only derived unit
             for element in (entity.ElementsValue(i) for i in range(1, entity.NbElements() + 1)):
                 is_mass = isinstance(element.Unit(), StepBasic_SiUnitAndMassUnit)
                 element.SetExponent(1.0 if is_mass else DENSITY_EXPONENT)
@@ -251,7 +251,7 @@ def _add_properties(model: StepData_StepModel, properties: MassProperties) -> No
 
 
 def _measure(name: str, kind: str, value: float, exponent: float) -> StepRepr_MeasureRepresentationItem:
-    """Return a measure in mm, mm² or mm³, by the exponent."""
+    """Return a measure whose unit is mm to the power of an exponent."""
     millimetre, element = StepBasic_SiUnitAndLengthUnit(), StepBasic_DerivedUnitElement()
     millimetre.Init(True, MILLI, METRE)
     element.Init(millimetre, exponent)
@@ -268,7 +268,7 @@ def _measure(name: str, kind: str, value: float, exponent: float) -> StepRepr_Me
 
 
 def _label(model: StepData_StepModel, name: str, part: Part) -> None:
-    """Set product and header of the shape in a model (OCC would add a number to a name that it has used before)."""
+    """Set the product's name and number, and the header (OCC would number a name that it has written before)."""
     text = Text(part21_string(name))
     product = _first_entity(model, StepBasic_Product)
     product.SetId(text if part.number is None else Text(part21_string(part.number)))

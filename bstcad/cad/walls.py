@@ -1,12 +1,12 @@
-"""Walls around a lens, between rails: closed runs of edges in which walls meet the optical faces or each other.
+"""Walls around a lens, between rails: closed sequences of edges in which walls meet optical faces or each other.
 
 An upright wall is a plane, a cylinder or the extrusion of a cubic.  A wall with draft, or a bevel, is a plane, a cone
-or a ruled surface.  Each edge is built once for the two faces that meet in it.  In space and in the parameter planes
-it has the parameter of its piece of the rim: the length on a level line, the net's parameter on the border of a net.
+or a ruled surface.  Each edge is built once for the two faces that meet in it.  In space and in the parameter planes,
+an edge has the parameter of its piece of the rim: the length on a level line, a net's parameter on its boundary.
 
 Walls with draft begin on a parting line, the rim at one height, and lean inwards down to the front.  If the rim shrinks
 by an offset o, its point p moves to p + o m with the inward normal m; on a straight side m is linear between the mitres
-of its two corners.  Only height and slope of the front are needed.
+at the two corners.  Of the front, only height and slope are needed.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ SHAPE_TOLERANCE = 1e-7  # tolerance (mm) of every face, edge and vertex
 RIM_TOLERANCE = 1e-8  # largest deviation (mm) of an edge from the exact curve
 MIN_WALL = 1e-3  # smallest height of a wall (mm)
 SMOOTH_TURN = 1e-7  # angle (rad) between successive pieces below which they join smoothly
-MIN_CORNER = 0.05  # smallest 1 + cos of the turn at a corner: a mitre is at most 6.3 times as long as the offset
-MAX_NEWTON_STEPS, NEWTON_TOLERANCE = 50, 1e-13  # steps of Newton's method; step (mm) at which it has converged
-WALL_SAMPLES = 129  # points of a piece at which its wall is checked
+MIN_CORNER = 0.05  # smallest 1 + cos of the exterior angle at a corner; a mitre is then at most 6.3 times the offset
+MAX_NEWTON_STEPS, NEWTON_TOLERANCE = 50, 1e-13  # number of Newton steps; step (mm) at which they have converged
+WALL_SAMPLES = 129  # number of points along a piece at which its wall is checked
 
 NamedFace = tuple[TopoDS_Face, str]  # face and its name: "back", "front", "underside", "rim", "bevel" or "hole"
-Loop = list[tuple[TopoDS_Edge, bool]]  # edges, each with True if it is used in its own direction
+Loop = list[tuple[TopoDS_Edge, bool]]  # edges, each with True if used forwards
 
 
 # ---- faces and solids ----------------------------------------------------------------------------------------------
@@ -92,7 +92,7 @@ def _straight(start: TopoDS_Vertex, end: TopoDS_Vertex) -> TopoDS_Edge:
 
 @dataclass(frozen=True)
 class Rail:
-    """A closed run of edges, one over each piece of a loop."""
+    """A closed sequence of edges, one above or below each piece of a loop."""
 
     curves: tuple[RailCurve, ...]
     edges: tuple[TopoDS_Edge, ...]
@@ -107,11 +107,11 @@ class Rail:
         return cls(tuple(curves), edges, corners)
 
     def along(self) -> Loop:
-        """Return the loop in the direction of its pieces."""
+        """Return the edges as a loop in the direction of the pieces."""
         return [(edge, True) for edge in self.edges]
 
     def against(self) -> Loop:
-        """Return the loop in the opposite direction."""
+        """Return the edges as a loop against the direction of the pieces."""
         return [(edge, False) for edge in reversed(self.edges)]
 
 
@@ -149,7 +149,7 @@ def _curve_on(surface: Surface, piece: LoopPiece) -> RailCurve:
 
 
 def _border(net: BSplineSurface, piece: LoopPiece) -> RailCurve | None:
-    """Return the border of a net along the whole of a straight piece, on the same knots; None if they differ."""
+    """Return the boundary of a net, with the net's knots, if it coincides with a straight piece; otherwise None."""
     poles = net.control_points()
     sides = [side[::step] for side in (poles[0], poles[-1], poles[:, 0], poles[:, -1]) for step in (1, -1)]
     ends = piece.points(np.array([0.0, piece.end]))
@@ -162,7 +162,7 @@ def _border(net: BSplineSurface, piece: LoopPiece) -> RailCurve | None:
 
 
 def _is_level_on(surface: Surface, piece: LoopPiece) -> bool:
-    """True if the edge over a piece on a surface is a level line or arc, as on a plane, or about the axis."""
+    """True if the edge over a piece on a surface is a level line or arc: on a plane, or a circle about the axis."""
     if piece.centre is not None and not surface.is_net and math.hypot(*piece.centre) < SHAPE_TOLERANCE:
         return True
     return surface.level and piece.is_line_or_arc
@@ -177,15 +177,15 @@ class WallSurface:
 
     surface: Geom_Surface
     out: bool  # True if its normal points out of the lens
-    # linear map (t, z, fraction of the height from the lower edge) -> (n, 2) in its parameter plane; None: a plane
+    # linear map (t, z, fraction of the height from the lower edge) -> (u, v), (n, 2); None: a plane, without (u, v)
     image: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None
 
     def curve(self, poles: tuple[np.ndarray, np.ndarray, np.ndarray], knots: np.ndarray) -> Geom2d_BSplineCurve | None:
-        """Return the image of a curve by its poles (t, z, fraction of the height)."""
+        """Return the image in (u, v) of the curve with poles (t, z, fraction of the height); None on a plane."""
         return None if self.image is None else patches.bspline_curve_2d(self.image(*poles), knots)
 
     def along(self, curve: RailCurve, up: float) -> Geom2d_BSplineCurve | None:
-        """Return the image of the lower edge (up 0) or the upper edge (1)."""
+        """Return the image in (u, v) of the lower edge (up 0) or the upper edge (up 1); None on a plane."""
         end = curve.piece.end
         if curve.knots is None:
             knots, t = np.array([0.0, 0.0, end, end]), np.array([0.0, end])
@@ -206,7 +206,7 @@ def _upright_surface(piece: LoopPiece) -> WallSurface:
 
 
 def _plane_or_cone(piece: LoopPiece, start: Sequence[float], tangent: float) -> WallSurface:
-    """Return the plane, cylinder or cone over a line or arc through a point over its start; it leans inwards below."""
+    """Return the plane, cylinder or cone over a line or arc, through a point over its start; tangent: see `Draft`."""
     x, y, z = map(float, start)
     angle, turn = math.atan(tangent), piece.turn
     if piece.straight:
@@ -231,7 +231,7 @@ def _drafted_surface(piece: LoopPiece, low: RailCurve, high: RailCurve, tangent:
 
 
 def _ruled_surface(low: RailCurve, high: RailCurve) -> WallSurface:
-    """Return the ruled surface between two cubics of the same knots."""
+    """Return the ruled surface between two cubics with equal knots."""
     assert low.knots is not None
     net, ends = np.stack([low.poles, high.poles], axis=1), np.array([0.0, 0.0, 1.0, 1.0])
     return WallSurface(patches.bspline_surface(net, low.knots, ends), True, lambda t, _, up: np.stack([t, up], axis=-1))
@@ -272,10 +272,10 @@ def upright_walls(
 
 @dataclass(frozen=True)
 class Draft:
-    """Draft and bevel of the walls of a lens between their parting line and the front; both zero: parallel to z."""
+    """Draft and bevel of the walls of a lens between parting line and front; if both are 0, walls are parallel to z."""
 
     angle: float = 0.0  # inward angle of the walls (degrees)
-    bevel: float = 0.0  # height along z (mm) of a bevel of 45 degrees at their edge with the front
+    bevel: float = 0.0  # height along z (mm) of a bevel of 45 degrees between walls and front
 
     def __post_init__(self) -> None:
         if not 0 <= self.angle <= MAX_DRAFT:
@@ -308,7 +308,7 @@ class LeaningPiece:
 
     front: Surface
     piece: LoopPiece
-    mitres: tuple[np.ndarray, np.ndarray]  # mitres m at both ends of the piece, (2,)
+    mitres: tuple[np.ndarray, np.ndarray]  # mitres m at the two ends of the piece, each (2,)
     z: float  # height of the parting line (mm)
     draft: Draft
 
@@ -320,7 +320,7 @@ class LeaningPiece:
         return start + (t / self.piece.end)[:, None] * (end - start)
 
     def ends(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lower edges of wall and bevel, (n, 3) in mm; the last one lies on the front.  No bevel: equal."""
+        """Return points (n, 3), mm, of the lower edges of wall and bevel (on the front); equal without a bevel."""
         start, m, tangent = self.piece.points(t), self.inwards(t), self.draft.tangent
         depth = self._depth(start, m, tangent, np.full(len(t), self.z)) - self.draft.bevel
         upper = np.column_stack([start + tangent * depth[:, None] * m, self.z - depth])
@@ -330,7 +330,7 @@ class LeaningPiece:
         return upper, np.column_stack([upper[:, :2] + depth[:, None] * m, upper[:, 2] - depth])
 
     def _depth(self, start: np.ndarray, inwards: np.ndarray, tangent: float, z: np.ndarray) -> np.ndarray:
-        """Return the depth (n,) (mm) below z at which lines with inward slope `tangent` meet the front, by Newton."""
+        """Return the depth (n,) (mm) below z where lines of inward slope `tangent` meet the front (Newton's method)."""
         depth, smallest = np.zeros(len(start)), np.ones(len(start))
         for _ in range(MAX_NEWTON_STEPS):
             height, *slopes = sampled(self.front, *(start + tangent * depth[:, None] * inwards).T)
@@ -344,18 +344,18 @@ class LeaningPiece:
         if not smallest[worst] > MIN_CLOSING or not np.abs(step).max() <= SHAPE_TOLERANCE:
             name, angle = ("bevel", 45.0) if tangent == 1 else ("draft", self.draft.angle)
             raise ValueError(
-                "{}: at ({:.4g}, {:.4g}) mm the front is too steep for a wall that leans by {:g} degrees to meet it; "
-                "make it smaller".format(name, *start[worst], angle)
+                "{0}: at ({1:.4g}, {2:.4g}) mm the front is too steep for a wall that leans by {3:g} degrees to meet "
+                "it; reduce the {0}".format(name, *start[worst], angle)
             )
         return depth
 
     def lower_edge(self) -> LoopPiece:
-        """Return the edge on the front, projected along z."""
+        """Return the lower edge, on the front, projected along z."""
         straight = self.piece.straight and _is_level_on(self.front, self.piece)
         return replace(self.piece, points=lambda t: self.ends(t)[1][:, :2], straight=straight)  # no curve needs `left`
 
     def curves(self) -> list[RailCurve]:
-        """Return the parting line and the lower edges of wall and bevel: lines, arcs, or cubics of the same knots."""
+        """Return the parting line and the lower edges of wall and bevel: lines, arcs, or cubics with equal knots."""
 
         def points(t: np.ndarray) -> np.ndarray:
             return np.hstack([self.piece.points(t), np.full((len(t), 1), self.z), *self.ends(t)])
@@ -372,10 +372,10 @@ class LeaningPiece:
 def leaning_walls(
     front: Surface, loops: Sequence[Sequence[LoopPiece]], high: Rail, above: Surface, draft: Draft
 ) -> tuple[list[NamedFace], Rail]:
-    """Return the walls over the rim, the first loop, from a rail down to the front, and their lower edge on it.
+    """Return the walls over the rim, the first loop, from a rail down to the front, and their lower rail there.
 
-    high: rail at their upper end, on the surface `above`, which is level if they have draft.  The other loops are
-    holes, which must lie inside the lower edge.  Raises ValueError if walls do not reach the front, or meet above it.
+    high: upper rail of the walls, on the surface `above`, which is level if the walls have draft.  The other loops are
+    holes, which must lie inside the lower rail.  Raises ValueError if walls do not reach the front or meet above it.
     """
     rim = loops[0]
     if not draft:
@@ -406,8 +406,8 @@ def _leaning_pieces(rim: Sequence[LoopPiece], front: Surface, z: float, draft: D
             continue
         if not (rim[k - 1].straight and piece.straight and 1 + before @ after > MIN_CORNER):
             raise ValueError(
-                "{}: at ({:.4g}, {:.4g}) mm the rim has a corner that is too sharp, or not between straight sides, and "
-                "walls cannot lean there; round it".format(draft.name, *piece.at(0.0))
+                "{}: at ({:.4g}, {:.4g}) mm the rim has a corner that is too sharp, or not between straight sides, so "
+                "that walls cannot lean there; round the corner".format(draft.name, *piece.at(0.0))
             )
         starts[k] = ends[k - 1] = (before + after) / (1 + before @ after)
     mitres = zip(starts, ends, strict=True)
@@ -415,7 +415,7 @@ def _leaning_pieces(rim: Sequence[LoopPiece], front: Surface, z: float, draft: D
 
 
 def _check(pieces: Sequence[LeaningPiece], holes: Sequence[Sequence[LoopPiece]], above: Surface) -> None:
-    """Raise ValueError unless walls end below the surface above, and cross neither each other nor the holes."""
+    """Raise ValueError unless walls end below the surface `above`, and cross neither each other nor the holes."""
     name = pieces[0].draft.name
     for each in pieces:
         t = np.linspace(0.0, each.piece.end, WALL_SAMPLES)
@@ -425,8 +425,8 @@ def _check(pieces: Sequence[LeaningPiece], holes: Sequence[Sequence[LoopPiece]],
         worst = int((top - upper[:, 2]).argmin())
         if not top[worst] - upper[worst, 2] > MIN_WALL:
             raise ValueError(
-                "{}: below ({:.4g}, {:.4g}) mm no wall is left between z = {:.4g} mm, where it begins, and the edge of "
-                "the front at {:.4g} mm; make it smaller, or the lens thicker at its edge".format(
+                "{0}: below ({1:.4g}, {2:.4g}) mm no wall is left between z = {3:.4g} mm, where it begins, and the "
+                "front's edge at {4:.4g} mm; reduce the {0}, or make the lens thicker at its edge".format(
                     name, *rim[worst], top[worst], lower[worst, 2]
                 )
             )
@@ -434,9 +434,9 @@ def _check(pieces: Sequence[LeaningPiece], holes: Sequence[Sequence[LoopPiece]],
         onwards = (on_front * along).sum(axis=1) / (along * along).sum(axis=1)
         if not onwards.min() > SMOOTH_TURN:
             position = "({:.4g}, {:.4g}) mm".format(*rim[onwards.argmin()])
-            raise ValueError(f"{name}: below {position} the walls meet before they reach the front; make it smaller")
+            raise ValueError(f"{name}: below {position} the walls meet before they reach the front; reduce the {name}")
     edge = [each.lower_edge() for each in pieces]
     if fault := wires.fault(wires.polygon(edge)):
-        raise ValueError(f"{name}: below {fault[1]} the walls meet before they reach the front; make it smaller")
+        raise ValueError(f"{name}: below {fault[1]} the walls meet before they reach the front; reduce the {name}")
     if fault := wires.fault(wires.polygon(edge, *holes)):
         raise ValueError(f"{name}: near {fault[1]} a hole crosses the walls where they lean inwards; move the hole")

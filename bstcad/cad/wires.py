@@ -1,4 +1,4 @@
-"""Closed plane wires that cut a lens, as smooth pieces with one wall each, and splines over them."""
+"""Closed plane wires that cut a lens, divided into smooth pieces with one wall each, and splines over the pieces."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     import cadquery
 
 WIRE_TOLERANCE = 1e-7  # largest deviation (mm) of a wire from its plane z = const
-MIN_CLEARANCE = 1e-6  # distance (mm) below which wires touch
-POLYGON_SIDES = 400  # sides of the polygon by which a loop is checked
-MIN_INTERVALS = 64  # smallest number of intervals of a piece
-MAX_INTERVALS, MAX_HALVINGS = 1 << 14, 4  # largest number of intervals of a cubic, and of halvings if they give more
-QUINTIC_INTERVALS = 256  # intervals of a quintic, which follows half a circle on a sphere or conic to 1e-12 mm
+MIN_CLEARANCE = 1e-6  # distance (mm) below which wires are said to touch
+POLYGON_SIDES = 400  # number of sides of the polygon that represents a loop in checks
+MIN_INTERVALS = 64  # smallest number of intervals of a spline over a piece
+MAX_INTERVALS, MAX_HALVINGS = 1 << 14, 4  # limits of a cubic: intervals, or halvings if they give more intervals
+QUINTIC_INTERVALS = 256  # intervals of a quintic; along half a circle on a sphere or conic its error is 1e-12 mm
 MIN_BREAK_DISTANCE = 1e-7  # smallest distance of two breaks, relative to the length of the piece
-ONE_SIDED_SLOPE = np.array([-25, 48, -36, 16, -3]) / 12  # weights of five values: slope at the first, error h⁴ f⁽⁵⁾ / 5
-CROSSING_BISECTIONS = 50  # steps of bisection, down to rounding
+ONE_SIDED_SLOPE = np.array([-25, 48, -36, 16, -3]) / 12  # weights for the slope at the first value; error h⁴ f⁽⁵⁾ / 5
+CROSSING_BISECTIONS = 50  # number of bisections, which leave only rounding errors
 
 Locus = Callable[[np.ndarray], np.ndarray]  # function of t (n,) that returns points (n, k)
 
@@ -45,8 +45,8 @@ class LoopPiece:
     points: Locus  # points at t (n,), (n, 2), mm
     left: Locus  # unit normals at t (n,) into the lens, (n, 2)
     end: float  # largest t
-    centre: tuple[float, float] | None = None  # centre of a circle (mm); None: no circle
-    turn: int = 0  # +1: a circle run counterclockwise, -1: clockwise, 0: no circle
+    centre: tuple[float, float] | None = None  # centre of a circle (mm); None: not a circle
+    turn: int = 0  # direction on a circle: +1 counterclockwise, -1 clockwise; 0: not a circle
     straight: bool = False  # True for a line
 
     @property
@@ -86,12 +86,12 @@ def wire_loop(given: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list
     ends = zip(pieces, pieces[1:] + pieces[:1], strict=True)
     gaps = [math.dist(before.at(before.end), after.at(0.0)) for before, after in ends]
     if not pieces or not wire.IsClosed() or max(gaps) > 10 * WIRE_TOLERANCE:
-        raise ValueError("a wire is open; close it")
+        raise ValueError("a wire is open; close the wire")
     return pieces
 
 
 def shape_in(given: Any) -> tuple[Any, str]:
-    """Return a shape, given as such or at the end of a Workplane, and the name of its kind; None unless it is one."""
+    """Return the given shape, or the only object of a Workplane (None: not one), and its type or number in words."""
     values = given.vals() if hasattr(given, "vals") else [given]
     if len(values) != 1:
         return None, f"a Workplane of {len(values)} objects"
@@ -162,7 +162,7 @@ def reversed_loop(loop: Sequence[LoopPiece]) -> list[LoopPiece]:
 
 
 def polygon(rim: Sequence[LoopPiece], *holes: Sequence[LoopPiece]) -> shapely.Polygon:
-    """Return the polygon inside a rim without holes, by points along the curves."""
+    """Return the polygon inside a rim and outside holes, with corners along the curves."""
     return shapely.Polygon(_corners(rim), [_corners(hole) for hole in holes])
 
 
@@ -172,9 +172,9 @@ def _corners(loop: Sequence[LoopPiece]) -> np.ndarray:
 
 
 def fault(shape: shapely.Polygon) -> tuple[str, str] | None:
-    """Return why a polygon bounds no lens, and the position; None if it bounds one.
+    """Return the reason why a polygon does not bound a lens, and the position; None if it does.
 
-    Its wires must neither cross nor touch themselves or each other; its holes lie inside the rim, none in another.
+    Wires must neither cross nor touch themselves or each other.  Holes must lie inside the rim and outside each other.
     """
     if not shape.is_valid:
         reason, _, position = shapely.is_valid_reason(shape).lower().partition("[")
@@ -194,12 +194,12 @@ class RailCurve:
     """A curve in space over a piece, with the piece's parameter t: a spline, or a level line or arc."""
 
     piece: LoopPiece
-    poles: np.ndarray  # control points, (n, 3), mm; of a line or an arc both ends
+    poles: np.ndarray  # control points, (n, 3), mm; for a line or an arc, its two ends
     knots: np.ndarray | None = None  # full knot vector; None: a line or an arc
 
 
 def breaks(surface: Surface, *pieces: LoopPiece) -> np.ndarray:
-    """Return parameters between which pieces, all with the same parameter, lie over one smooth part of a surface."""
+    """Return parameters between which each piece lies over one smooth part of a surface; the pieces share t."""
     t = np.linspace(0.0, pieces[0].end, MIN_INTERVALS + 1)
     if is_net(surface):  # smooth between its knot lines
         t = np.unique(np.concatenate([t, *(_crossings(surface, piece) for piece in pieces)]))
@@ -228,9 +228,9 @@ def _crossings(surface: BSplineSurface, piece: LoopPiece) -> np.ndarray:
 def fit_spline(points: Locus, t: np.ndarray, tolerance: float, smooth: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Fit a spline to a curve within a tolerance and return its poles (n, k) and full knots.
 
-    smooth: the curve is analytic, and a quintic is used if that suffices.  Otherwise the spline is a piecewise cubic
-    with the points and slopes of the curve.  It begins with the breaks t and halves each interval with a larger error
-    at its middle or quarters; the error falls with the fourth power of its length, down to rounding.
+    smooth: the curve is analytic, and a quintic is used if it suffices.  Otherwise, a piecewise cubic interpolates the
+    points and slopes of the curve.  Its first intervals lie between the breaks t.  Each interval is halved until its
+    error is small enough at its centre and quarters; the error falls with the fourth power of the interval's length.
     """
     if smooth:
         even = np.linspace(t[0], t[-1], 2 * QUINTIC_INTERVALS + 1)
@@ -249,14 +249,14 @@ def fit_spline(points: Locus, t: np.ndarray, tolerance: float, smooth: bool = Fa
             return poles, knots
         if len(t) > max_parts:
             raise ValueError(
-                f"the rim bends too sharply for a curve of {len(t)} parts ({off.max():.1e} mm off); "
+                f"the rim bends too sharply for a curve of {len(t)} parts (error {off.max():.1e} mm); "
                 "move the rim, round its corners, or give the lens fewer control points"
             )
         t = np.union1d(t, (t[:-1] + t[1:])[off > limit] / 2)
 
 
 def _hermite(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return poles and full knots of the piecewise cubic through values at t; its slopes come from the quarters."""
+    """Return poles and full knots of the piecewise cubic through values at t, with slopes from values at quarters."""
     parts, length = sliding_window_view(values, 5, axis=0)[::4], np.diff(t)[:, None]
     first, last = 4 * parts @ ONE_SIDED_SLOPE / length, -4 * parts @ ONE_SIDED_SLOPE[::-1] / length
     slope = np.concatenate([first[:1], (last[:-1] + first[1:]) / 2, last[-1:]])

@@ -136,7 +136,7 @@ def test_a_place_that_is_none_is_refused():
         (disc(0.0, 2.0), "lens: the flange's lower face, z = 0 mm, cuts the rim of the front"),
         (disc(7.0, 8.0), "lens: the flange, from z = 7 to 8 mm, misses the lens's wall"),
         (disc(1.0, 2.0, 4.5), "give one solid that reaches all around each lens"),
-        (cq.Workplane("XY").sphere(9.0), "lens: the body must surround it between two planes"),
+        (cq.Workplane("XY").sphere(9.0), "lens: the body must surround the lens between two"),
         (cq.Workplane("XY", origin=(0, 0, 1)).circle(RADIUS).workplane(offset=2).circle(7.5).loft()
          .rotate((0, 0, 0), (1, 0, 0), 5), "lens: the body meets it in a face that is not a plane z = const"),
         (None, "mount: the body is NoneType; give one cadquery solid"),

@@ -115,7 +115,7 @@ def test_a_bevel_that_occ_cannot_build_is_a_sentence(design):
     outline = mount.flange.outline.model_copy(update={"corner_radius": 0.05})
     flange = mount.flange.model_copy(update={"outline": outline, "bevel": 0.9, "draft": 5.0})
     with pytest.raises(
-        ValueError, match=r"^mount: OpenCASCADE cannot build it \(StdFail_NotDone\); make bevel or draft smaller"
+        ValueError, match=r"^mount: OpenCASCADE cannot build the part \(StdFail_NotDone\); reduce or omit bevel"
     ):
         mounting.part_of(design.lens, mount.model_copy(update={"flange": flange}))
 
