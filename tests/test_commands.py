@@ -310,7 +310,7 @@ class TestVerify:
         "a truncated mesh": (lambda d: os.truncate(d / "lens.stl", 90_000), "lens.stl: 90000 bytes"),
         "step in metres": (
             lambda d: (d / "lens.step").write_text((d / "lens.step").read_text().replace(".MILLI.", "$")),
-            "lens.step: read as text: lengths in metre",
+            "lens.step: read as text: its lengths are in metre",
         ),
         "a blank thinner than asked": (
             lambda d: (d / "scene.toml").write_text(

@@ -33,13 +33,13 @@ from bstcad.scene.mount import parting
 if TYPE_CHECKING:
     import cadquery
 
-EXTRA_POINTS = 4  # control points outside the rim on each side: two spans, and two more until x(u) is linear
-RIM_POINTS_PER_CELL = 8  # points on each piece of a rim per control point of the back's longer side
-IMAGE_TOLERANCE = 1e-12  # deviation from a line or circle below which an image is one, relative to its size
+EXTRA_POINTS = 4  # control points beyond the rim at each end: two spans, and two more until x(u) is linear
+RIM_POINTS_PER_CELL = 8  # points on each piece of a rim, per control point of the back's longer side
+IMAGE_TOLERANCE = 1e-12  # relative deviation from a line or circle below which an image is written as such
 IMAGE_SAMPLES = 65  # points of an image that are compared with a line and a circle
 INVALID_LENS = (
-    "lens: front, back and walls bound no valid solid; check that the back lies above the front, and move wires apart "
-    "or make them simpler"
+    "lens: front, back and walls do not bound a valid solid; check that the back lies above the front, and move wires "
+    "apart or make them simpler"
 )
 
 
@@ -56,7 +56,7 @@ def lens_solid(
     """Return the lens inside `trim` (None: its outline) without `holes` as a cadquery solid, faces oriented outwards.
 
     trim: a closed plane wire, of which x and y are used; holes: such wires, or (x, y, diameter) in mm.  Walls are
-    parallel to z.  With `draft`, the outer walls lean from a plane on that lies scene.mount.LAND below the back's rim.
+    parallel to z.  With `draft`, the outer walls lean inwards below a plane scene.mount.LAND under the back's rim.
     Raises ValueError in one sentence if a wire is open, crosses itself or another, or leaves the lens, if walls would
     meet, or if no valid solid exists.
     """
@@ -95,8 +95,8 @@ def lens_shape(
 def coarse_copy(lens: Lens, m: int) -> Lens:
     """Return the lens with m control points along the longer side of its back, for viewers, which triangulate faces.
 
-    Each control point has the height of the back at its (x, y), which is Schoenberg's operator (de Boor 1978).  It
-    follows relief wider than a few cells of the coarse net and smooths the rest.  The copy is not made for tracing.
+    Each control point has the height of the back at its (x, y), which is Schoenberg's operator (de Boor 1978).  The
+    copy follows relief wider than a few cells of the coarse net and smooths the rest; do not trace light through it.
     """
     lens = lens.plain()
     net = lens.back_net
@@ -114,8 +114,8 @@ def coarse_copy(lens: Lens, m: int) -> Lens:
 def check_thickness(lens: Lens) -> None:
     """Raise ValueError unless the back lies above the front everywhere; OCC does not detect faces that cross.
 
-    Below MIN_WALL the lens is thinner than the tolerance of its edges allows.  A spline lies nowhere below its lowest
-    control point, which is sufficient for most lenses.  Others are sampled at three points per knot span each way.
+    The thickness must exceed MIN_WALL because of the tolerance of edges.  Since a spline lies nowhere below its lowest
+    control point, most lenses need no sampling.  Others are sampled at three points per knot span in x and in y.
     """
     lowest, highest = lens.back.sags(lens.outline)[0], lens.front.sags(lens.outline)[1]
     if lens.back.z + lowest - (lens.front.z + highest) > MIN_WALL:
@@ -147,7 +147,7 @@ def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[l
     outside = ~lens.outline.contains(*(torch.from_numpy(p * (1 - 1e-9)) for p in (x, y))).numpy()
     if outside.any():
         raise ValueError(
-            f"trim: the wire leaves the lens at ({x[outside][0]:.4g}, {y[outside][0]:.4g}) mm; draw it inside"
+            f"trim: the wire leaves the lens at ({x[outside][0]:.4g}, {y[outside][0]:.4g}) mm; move it inside"
         )
     if fault := wires.fault(shape):
         reason, position = fault
@@ -157,7 +157,7 @@ def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[l
         )
     if (dome := lens.front.outline) and not shape.contains(wires.polygon(wires.outline_loop(dome))):
         raise ValueError(
-            f"trim or holes: a wire crosses the front, {dome.words}, or lies inside it; draw it in the plane around it"
+            f"trim or holes: a wire crosses the front, {dome.words}, or lies inside it; move the wire outside"
         )
     correct = [shape.exterior.is_ccw, *(not hole.is_ccw for hole in shape.interiors)]
     return [loop if is_left else wires.reversed_loop(loop) for loop, is_left in zip(loops, correct, strict=True)]
@@ -177,7 +177,7 @@ def _hole_loop(name: str, hole: cadquery.Wire | Sequence[float]) -> list[LoopPie
         raise ValueError(f"{name}: {hole} is not (x, y, diameter); give three numbers in mm, or a closed wire")
     x, y, diameter = map(float, hole)
     if not diameter > 0:
-        raise ValueError(f"{name}: a diameter of {diameter:g} mm; give one above zero")
+        raise ValueError(f"{name}: the diameter is {diameter:g} mm; give a diameter above 0")
     return wires.circle(x, y, diameter / 2)
 
 
@@ -185,7 +185,7 @@ def _hole_loop(name: str, hole: cadquery.Wire | Sequence[float]) -> list[LoopPie
 
 
 def cap(patch: Patch, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
-    """Return the back or front inside the first rail and outside the others; along: rails run forwards around it."""
+    """Return the back or front inside the first rail and outside the others; along: True to use rails forwards."""
     loops = [rail.along() if along else rail.against() for rail in rails]
     face = face_inside(patch.surface, patch.outward, *loops)
     for rail in rails if patch.uv is not None else ():
@@ -212,7 +212,7 @@ def dome_cap(lens: Lens) -> tuple[NamedFace, Rail]:
 
 
 def image(patch: Patch, curve: RailCurve) -> Geom2d_Curve:
-    """Return the image of a curve on a patch in (u, v), with the curve's parameter: a line or circle if it is one."""
+    """Return the image in (u, v) of a curve on a patch, with the curve's parameter: a line, a circle or a spline."""
     piece, uv = curve.piece, patch.uv
     assert uv is not None  # a plane needs no image
     cubic = curve.knots if curve.knots is not None and len(curve.knots) == len(curve.poles) + 4 else None  # its knots
@@ -239,7 +239,7 @@ def image(patch: Patch, curve: RailCurve) -> Geom2d_Curve:
 
 
 def _outer_walls(lens: Lens, loops: Sequence[list[LoopPiece]], top: Rail, draft: Draft) -> tuple[list[NamedFace], Rail]:
-    """Return the walls over the rim, the first loop, from the back's edge down to the front, and their lower edge."""
+    """Return the walls over the rim (the first loop) from the back's edge to the front, and the rail on the front."""
     if not draft.angle:
         return walls.leaning_walls(lens.front.around, loops, top, above=lens.back, draft=draft)
     plane = Plane(_parting(lens, loops[0]))
@@ -255,7 +255,7 @@ def _parting(lens: Lens, rim: Sequence[LoopPiece]) -> float:
     if not low - high > MIN_WALL:
         raise ValueError(
             f"draft: the rim of the back comes down to z = {low:.4g} mm, and the rim of the front rises to {high:.4g} "
-            "mm, so that no plane between them divides the wall; leave it out, or make the lens thicker at its edge"
+            "mm, so that no plane between them divides the wall; omit draft, or make the lens thicker at its edge"
         )
     return parting(lens.back, lens.front, x, y)
 

@@ -1,8 +1,8 @@
-"""Area, volume and centroid of a part with lenses, from its faces and edges, to a relative error of 1e-8.
+"""Area, volume and centroid of a part with lenses, from its faces and edges, with a relative error of 1e-8.
 
-Each face is integrated along its boundary by Green's theorem: a large net over x and y (optics.quadrature), any other
-face over its parameters u and v.  OCC's own integrals take minutes over a large net.  Over a face that shares an edge
-with a large net, a curve of thousands of knots, they have errors of 1e-5.
+Each face is integrated along its boundary with Green's theorem: a large net in x and y (optics.quadrature), any other
+face in its parameters u and v.  OCC's own integrals take minutes for a large net.  They have errors of 1e-5 for a face
+that shares an edge with a large net, since this edge is a curve of thousands of knots.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 
 Coordinates = tuple[float, float, float]
 
-STRAIGHT_POINTS = 2  # Gauss points along v where r and its derivatives are linear: r (r · n) is at most cubic
+STRAIGHT_POINTS = 2  # Gauss points along v if r and its derivatives are linear in v, and r (r · n) at most cubic
 STRAIGHT_KINDS = (Kind.GeomAbs_Plane, Kind.GeomAbs_Cylinder, Kind.GeomAbs_Cone, Kind.GeomAbs_SurfaceOfExtrusion)
-# Gauss points along v for each kind of face, which leave only rounding
+# Gauss points along v for each kind of face; only rounding errors remain
 GAUSS_POINTS_V = dict.fromkeys(STRAIGHT_KINDS, STRAIGHT_POINTS)
 GAUSS_POINTS_V |= {Kind.GeomAbs_Sphere: 12, Kind.GeomAbs_Torus: 12, Kind.GeomAbs_BSplineSurface: 32}
 ARC_PARTS, ARC_POINTS = 8, 12  # intervals, and Gauss points in each, of a line or an arc on a smooth face
@@ -45,7 +45,7 @@ ARC_PARTS, ARC_POINTS = 8, 12  # intervals, and Gauss points in each, of a line 
 
 @dataclass(frozen=True)
 class WholePart:
-    """A part around a lens with other walls than the lens's outline: with a flange, draft, a bevel or a cut."""
+    """A part whose walls are not those over the lens's outline: with a flange, draft, a bevel or a cut."""
 
     edge: np.ndarray  # points along the edge of the back, (n, 2), mm
     low: Coordinates  # smallest x, y and z (mm) of all faces except freeform ones, whose edges other faces share
@@ -65,7 +65,7 @@ def whole_part(reread: StepLens, properties: MassProperties | None) -> WholePart
 
 
 def of_solid(solid: cadquery.Shape | TopoDS_Shape) -> MassProperties | None:
-    """Return the properties of a part in which lens axes are parallel to z; None if it has a face of unknown kind."""
+    """Return area, volume and centroid of a part with lens axes along z; None if a face is of an unknown kind."""
     shape: TopoDS_Shape = getattr(solid, "wrapped", solid)
     vertex = TopoDS.Vertex_s(parts_of(shape, TopAbs_VERTEX)[0])
     z_ref = BRep_Tool.Pnt_s(vertex).Z()  # origin of the sums, near the part: errors by gaps grow with the distance
@@ -83,7 +83,7 @@ def _of_face(face: TopoDS_Face, z_ref: float) -> Sums:
         border = Border(*_concatenate(_edge_in_space(edge) for edge in _edges(face)))
         return quadrature.of_face(net, border, net.z - z_ref)
     if surface.GetType() not in GAUSS_POINTS_V:
-        raise ValueError("a face is of a kind that is not known here; write it again")
+        raise ValueError("a face is of an unknown kind; write the file again")
     return _in_parameters(face, surface, z_ref)
 
 
@@ -106,7 +106,7 @@ def _in_parameters(face: TopoDS_Face, surface: BRepAdaptor_Surface, z_ref: float
 
 
 def _edges(face: TopoDS_Face) -> Iterator[TopoDS_Edge]:
-    """Yield the edges of a face in its own order and direction, a seam twice."""
+    """Yield the edges of a face in the face's order and directions; a seam occurs twice."""
     explorer = TopExp_Explorer(face, TopAbs_EDGE)
     while explorer.More():
         yield TopoDS.Edge_s(explorer.Current())
@@ -118,7 +118,7 @@ def _concatenate(parts: Iterator[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
 
 
 def _edge_in_space(edge: TopoDS_Edge) -> tuple[np.ndarray, ...]:
-    """Return x, y and the weights of dx and dy of Gauss points along an edge in space."""
+    """Return x and y (mm) at Gauss points along an edge in space, and dx and dy multiplied by the points' weights."""
     curve = BRepAdaptor_Curve(edge)
     t, weight = _gauss_points(edge, [curve], over_net=True)
     x, y, _, dx, dy, _ = _evaluate(curve, t, gp_Pnt(), gp_Vec())
@@ -126,7 +126,7 @@ def _edge_in_space(edge: TopoDS_Edge) -> tuple[np.ndarray, ...]:
 
 
 def _edge_in_parameters(edge: TopoDS_Edge, face: TopoDS_Face) -> tuple[np.ndarray, ...]:
-    """Return u, v and the weights of du of Gauss points along an edge in its face's parameters, where u changes."""
+    """Return u and v at Gauss points along an edge of a face, where u changes, and du multiplied by their weights."""
     curve = BRepAdaptor_Curve2d(edge, face)
     curves = [curve] if BRep_Tool.Degenerated_s(edge) else [curve, BRepAdaptor_Curve(edge)]
     t, weight = _gauss_points(edge, curves)
@@ -138,7 +138,7 @@ def _edge_in_parameters(edge: TopoDS_Edge, face: TopoDS_Face) -> tuple[np.ndarra
 def _evaluate(
     curve: BRepAdaptor_Curve | BRepAdaptor_Curve2d, t: np.ndarray, point: gp_Pnt | gp_Pnt2d, tangent: gp_Vec | gp_Vec2d
 ) -> np.ndarray:
-    """Return the coordinates of a curve and of its derivative, each (n,); point, tangent: OCC's output objects."""
+    """Return the coordinates of a curve and of its derivative at t, each (n,); point, tangent: OCC's output objects."""
     rows = []
     for value in t.tolist():
         curve.D1(value, point, tangent)
@@ -149,7 +149,7 @@ def _evaluate(
 def _gauss_points(
     edge: TopoDS_Edge, curves: Sequence[BRepAdaptor_Curve | BRepAdaptor_Curve2d], over_net: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return Gauss parameters and weights in the direction of an edge, in intervals without knots of its curves."""
+    """Return parameters and weights of Gauss points in the direction of an edge, in intervals between knots."""
     first, last = curves[0].FirstParameter(), curves[0].LastParameter()
     knots = {first, last}
     for curve in curves:

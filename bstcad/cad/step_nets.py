@@ -1,8 +1,8 @@
 """Large control nets in STEP files, written as text; OCC writes the rest of the file.
 
 OCC makes an object of each control point, then its text: 16 s and 2.5 GB for 2049 x 2049 points.  Therefore OCC writes
-the solid with a *placeholder* for each large net: a patch without inner knots, on the same parameters.  In OCC's text
-the statement of the placeholder is replaced by that of the net, and the points are appended after the last entity.  All
+the solid with a *placeholder* for each large net: a patch without inner knots, with the same parameter ranges.  In
+OCC's text, the net's statement replaces the placeholder's, and the points are appended after the last entity.  All
 other statements are OCC's own, including edges and their images in the parameter planes.
 """
 
@@ -28,8 +28,8 @@ FIXED_FORMAT, SCIENTIFIC_FORMAT = "%.14f", "%.16E"  # formats of numbers in [FIX
 FIXED_MIN, FIXED_MAX = 0.1, 1e3
 PLACEHOLDER_X = 1e60  # mm; placeholder k has its first control point at x = (k + 1) PLACEHOLDER_X, far from any lens
 REFERENCES_PER_LINE = 16  # entries per line of a list
-OTHER_FORM = "UNSPECIFIED"  # form of any other knot vector in Part 21
-KNOT_FORMS = {  # forms of knot vectors in Part 21
+OTHER_FORM = "UNSPECIFIED"  # name in Part 21 of any other form of a knot vector
+KNOT_FORMS = {  # names in Part 21 of the forms of knot vectors
     Distribution.GeomAbs_Uniform: "UNIFORM_KNOTS",
     Distribution.GeomAbs_QuasiUniform: "QUASI_UNIFORM_KNOTS",
     Distribution.GeomAbs_PiecewiseBezier: "PIECEWISE_BEZIER_KNOTS",
@@ -42,7 +42,7 @@ class LargeNet:
 
     control_points: np.ndarray  # control net, (m, n, 3), mm
     knots: tuple[np.ndarray, np.ndarray]  # full knot vectors in u and v
-    form: str  # form of both knot vectors in Part 21
+    form: str  # name in Part 21 of the form of the knot vectors
 
     @property
     def degrees(self) -> tuple[int, int]:
@@ -52,7 +52,7 @@ class LargeNet:
 
 
 def with_placeholders(shape: TopoDS_Shape) -> tuple[TopoDS_Shape, list[LargeNet]]:
-    """Return a copy of the shape with a placeholder for each large net, and the nets; the shape itself without nets."""
+    """Return a copy of the shape with a placeholder for each large net (the shape itself if none), and the nets."""
     nets: list[LargeNet] = []
     data = b""
     for face in parts_of(shape, TopAbs_FACE):
@@ -74,7 +74,7 @@ def with_placeholders(shape: TopoDS_Shape) -> tuple[TopoDS_Shape, list[LargeNet]
 
 
 def _placeholder(net: LargeNet, k: int) -> bytes:
-    """Encode the placeholder of net k: a patch of the same degrees and parameters without inner knots."""
+    """Encode the placeholder of net k: a patch of the same degrees and parameter ranges, without inner knots."""
     points = np.zeros((*(degree + 1 for degree in net.degrees), 3))
     numbers = np.arange(points[..., 0].size).reshape(points.shape[:2])
     points[..., 0] = (k + 1) * PLACEHOLDER_X + numbers * (PLACEHOLDER_X / 1000)
@@ -119,7 +119,7 @@ def fill_in_nets(text: bytes, placeholders: Sequence[int], nets: Sequence[LargeN
 
 
 def _surface_statement(name: int, net: LargeNet, first: int) -> Iterator[bytes]:
-    """Yield the statement of a net whose points have numbers from `first` on, v changing fastest."""
+    """Yield statement number `name` of a net whose points have numbers from `first` on, v changing fastest."""
     m, n, _ = net.control_points.shape
     yield b"#%d = B_SPLINE_SURFACE_WITH_KNOTS('',%d,%d,(\n" % (name, *net.degrees)
     for i in range(m):
@@ -141,7 +141,7 @@ def _format_list(words: Sequence[str]) -> str:
 
 
 def _point_statements(net: np.ndarray, first: int) -> Iterator[bytes]:
-    """Yield the statements of a net's points, one per line, numbered from `first` on; a row of the net at a time."""
+    """Yield the statements of a net's points, numbered from `first` on, one per line, a row of the net at a time."""
     n, before, y = net.shape[1], None, []
     for i, row in enumerate(net):
         x = _format_reals(row[:1, 0]) * n if (row[:, 0] == row[0, 0]).all() else _format_reals(row[:, 0])
@@ -154,7 +154,7 @@ def _point_statements(net: np.ndarray, first: int) -> Iterator[bytes]:
 
 
 def _format_reals(values: np.ndarray) -> list[str]:
-    """Format numbers as OCC writes them with the formats above: 15 to 17 digits."""
+    """Format numbers with FIXED_FORMAT or SCIENTIFIC_FORMAT, as OCC does: 15 to 17 digits."""
     size = np.abs(values)
     fixed = (size >= FIXED_MIN) & (size < FIXED_MAX)
     forms = np.where(fixed, FIXED_FORMAT, SCIENTIFIC_FORMAT).tolist()

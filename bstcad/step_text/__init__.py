@@ -1,1 +1,1 @@
-"""A reader of STEP files (ISO 10303-21) as text.  It shares no code with OCC: a second opinion on each written file."""
+"""Reader of STEP files (ISO 10303-21) as text, without OCC, so that each written file is checked independently."""

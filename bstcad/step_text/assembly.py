@@ -1,7 +1,7 @@
-"""The placements that a STEP file states for its solid, each as ISO 10303-42 and -43 define it.
+"""The placements that a STEP file states for its solid, each as defined in ISO 10303-42 and -43.
 
 A shape representation is part of another one by a relationship with an ITEM_DEFINED_TRANSFORMATION, which an assembly
-states for each of its parts, by a MAPPED_ITEM, or by a plain relationship: then both have the same coordinates.  The
+states for each of its parts, by a MAPPED_ITEM, or by a plain relationship, without a change of coordinates.  The
 transformation maps one AXIS2_PLACEMENT_3D to another.  Nested transformations are composed.
 """
 
@@ -33,7 +33,7 @@ class Link:
     """The relation of a representation to another one that contains it."""
 
     parent: str  # number of the containing representation
-    placement: Placement | None  # placement in it; None: both have the same coordinates
+    placement: Placement | None  # placement in the parent; None: the coordinates are those of the parent
 
 
 def placement_of(solid: str, entities: Entities) -> Placement:
@@ -41,7 +41,7 @@ def placement_of(solid: str, entities: Entities) -> Placement:
     homes, links = _representations_and_links(solid, entities)
     paths = [path for home in homes[:1] for path in _paths(home, links, frozenset())]
     if len(paths) > 1:
-        raise ValueError("the file places its lens more than once; export one alone")
+        raise ValueError("the file places its lens more than once; export a single lens")
     return compose(paths[0] if paths else [])
 
 
@@ -79,7 +79,7 @@ def _paths(home: str, links: dict[str, list[Link]], seen: frozenset[str]) -> lis
 
 
 def _equal_representations(home: str, links: dict[str, list[Link]]) -> set[str]:
-    """Return the representations with the same coordinates as this one, itself included."""
+    """Return the representations with the same coordinates as representation `home`, which is included."""
     found, left = {home}, [home]
     while left:
         equal = {link.parent for link in links.get(left.pop(), []) if link.placement is None} - found
@@ -142,7 +142,7 @@ def _shapes(entities: Entities) -> dict[str, set[str]]:
 
 
 def _transformation(name: str, first: list[str], second: list[str], entities: Entities) -> Placement:
-    """Return the placement of one representation in another; first, second: the items of the two."""
+    """Return the placement of one representation in another; first, second: items of the two representations."""
     if entities.bodies[name][0] != "ITEM_DEFINED_TRANSFORMATION":
         return _frame(name, entities)
     origin, target = _pair(name, entities)
@@ -167,13 +167,13 @@ def _frame(name: str, entities: Entities) -> Placement:
             return found
     except ValueError as error:
         raise ValueError(f"#{name} = {kind}: {error}; export the lens without this placement") from error
-    raise ValueError(f"#{name} = {kind} places the lens, but bstcad cannot read it; export the lens without it")
+    raise ValueError(f"#{name} = {kind} places the lens, but is of an unknown kind; export the lens without it")
 
 
 def _axes(location: str, axis: str | None, reference: str | None, entities: Entities) -> Placement:
-    """Return a frame by its origin, z and x.  An absent z or x is the axis of the representation.
+    """Return the placement with an origin, z and x direction.  Without z or x, the representation's axis is used.
 
-    A tilted z without x is refused: ISO 10303-42 projects the x axis, but other readers choose another axis.
+    A tilted z without x is refused: ISO 10303-42 projects the x axis, but some readers choose another axis.
     """
     z = Z_AXIS if axis is None else _direction(axis, entities)
     if reference is None and (z[0] or z[1] or not z[2] > 0):
@@ -183,7 +183,7 @@ def _axes(location: str, axis: str | None, reference: str | None, entities: Enti
 
 
 def _pair(name: str, entities: Entities) -> list[str]:
-    """Return the two entities that an entity refers to; ValueError if it refers to another number."""
+    """Return the two entities that an entity refers to; ValueError if it refers to fewer or more."""
     found = entities.references(name)
     if len(found) != 2:
         raise damaged(f"statement #{name} = {entities.bodies[name][0]} refers to {len(found)} entities, not to two")

@@ -22,7 +22,7 @@ OTHER_FORMATS = {  # remedies for files that are not STEP, by their first bytes
 
 
 def fault(data: bytes) -> str | None:
-    """Return why these first bytes begin no STEP file, with a remedy; None if they begin one."""
+    """Return the reason why a file with these first bytes is not a STEP file, with a remedy; None if it is one."""
     if not data.strip():
         return "not a STEP file (it is empty); export the lens as STEP"
     for first, kind in OTHER_FORMATS.items():
@@ -34,7 +34,7 @@ def fault(data: bytes) -> str | None:
 
 
 def check(path: Path) -> None:
-    """Raise SceneError in one sentence unless a file begins as STEP.  Later readers refuse what cannot be read."""
+    """Raise SceneError in one sentence unless a file begins as STEP.  Later readers refuse files that are damaged."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):
             return

@@ -1,7 +1,7 @@
 """Entities of a STEP file: the statements of its DATA section (ISO 10303-21).
 
 Text that is not a token of Part 21, such as NAN or 1.5.2, is refused with the number of its statement.  Other STEP
-readers take it for zero or hang.
+readers read zero or hang.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ ENTITY = r"[1-9]\d{0,17}"  # pattern of an entity's number, which fits into 64 b
 REAL = r"[-+]?\d+\.\d*(?:E[-+]?\d+)?"
 COORDINATE = rf"[-+]?\d{{1,{MAX_NUMBER_LENGTH}}}+\.\d{{0,{MAX_NUMBER_LENGTH}}}+(?:E[-+]?\d{{1,4}}+)?"
 BLANKS = bytes(code for code in range(256) if chr(code).isspace())
-STRING = re.compile(  # text and empty strings, then one string or comment: few calls of the replacing function
+STRING = re.compile(  # text with empty strings, then a string or comment; long matches need few calls of `numbered`
     r"((?:[^'/]++|''(?!')|/(?!\*))*+)('[^']*(?:''[^']*)*'|/\*.*?(?:\*/|\Z)|'|\Z)", re.DOTALL
 )
 POINT_TEXT = re.compile(rf"(?<=;)#({ENTITY})=CARTESIAN_POINT\('\d*',\(({COORDINATE},{COORDINATE},{COORDINATE})\)\);")
-POINT_ROWS = re.compile(  # consecutive points as OCC writes them: nine tenths of a file, which need no further check
+POINT_ROWS = re.compile(  # consecutive points as OCC writes them, nine tenths of a file; they need no other check
     rf"(?<=;\n)((?:#[1-9]\d{{0,14}}+ = CARTESIAN_POINT\('',\({COORDINATE},\s*+{COORDINATE},\s*+{COORDINATE}\)\);\n)++)"
 )
 POINTS_MARK = "\0"  # character that replaces consecutive points in the text
@@ -34,7 +34,7 @@ STATEMENT = re.compile(rf"#({ENTITY})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
 TOKENS = re.compile(  # tokens without blanks: separators, references, numbers, strings, enumerations, keywords
     r"[(),;]++|(?:#\d{1,20}+,)++|#\d{1,20}+(?=[)=])=?|'\d*+'|\.[A-Z_0-9]++\.|[$*](?=[,)])|!?[A-Z_][A-Z_0-9]{0,99}+(?=\()"
     r"|[-+]?\d{1,99}+(?:\.\d{0,99}+(?:[Ee][-+]?\d{1,9}+)?)?(?=[,)])|\"[0-9A-F]*+\""
-)  # each is bounded, or begins with a character that it cannot contain: the time is proportional to the text
+)  # each token is bounded, or begins with a character that it cannot contain, so that matching takes linear time
 LONG_NUMBER = re.compile(rf"(?<=[(,])[-+.\d][-+.\dEe]{{{MAX_NUMBER_LENGTH},}}")
 HUGE_NUMBER = re.compile(r"(?<=[(,])[-+]?\d++\.\d*+[Ee]\+?\d{3,}+")  # number of at least 1e100
 
@@ -62,7 +62,7 @@ class Entities:
         return decode(self.strings[int(attributes[index])]) if attributes[index] else ""
 
     def points(self, numbers: np.ndarray) -> np.ndarray:
-        """Return the coordinates of point entities, (…, 3); KeyError names an entity that is not a point."""
+        """Return the coordinates of point entities, (…, 3); KeyError, with the number, for any other entity."""
         rows = np.searchsorted(self.point_numbers, numbers).clip(max=len(self.xyz) - 1)
         wrong = numbers[self.point_numbers[rows] != numbers] if len(self.xyz) else numbers.ravel()
         if len(wrong):
@@ -71,7 +71,7 @@ class Entities:
 
 
 def without_blanks(text: str) -> tuple[str, list[str]]:
-    """Return (the text without comments and blanks, its strings); 'k' replaces string k, and '' stays."""
+    """Return the text without comments and blanks, and its strings; 'k' replaces string k, and '' stays."""
     strings: list[str] = []
 
     def numbered(hit: re.Match[str]) -> str:
@@ -88,7 +88,7 @@ def without_blanks(text: str) -> tuple[str, list[str]]:
 
 
 def read_entities(text: str) -> tuple[str, Entities]:
-    """Return a STEP file's text without blanks and points, and its entities; ValueError in one sentence if damaged."""
+    """Return the text of a STEP file without blanks and points, and its entities; ValueError if the file is damaged."""
     parts = [text] if POINTS_MARK in text else POINT_ROWS.split(text)
     data, strings = without_blanks(POINTS_MARK.join(parts[::2]))
     start, end = data.find("DATA;"), data.rfind("ENDSEC;")
@@ -127,7 +127,7 @@ def read_entities(text: str) -> tuple[str, Entities]:
 
 
 def required(hit: re.Match[str] | None) -> re.Match[str]:
-    """Return the match of an entity's text; LookupError if it has another form."""
+    """Return the match of an entity's text; LookupError if it is None, since the text has another form."""
     if hit is None:
         raise LookupError
     return hit

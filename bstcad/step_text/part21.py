@@ -1,4 +1,4 @@
-"""Reader of the lens in a STEP file (ISO 10303-21), independent of OCC: a second opinion on each written file.
+"""Reader of the lens in a STEP file (ISO 10303-21), independent of OCC, for a second check of each written file.
 
 It reads the entities that the checks need: control nets, knots and multiplicities of the freeform faces, the product's
 name, the units, the number of solids, the uses of each edge, and the stated properties: area, volume, centroid,
@@ -6,8 +6,8 @@ material and profile tolerances, by their names in "Recommended Practices for Ge
 Properties" of the CAx Interoperability Forum.  Damage to these entities is refused in one sentence.  OCC reads the
 whole file, in a second process.
 
-Every pattern takes a time proportional to the text: a repeated group ends at a character that it cannot contain, and
-the text is split into statements before they are matched.
+Matching takes a time proportional to the length of the text: a repeated group ends at a character that it cannot
+contain, and the text is split into statements before they are matched.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ UNREADABLE = (LookupError, AttributeError, TypeError, ArithmeticError)  # errors
 
 @dataclass(frozen=True)
 class FreeformSurface:
-    """A B_SPLINE_SURFACE_WITH_KNOTS as written.  Rational surfaces are other entities, and no freeform faces."""
+    """A B_SPLINE_SURFACE_WITH_KNOTS as written.  Rational surfaces are other entities, and are not freeform faces."""
 
     degrees: tuple[int, int]  # degrees in u and v
     control_points: np.ndarray  # control net, (m, n, 3), mm, in the frame of the file, u along the first axis
@@ -74,7 +74,7 @@ class ProfileTolerance:
 
     width: float  # width of the tolerance zone (mm)
     surface: str  # entity of the toleranced face's surface; "": the file refers to it in an unknown form
-    face: str = ""  # name of that face
+    face: str = ""  # name of the toleranced face
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class StepText:
     schema: str  # schema that the header states
     solids: int  # number of MANIFOLD_SOLID_BREP and BREP_WITH_VOIDS
     faces: int  # number of faces
-    surface: FreeformSurface  # freeform back; of two nets the one whose normal u x v points away from the other
+    surface: FreeformSurface  # freeform back; of two nets, the net whose normal u x v points away from the other net
     front: FreeformSurface | None  # freeform front; None: the front is not a net
     edge_uses: dict[int, tuple[int, int]]  # edge -> number of uses (forward, reversed)
     properties: ValidationProperties
@@ -140,23 +140,23 @@ def read_lens(path: str | Path, any_unit: bool = False) -> StepText:
     """Read a lens in millimetres (any_unit: in any unit of length) and radians; ValueError for anything else."""
     text, name = read(path), f"{Path(path).name}: read as text"
     if not any_unit and text.unit != "millimetre":
-        raise ValueError(f"{name}: lengths in {text.unit}; export it in millimetres")
+        raise ValueError(f"{name}: its lengths are in {text.unit}; export it in millimetres")
     if text.angle != "radian":
-        raise ValueError(f"{name}: angles in {text.angle}; export it in radians")
+        raise ValueError(f"{name}: its angles are in {text.angle}; export it in radians")
     if text.solids != 1:
-        raise ValueError(f"{name}: {text.solids} solids; a lens is one: export it alone")
+        raise ValueError(f"{name}: it has {text.solids} solids, but a lens is one solid; export the lens alone")
     return text
 
 
 def parse(text: bytes | str) -> StepText:
-    """Parse the text of a STEP file of a lens; ValueError in one sentence if it is none."""
+    """Parse the text of a STEP file of a lens; ValueError in one sentence if it is not such a file."""
     try:
         return _parse(text.encode("latin-1", "replace") if isinstance(text, str) else text)
     except ValueError as error:
         raise ValueError(one_line(error)) from error
     except UNREADABLE as error:
-        fault = f"{error.args[0]} is missing, or of another kind" if isinstance(error, KeyError) else "one is malformed"
-        raise ValueError(one_line(damaged(f"of its entities {fault}"))) from error
+        fault = f"{error.args[0]} is missing or of another kind" if isinstance(error, KeyError) else "text is malformed"
+        raise ValueError(one_line(damaged(f"entity {fault}"))) from error
 
 
 def _parse(text: bytes) -> StepText:
@@ -167,11 +167,11 @@ def _parse(text: bytes) -> StepText:
     data, entities = read_entities(text.decode("latin-1"))  # Part 21 is ASCII; latin-1 never fails
     lengths, angles = (_units(kind, entities) for kind in ("LENGTH", "PLANE_ANGLE"))
     if len(lengths) != 1:
-        raise ValueError(f"{len(lengths)} units of length ({', '.join(lengths)}); export it in millimetres only")
+        raise ValueError(f"it has {len(lengths)} units of length ({', '.join(lengths)}); export it in millimetres only")
     ((unit, number),) = lengths.items()
     size = _unit_size(entities, number)  # mm
     if size is None or not 0 < size < math.inf:
-        raise ValueError(f"lengths in {unit}, whose size in metres the file does not state; export it in millimetres")
+        raise ValueError(f"it has lengths in {unit} but does not state the size of this unit; export it in millimetres")
     solids = [*entities.of("MANIFOLD_SOLID_BREP"), *entities.of("BREP_WITH_VOIDS")]
     placement = placement_of(solids[0], entities) if len(solids) == 1 else identity()
     placement = replace(placement, shift=size * placement.shift)
@@ -194,7 +194,7 @@ def _parse(text: bytes) -> StepText:
 def _schema(data: str, strings: Sequence[str]) -> str:
     schema = re.search(r"FILE_SCHEMA\(\('(\d*)'", data)
     if schema is None:
-        raise ValueError("no FILE_SCHEMA in its header; write it again")
+        raise ValueError("the header has no FILE_SCHEMA; write the file again")
     return one_line(strings[int(schema[1])])
 
 
@@ -202,7 +202,7 @@ def _product(entities: Entities) -> str:
     """Return the name of the first PRODUCT, or its number if it has none."""
     for number in entities.of("PRODUCT"):
         return entities.string(number, 1) or entities.string(number, 0)
-    raise ValueError("no PRODUCT in the file; export it with a product name")
+    raise ValueError("the file has no PRODUCT; export it with a product name")
 
 
 def _units(quantity: str, entities: Entities) -> dict[str, str]:
@@ -220,7 +220,7 @@ def _unit_name(body: str, entities: Entities) -> str:
     if "CONVERSION_BASED_UNIT" in body:  # an inch
         index = required(re.search(r"CONVERSION_BASED_UNIT\('(\d+)'", body))[1]
         name = one_line(entities.strings[int(index)].lower()[:40])
-        return f"{name} by a factor of its own" if "metre" in name or "radian" in name else name
+        return f"{name} with a conversion factor" if "metre" in name or "radian" in name else name
     if body.count("SI_UNIT(") != 1:
         raise damaged("a unit has no kind, or two kinds")
     prefix, unit = required(re.search(r"SI_UNIT\((\.\w+\.|\$),\.(\w+)\.\)", body)).groups()
@@ -259,7 +259,7 @@ def _reference_lists(kind: str, entities: Entities) -> dict[str, list[str]]:
 
 
 def _flagged_references(kind: str, before: str, entities: Entities) -> dict[str, tuple[str, str]]:
-    """Return the reference and the flag, T or F, at the end of each entity of a kind."""
+    """Return reference and flag, T or F, at the end of each entity of a kind; before: pattern of what precedes them."""
     pattern = re.compile(before + r"#(\d+),\.([TF])\.\)")
     flagged = {name: required(pattern.fullmatch(body)) for name, body in entities.of(kind).items()}
     return {name: (hit[1], hit[2]) for name, hit in flagged.items()}
@@ -274,10 +274,10 @@ def _freeform_surfaces(entities: Entities) -> list[FreeformSurface]:
     bodies = [(number, body) for number, body in attributes.items() if not RULED.match(body)]
     bodies.sort(key=lambda each: each[1].count("#"), reverse=True)
     if not bodies:
-        raise ValueError("no B_SPLINE_SURFACE_WITH_KNOTS in the file; give one written by bstcad")
+        raise ValueError("the file has no B_SPLINE_SURFACE_WITH_KNOTS; give a file written by bstcad")
     large = [each for each in bodies if each[1].count("#") > CONIC_NET]
     if len(large) > 2:
-        raise ValueError(f"the file has {len(large)} freeform surfaces, a lens has one or two; export only the lens")
+        raise ValueError(f"the file has {len(large)} freeform surfaces, but a lens one or two; export only the lens")
     surfaces = [_surface(*each, entities) for each in large or bodies[:1]]
     if len(surfaces) > 1:
         (middle, normal), (other, its_normal) = map(_middle_and_normal, surfaces)
@@ -287,7 +287,7 @@ def _freeform_surfaces(entities: Entities) -> list[FreeformSurface]:
 
 
 def _middle_and_normal(surface: FreeformSurface) -> tuple[np.ndarray, np.ndarray]:
-    """Return the control point (3,) in the middle of a net, and the unit vector (3,) along u x v of its sides."""
+    """Return the control point (3,) at the centre of a net, and the unit vector (3,) along u x v of its sides."""
     net = surface.control_points
     m, n, _ = net.shape
     normal = np.cross(net[-1, 0] - net[0, 0], net[0, -1] - net[0, 0])
@@ -332,10 +332,10 @@ def _net(text: str) -> np.ndarray:
 def _check_knots(counts: np.ndarray, knots: np.ndarray, points: int, degree: int) -> None:
     """Raise ValueError unless knots of these multiplicities define a spline of this degree and number of points."""
     if not 1 <= degree <= MAX_DEGREE:
-        raise damaged(f"a spline of degree {degree}")
+        raise damaged(f"a spline has degree {degree}")
     rising = np.isfinite(knots).all() and (np.diff(knots) > 0).all()
     if not rising or len(counts) != len(knots) or counts.min() < 1 or counts.sum() != points + degree + 1:
-        raise damaged(f"{counts.sum()} knots for {points} control points of degree {degree}")
+        raise damaged(f"{counts.sum()} knots do not fit {points} control points of degree {degree}")
 
 
 # ---- stated properties of the part ---------------------------------------------------------------------------------
@@ -344,9 +344,9 @@ def _check_knots(counts: np.ndarray, knots: np.ndarray, points: int, degree: int
 def _properties(entities: Entities, products: set[str], unit: float) -> ValidationProperties:
     """Return the properties that a file states; a number that cannot be read is UNKNOWN_VALUE.
 
-    unit: unit of length of the file (mm), which holds for centroids; a measure states its own unit.
-    products: product definitions of the lens.  Others, such as an assembly, have centroids in their own frames; if the
-    set is empty, those of all products are read.
+    unit: unit of length of the file (mm), in which centroids are stated; a measure states its unit.
+    products: product definitions of the lens; if empty, properties of all products are read.  Others, such as an
+    assembly, have centroids in frames of their own.
     """
     items: dict[tuple[str, str], list[str]] = {}  # (kind of property, its name) -> first items of its representations
     for body in entities.of("PROPERTY_DEFINITION_REPRESENTATION").values():
@@ -373,7 +373,7 @@ def _properties(entities: Entities, products: set[str], unit: float) -> Validati
 
 
 def _measure(entities: Entities, item: str, kind: str) -> float:
-    """Return the value of a measure, in mm and g to the powers of its unit."""
+    """Return the value of a measure, in powers of mm and g as in its unit."""
     value = re.search(rf"{kind}\(({NUMBER})\),#(\d+)", entities.bodies.get(item, ("", ""))[1])
     return float(value[1]) * _unit_scale(entities, value[2]) if value else UNKNOWN_VALUE
 
@@ -387,7 +387,7 @@ def _centroid(item: str, entities: Entities, unit: float) -> tuple[float, float,
 
 
 def _unit_scale(entities: Entities, unit: str) -> float:
-    """Return the size of a unit, in mm and g to its powers."""
+    """Return the size of a unit, in powers of mm and g."""
     if (size := _unit_size(entities, unit)) is not None:
         return size
     scale = 1.0
@@ -425,7 +425,7 @@ def _profiles(entities: Entities) -> Iterator[ProfileTolerance]:
 
 
 def _toleranced_face(entities: Entities, aspect: str) -> tuple[str, str]:
-    """Return (surface, name) of the face that an aspect of the shape denotes; ("", "") if that is not one face."""
+    """Return (surface, name) of the face that an aspect of the shape denotes; ("", "") unless it is one face."""
     usages = map(entities.references, entities.of("GEOMETRIC_ITEM_SPECIFIC_USAGE"))
     faces = {names[-1] for names in usages if names[0] == aspect}
     if len(faces) != 1 or entities.bodies.get(face := faces.pop(), ("",))[0] != "ADVANCED_FACE":

@@ -1,8 +1,8 @@
 """Placement of a lens in its file: a rotation and a shift, r -> R r + t.
 
 A CAD program that moves a part writes either a placement or moved coordinates.  A placement is read from the
-statements of the file (assembly.py).  Moved coordinates are recognised here by the net of the freeform face, whose
-control points lie on a uniform grid over the lens's own x and y.
+statements of the file (assembly.py).  Moved coordinates are recognised here from the net of the freeform face, whose
+control points lie on a uniform grid in x and y of the lens's own frame.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from scipy.spatial.transform import Rotation
 MAX_GRID_DEVIATION = 1e-9  # largest deviation (mm) of an unmoved net from its uniform grid about the axis
 FLAT_RMS = 1e-7  # RMS deviation (mm) from a plane below which a net has the normal of that plane
 PARALLEL_SINE = 1e-9  # sine of the angle below which two directions are parallel
-DECIMALS = 9  # decimals of a stated shift (mm) and rotation (degrees); finer ones are rounding of the coordinates
+DECIMALS = 9  # decimals of a stated shift (mm) and rotation (degrees); further ones are rounding errors
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """r -> R r + t, from the frame of the lens to the frame of the file."""
+    """Rigid motion r -> R r + t from the frame of the lens to the frame of the file."""
 
     rotation: np.ndarray  # R, (3, 3), orthonormal and right-handed
     shift: np.ndarray  # t, (3,), mm
 
     @classmethod
     def of_axes(cls, origin: np.ndarray, axis: np.ndarray, reference: np.ndarray) -> Placement:
-        """Return the frame at an origin with z along `axis` and x along the component of `reference` normal to z.
+        """Return the placement at `origin`, with z along `axis` and x along the part of `reference` normal to z.
 
         Raises ValueError if the two directions are parallel or zero.
         """
@@ -102,11 +102,11 @@ def compose(placements: Sequence[Placement]) -> Placement:
 
 
 def own_frame(net: np.ndarray) -> Placement:
-    """Return the placement of a control net (m, n, 3) by its own grid: x along its first axis, y along the second.
+    """Return the placement of the frame of a net (m, n, 3): x along its first array axis, y along its second.
 
-    z is the direction in which the net deviates from a uniform plane grid.  The new origin is the projection of the
-    old one onto the axis of the net, so that heights along the axis do not change.  The identity is returned for a net
-    that already lies about the z axis, or whose points lie on no such grid.
+    z is the direction in which the net deviates from a uniform plane grid.  The origin is the file's origin projected
+    onto the axis of the net, so that heights along the axis do not change.  The identity is returned for a net that
+    is already centred on the z axis, or whose points do not lie on such a grid.
     """
     if _grid_deviation(net) <= MAX_GRID_DEVIATION:
         return identity()
@@ -129,7 +129,7 @@ def own_frame(net: np.ndarray) -> Placement:
 
 
 def _grid_deviation(net: np.ndarray) -> float:
-    """Return the largest deviation (mm) in x or y of a net from the uniform grid of its extent about the z axis."""
+    """Return the largest deviation (mm) in x or y of a net from a uniform grid of equal size, centred on the z axis."""
     m, n, _ = net.shape
     half = (net[-1, -1, :2] - net[0, 0, :2]) / 2
     if not half.min() > 0:

@@ -101,7 +101,7 @@ def test_a_lens_in_another_unit_passes_in_mm(make_lens, tmp_path, unit, name, si
     net = lens.back.control_points()
     assert np.abs(text.surface.control_points - net).max() < 1e-12 * size  # of the digits that OCC writes
     assert np.abs(found.lens.back.control_points() - net).max() < 1e-12 * size
-    with pytest.raises(ValueError, match=f"lengths in {name}; export it in millimetres"):
+    with pytest.raises(ValueError, match=f"lengths are in {name}; export it in millimetres"):
         part21.read_lens(path)
 
 

@@ -94,9 +94,9 @@ DAMAGES = {
     "truncated": (lambda t: t[: len(t) // 2], "truncated"),
     "closed half-way": (lambda t: t[: len(t) // 2] + ";\nENDSEC;\nEND-ISO-10303-21;\n", "damaged"),
     "gap": (lambda t: t[: len(t) // 3] + t[len(t) // 3 + 3000 :], "damaged"),
-    "picometres": (lambda t: t.replace("SI_UNIT(.MILLI.,", "SI_UNIT(.PICO.,"), "lengths in picometre, whose size"),
+    "picometres": (lambda t: t.replace("SI_UNIT(.MILLI.,", "SI_UNIT(.PICO.,"), "lengths in picometre but does"),
     "no face": (lambda t: re.sub(r"(CLOSED_SHELL\('',\(#\d+),#\d+,", r"\1,", t), "0 solids"),
-    "no surface": (lambda t: t.replace("B_SPLINE_SURFACE_WITH_KNOTS", "B_SPLINE_SURFAXE"), "text: no B_SPLINE_SURFACE"),
+    "no surface": (lambda t: t.replace("B_SPLINE_SURFACE_WITH_KNOTS", "B_SPLINE_SURFAXE"), "the file has no B_SPLINE_"),
     "no solid": (lambda t: t.replace("MANIFOLD_SOLID_BREP", "FACETED_BREP"), "0 solids"),
 }
 

@@ -177,7 +177,7 @@ PLATE = rectangle(6, 5)
         (PLATE, [(0.0, 0.0, 1.0), (0.0, 0.0, 1.0)], CROSSED),
         (PLATE, [(0.0, 0.0, 1.0), (4.0, 0.0, 0.5)], FAULT.format("hole lies outside the rim")),
         (PLATE, [(0.0, 0.0, 2.0), (0.1, 0.0, 0.5)], FAULT.format("holes are nested")),
-        (PLATE, [(0.0, 0.0, 0.0)], "hole 1: a diameter of 0 mm"),
+        (PLATE, [(0.0, 0.0, 0.0)], "hole 1: the diameter is 0 mm"),
         (PLATE, [(0.0, 1.0)], r"hole 1: \(0.0, 1.0\) is not \(x, y, diameter\); give"),
         (PLATE, (0.0, 0.0, 1.0), f"hole 1: float {NO_WIRE}"),
         (PLATE, [(0.0, float("nan"), 1.0)], "hole 1: .* give three numbers"),

@@ -101,7 +101,7 @@ def test_wires_stay_in_the_plane_around_the_front():
     depth = quadrature.of_lens(lens()).volume - solid_properties.of_solid(drilled).volume
     assert drilled.isValid() and 50 < depth < 120
     for hole in ((10.0, 0.0, 3.0), (0.0, 0.0, 3.0)):
-        with pytest.raises(ValueError, match="a wire crosses the front, Ø21 mm, or lies inside it; draw it in the"):
+        with pytest.raises(ValueError, match="a wire crosses the front, Ø21 mm, or lies inside it; move the wire"):
             lens_solid(lens(), holes=[hole])
 
 

@@ -77,7 +77,7 @@ def test_coordinates_in_another_unit_are_read_in_mm(units, name, size):
 
 
 def test_a_unit_of_no_stated_size_is_refused():
-    with pytest.raises(ValueError, match="lengths in inch, whose size in metres the file does not state"):
+    with pytest.raises(ValueError, match="it has lengths in inch but does not state the size of this unit"):
         part21.parse(text(units=UNITS.replace(MILLI, "CONVERSION_BASED_UNIT('INCH',#901)")))
 
 
@@ -125,7 +125,7 @@ DAMAGES = {
     "bracket": (lambda t: t.replace("((#1,", "(#1,"), "malformed"),
     "letter": (lambda t: t.replace("(3,1,3)", "(3,l,3)"), "malformed"),
     "infinite": (lambda t: t.replace("1.50000000000000000E+00", "1.E999", 1), "not finite"),
-    "kind": (lambda t: t.replace("#3,#4)", "#3,#60)"), "#60 is missing, or of another kind"),
+    "kind": (lambda t: t.replace("#3,#4)", "#3,#60)"), "#60 is missing or of another kind"),
     "knots": (lambda t: t.replace("(3,1,3)", "(2,1,3)"), "knots"),
     "no times": (lambda t: t.replace(KNOTS[:-11], "(3,0,1,3),(3,\n1,3),(0.,0.5,1.,2.)", 1), "knots"),
     "infinite knot": (

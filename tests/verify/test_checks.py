@@ -196,7 +196,7 @@ def test_where_no_limit_was_asked_the_verdict_is_one_of_its_own(small_design, tm
 
 
 UNREADABLE = {
-    "metres": (lambda t: t.replace("SI_UNIT(.MILLI.,.METRE.)", "SI_UNIT($,.METRE.)"), "lengths in metre"),
+    "metres": (lambda t: t.replace("SI_UNIT(.MILLI.,.METRE.)", "SI_UNIT($,.METRE.)"), "lengths are in metre"),
     "a knot by 0.01": (lambda t: moved_knot(t, 0.01), "knots in x are not"),
     "truncated": (lambda t: t[: len(t) // 2], "truncated"),
     "the front behind the back": (lambda t: moved_sphere(t, 15.0), "none of its light"),
