@@ -90,7 +90,7 @@ def _solid(shape: cadquery.Shape, name: str) -> cadquery.Solid:
     """Return the only solid in a shape; ValueError if there is not exactly one."""
     solids = shape.Solids()
     if len(solids) != 1:
-        raise ValueError(f"mount: {name} has {len(solids)} solids; give one solid that extends all around each lens")
+        raise ValueError(f"mount: {name} has {len(solids)} solids; give one solid that reaches all around each lens")
     return solids[0]
 
 

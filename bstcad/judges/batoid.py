@@ -1,8 +1,8 @@
 """batoid as a judge: a sequential ray tracer for telescopes, in C++ and double precision.
 
-A freeform face is its `Bicubic` on lines through all knots.  Heights, slopes and mixed derivatives there make it equal
-to the spline, except in the outermost one and a half pitches, where x is not linear in the parameter.  bstcad's source
-gives the start and the flux of each ray; batoid traces it, without losses.
+A freeform face is batoid's `Bicubic` on grid lines through all knots.  Heights, slopes and mixed derivatives there make
+it equal to the spline, except in the outermost one and a half pitches, where x is not linear in the parameter.
+bstcad's source gives the start and the flux of each ray; batoid traces the ray, without losses.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def placed(face: Face) -> PlacedSurface:
 
 
 def surfaces(lens: Lens) -> tuple[PlacedSurface, ...]:
-    """Return the faces that light meets, in its order, including windows and mirrors around the lens."""
+    """Return the faces in the order in which light meets them, including windows and mirrors around the lens."""
     return tuple(
         _place_tilted(surface) if isinstance(surface, TiltedSurface) else placed(faces.face(surface, lens.outline))
         for surface in (interface.surface for interface in lens.interfaces)
@@ -70,7 +70,7 @@ def surfaces(lens: Lens) -> tuple[PlacedSurface, ...]:
 
 
 def _place_tilted(surface: TiltedSurface) -> PlacedSurface:
-    """Return a plane or sphere in any position as a surface of batoid, without comparison."""
+    """Return a plane or sphere in any position as a surface of batoid; its error is not computed."""
     n = np.array(surface.unit_normal)
     e_x = np.cross((0.0, 1.0, 0.0), n)
     e_x /= np.linalg.norm(e_x)
@@ -85,7 +85,7 @@ def vector(rays: Rays) -> Any:
 
 
 def land(rays: Any, screen: Screen, sense: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Move batoid's rays to the screen; return x, y (mm, on it) and True if arrived; sense: -1 for light along -z."""
+    """Move rays of batoid to a screen; return x and y there (mm) and True for rays that hit.  sense: -1 along -z."""
     x, y, _ = screen.middle
     batoid.intersect(batoid.Plane(), rays, _frame(screen.middle, np.column_stack(axes(screen.tilt or (0.0, 0.0)))))
     arrived = ~rays.failed & ~rays.vignetted & np.isfinite(rays.x) & np.isfinite(rays.y) & (sense * rays.vz > 0)
@@ -93,7 +93,7 @@ def land(rays: Any, screen: Screen, sense: int = 1) -> tuple[np.ndarray, np.ndar
 
 
 def through(lens: Lens, known: Sequence[PlacedSurface], rays: Rays) -> Any:
-    """Trace rays of the source through the lens and return them as batoid's; known: surfaces of the lens in batoid."""
+    """Trace rays from the source through the lens; return rays of batoid.  known: surfaces of the lens in batoid."""
     theirs = vector(rays)
     for interface, at in zip(lens.interfaces, known, strict=True):
         if isinstance(interface.law, Reflect):

@@ -34,10 +34,10 @@ from bstcad.verify.verdict import Check
 JUDGES = {"batoid": "bstcad.judges.batoid", "mitsuba": "bstcad.judges.mitsuba"}
 JUDGE_RAYS = 1 << 24  # rays of a judge, in both halves
 MAX_COMPARED_PIXELS = 128  # largest number of pixels along the longer side of the compared pictures
-OWN_EFFORT = Effort(accuracy=0.0, witness=False)  # all rays are traced, and no second picture with tubes
+OWN_EFFORT = Effort(accuracy=0.0, witness=False)  # effort of bstcad: all rays, no second picture by flux tubes
 OWN_SEED_OFFSET = 500_009  # difference between the seeds of bstcad's and the judge's rays
-AGREEMENT_FACTOR = 1.5  # largest ratio of the difference of pictures to its noise, if there are many pixels
-MIN_NOISE = 1e-9  # smallest noise, relative to the target
+AGREEMENT_FACTOR = 1.5  # largest ratio of the difference of pictures to its noise, for many pixels
+MIN_NOISE = 1e-9  # lower bound of the noise, relative to the target
 FLUX_TOLERANCE = 0.005  # largest difference of the light on the target, as a fraction of the source's light
 
 
@@ -102,7 +102,7 @@ class OwnJudge(Protocol):
 
 
 def choose_judges(names: Sequence[str | OwnJudge]) -> tuple[str | OwnJudge, ...]:
-    """Check the names of judges, each once; SceneError for an unknown one, MachineError if it is not installed."""
+    """Return the judges, each once; SceneError for an unknown name, MachineError for a program not installed."""
     for name in names:
         if not isinstance(name, str):
             continue
@@ -135,7 +135,7 @@ def run_judges(
 def compare(
     judge: str | OwnJudge, lens: Lens, channels: Sequence[Channel], goal: Goal, *, rays: int, seed: int = 0
 ) -> Comparison:
-    """Compare a judge's picture of the light on a target with bstcad's; rays: number of its rays in both halves."""
+    """Compare a judge's picture of the light on a target with bstcad's; rays: number of the judge's rays in total."""
     began = time.perf_counter()
     (functions, name, version), key = _judge_functions(judge), goal.key if goal.suffix else ""
     declined = functions.cannot(lens, channels)
@@ -194,12 +194,12 @@ def _judge_functions(judge: str | OwnJudge) -> tuple[Any, str, str]:
 
 
 def _difference(one: np.ndarray, other: np.ndarray, target: np.ndarray) -> float:
-    """Return the RMS difference of two pictures of the target's sum, relative to the target."""
+    """Return the RMS difference of two pictures, each with the sum of the target, relative to the target's RMS."""
     return float(np.linalg.norm(one - other) / np.linalg.norm(target))
 
 
 def _effective_pixels(noise: np.ndarray) -> float:
-    """Return the effective number of pixels with noise: all if it is normal and uniform, few if few are lit."""
+    """Return the effective number of noisy pixels: all if the noise is normal and uniform, few if few are lit."""
     second, fourth = float((noise**2).sum()), float((noise**4).sum())
     return min(3 * second**2 / fourth, noise.size) if fourth > 0 else float(noise.size)
 
@@ -210,9 +210,9 @@ def _scale_to(picture: np.ndarray, total: float) -> np.ndarray:
 
 
 def coarse_screen(screen: Screen) -> Screen:
-    """Return the screen with nearly square pixels, at most MAX_COMPARED_PIXELS and its own number along the longer one.
+    """Return the screen with nearly square pixels, along the longer side at most MAX_COMPARED_PIXELS or the old number.
 
-    Of the numbers above half of that, the one with the most nearly square pixels is chosen, the largest of several.
+    Of the numbers above half this limit, the one with the most nearly square pixels is chosen, the largest of equals.
     """
     width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
     ratio = min(width, height) / max(width, height)
@@ -226,6 +226,6 @@ def coarse_screen(screen: Screen) -> Screen:
 
 
 def resample(picture: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return the flux of a picture in the pixels of another raster (rows, columns) of its rectangle."""
+    """Return the flux of a picture in another number of pixels (rows, columns) of the same rectangle."""
     down, across = (overlap(n, k) * (n / k) for n, k in zip(picture.shape, shape, strict=True))
     return down @ (across @ picture.T).T

@@ -1,7 +1,7 @@
 """Faces of a lens for judges: heights, slopes and triangles; and the record of a judge's picture.
 
-They are independent of bstcad's tracing: scipy's splines on the control net and its knots, and the sag of a surface of
-revolution in numpy.
+The faces are independent of bstcad's tracing: scipy evaluates splines on the control net and its knots, and numpy the
+sag of a surface of revolution.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from bstcad.optics.unfolding import per_radian
 
 PARAMETER_STEPS = 6  # steps of Newton's method for a parameter; the first guess has an error of at most half a span
 GRID_CELLS = 512  # cells per side of the grid over a face without knots
-PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # radii of rings, relative; slim triangles leak light
+PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # radii relative to the rim; slim triangles leak light
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Freeform:
-    """A quadratic B-spline of a net that is uniform in x and in y; outside the net its tangent."""
+    """A quadratic B-spline on a net that is uniform in x and in y, extrapolated linearly outside the net."""
 
     net: np.ndarray  # control net, (m, n, 3), mm, x along the first axis
 
@@ -68,7 +68,7 @@ class Freeform:
         return (x0, x1), (y0, y1)
 
     def lines(self, parts: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return x and y (mm) of grid lines, 2 `parts` per pitch, through all knots, at 1.5, 2.5, … pitches."""
+        """Return x and y (mm) of grid lines, 2 `parts` per pitch, through all knots (at 1.5, 2.5, … pitches)."""
         x, y = (
             np.linspace(*ends, 2 * parts * (m - 1) + 1) for ends, m in zip(self._ends, self.net.shape, strict=False)
         )
@@ -94,7 +94,7 @@ class Freeform:
         return Shape(grid_x, grid_y, z, z_x=z_x + z_xy * off_y, z_y=z_y + z_xy * off_x, z_xy=z_xy)
 
     def _parameter(self, x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return x clipped to the net, t and dt/dx, with x(t) = Σ B_i(t) x_i, by Newton's method."""
+        """Return x clipped to the net, and t and dt/dx for x(t) = Σ B_i(t) x_i, found with Newton's method."""
         ends, m = self._ends[axis], self.net.shape[axis]
         x = np.clip(x, *ends)
         along = BSpline(self.knots[axis], np.linspace(*ends, m), 2)
@@ -115,7 +115,7 @@ class Revolved:
     half: tuple[float, float]  # half extents along x and y (mm)
 
     def lines(self, parts: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return x and y (mm) of the lines of a uniform grid over the face; a plane ignores `parts`."""
+        """Return x and y (mm) of the lines of a uniform grid over the face; parts: refinement, not for a plane."""
         cells = GRID_CELLS * parts if self.curvature else 64
         x, y = (np.linspace(-half, half, cells + 1) for half in self.half)
         return x, y
@@ -151,7 +151,7 @@ class FaceError:
     slope: float  # RMS angle between normals (rad)
 
     def shift(self, lens: Lens, screen: Screen) -> float:
-        """Return the shift of light on the screen, in its unit."""
+        """Return the shift of light on the screen due to this error, in the screen's unit."""
         return self.slope * lens.deflection * abs(per_radian(lens, screen))
 
     @classmethod
@@ -171,14 +171,14 @@ class FaceError:
 class Traced:
     """A judge's picture of the light on a screen."""
 
-    halves: np.ndarray = field(repr=False)  # flux per pixel, (2, rows, columns), row 0 = y max, each of the whole light
+    halves: np.ndarray = field(repr=False)  # flux per pixel, (2, rows, columns), row 0 = y max, each with the full flux
     rays: int  # number of rays in both halves
     error: FaceError  # largest error of the judge's faces
     by: str = ""  # variant of the program, if it has several
 
     @property
     def picture(self) -> np.ndarray:
-        """Mean of both halves, (rows, columns)."""
+        """Mean of the two halves, (rows, columns)."""
         return self.halves.mean(axis=0)
 
 
@@ -227,8 +227,8 @@ def _mesh(corners: np.ndarray, normals: np.ndarray, triangles: np.ndarray, uv: n
 def face_mesh(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Trimesh, FaceError]:
     """Return a mesh of a face inside the outline, with exact normals towards +z or -z at its corners, and its error.
 
-    The grid is uniform and has lines through all knots.  Between corners the normals are linear, nearly as those of a
-    quadratic spline.  Outer corners of cells on the rim are moved onto the rim; cells outside are omitted.
+    The grid is uniform and has lines through all knots.  Between corners, normals are interpolated linearly, nearly as
+    on a quadratic spline.  Outer corners of cells on the rim are moved onto the rim; cells outside are omitted.
     """
     x, y = face.lines(parts)
     shape = face.on_grid(x, y)
@@ -250,7 +250,7 @@ def face_mesh(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Trime
 
 
 def _mesh_error(face: Face, shape: Shape, x: np.ndarray, y: np.ndarray, *, whole: np.ndarray) -> FaceError:
-    """Return the error at the centres of the whole cells, which are the middles of their diagonals."""
+    """Return the error at the centres of cells inside the rim (whole), which lie on the diagonals of these cells."""
     middle = face.on_grid((x[:-1] + x[1:]) / 2, (y[:-1] + y[1:]) / 2)
     between = shape.normals[:-1, :-1] + shape.normals[1:, 1:]
     between /= np.linalg.norm(between, axis=-1, keepdims=True)
@@ -284,7 +284,7 @@ def disc(outline: Outline, centre: tuple[float, float, float], along: tuple[floa
 
 
 def _strips(curves: Sequence[np.ndarray], normals: np.ndarray) -> Trimesh:
-    """Return strips of triangles between successive closed curves with equal numbers of points."""
+    """Return strips of triangles between successive closed curves (n, 3) with equal numbers of points."""
     n = len(normals)
     k, after = np.arange(n), (np.arange(n) + 1) % n
     strip = np.concatenate([np.stack([k, after, after + n], axis=1), np.stack([k, after + n, k + n], axis=1)])

@@ -1,14 +1,14 @@
-"""Mitsuba 3, a renderer, as a judge: photons of its own emitters through a mesh of its own dielectric.
+"""Mitsuba 3, a renderer, as a judge: photons from Mitsuba's emitters through a mesh of Mitsuba's dielectric.
 
-Its particle tracer sends photons from the source, reflects or transmits each at random (Fresnel reflectance), and
-images a matt screen through a pinhole.  Therefore its light has photon noise, and the losses of uncoated faces even if
-the scene requests none.  Its mirror is lossless.
+Mitsuba's particle tracer sends photons from the source, reflects or transmits each at random (Fresnel reflectance), and
+images a matt screen through a pinhole.  Therefore the light has photon noise, and the losses of uncoated faces even if
+the scene requests none.  Mirrors are lossless.
 
 The wall of the lens and a plate around its front stop the light that bstcad counts as lost: through the sides, and past
 the lens.  A parallel beam starts from a plate of the aperture's shape with normals along the beam; a cone of uniform
 radiant intensity is a spot; any other point source is a projector, whose slide is its irradiance over the lens.
 
-With a shared library of LLVM 16 or later it is several times faster; without one it needs no library.
+With a shared library of LLVM 16 or later, which is optional, Mitsuba is several times faster.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from bstcad.optics.point import Point
 from bstcad.optics.rays import axes
 from bstcad.optics.trace import window
 
-MIN_LLVM = 16  # first version that compiles its kernels; with 15 the process crashes
-SCREEN_REFLECTANCE = 1e-3  # reflectance of the screen, so low that light back to the lens is negligible
+MIN_LLVM = 16  # first version of LLVM that compiles Mitsuba's kernels; with 15 the process crashes
+SCREEN_REFLECTANCE = 1e-3  # reflectance of the screen, so low that light reflected to the lens is negligible
 PHOTONS_PER_PASS = 1 << 22  # largest number of photons in a pass, limited by memory
 MESH_PARTS = (1, 2, 4)  # cells of the mesh per half span of the net, tried in turn
 MAX_CORNERS = 5_000_000  # largest number of corners of a mesh
@@ -78,7 +78,7 @@ def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
 def trace(
     lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int, reflections: int = 0
 ) -> Traced:
-    """Return the picture on a screen of square pixels; reflections: largest number inside a lens, 2 for its ghost."""
+    """Return the picture on a screen of square pixels; reflections: largest number inside the lens, 2 for a ghost."""
     _mitsuba().set_variant(variant := _variant())
     _mitsuba().logger().clear_appenders()  # no progress bar per render
     halves, photons = np.zeros((2, *screen.shape)), 0
@@ -114,7 +114,7 @@ def _variant() -> str:
 
 
 def _render(scene: Any, screen: Screen, photons: float, seed: tuple[int, ...]) -> tuple[np.ndarray, int]:
-    """Return the flux in each pixel, row 0 = y max, column 0 = x min, and the number of photons.  E = π L / ρ."""
+    """Return the flux in each pixel, E = π L / ρ, row 0 = y max, column 0 = x min, and the number of photons."""
     pixels, passes = math.prod(screen.shape), math.ceil(photons / PHOTONS_PER_PASS)
     spp = max(1, round(photons / pixels / passes))
     numbers = np.random.SeedSequence([abs(part) for part in seed]).generate_state(passes)
@@ -234,7 +234,7 @@ LAMPS = {"collimated": _beam_lamps, "point": _point_lamps}  # function that retu
 
 
 def _plate(source: Collimated, weight: float, lens: Lens, path: Path) -> Entry:
-    """Return a parallel beam through its aperture, from the plane where rays start."""
+    """Return a plate of the aperture's shape that emits a parallel beam, in the plane where rays start."""
     z = lens.entrance.z
     start = source.start(z)
     (x, y), (a, b), distance = source.shift(z), source.slopes, z - start
@@ -272,7 +272,7 @@ def _largest_slope(source: Point, lens: Lens) -> float:
 
 
 def _slide(source: Point, lens: Lens, half: float) -> Entry:
-    """Return the slide of a projector: E on the plane at a distance of 1 mm from the source, seen along its light."""
+    """Return a projector's slide: the irradiance on a plane 1 mm from the source, seen along the light."""
     (x, y, z), sense, across = source.position, _sense(source, lens), half * TEXEL_CENTRES
     return _texture(_irradiance(source, x - sense * across, y - across, z + sense))
 

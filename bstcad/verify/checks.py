@@ -41,17 +41,17 @@ if TYPE_CHECKING:
     from bstcad.verify.step_checks import ExaminedFile  # this import loads OCC
 
 VERTEX_ROUNDING = 2e-7  # distance of a vertex in float32 from its sloped face, relative to the largest coordinate
-VERIFY_SEED = 1_000_003  # offset of the seed: rays that tailoring has not used
-TARGET_TOLERANCE = 1e-3  # difference of targets, relative to the brightest pixel: versions of picture libraries differ
+VERIFY_SEED = 1_000_003  # offset of the seed, for rays that tailoring has not used
+TARGET_TOLERANCE = 1e-3  # difference of targets by versions of picture libraries, relative to the brightest pixel
 DEFAULT_RRMSD_LIMIT = 0.25  # limit of the RRMSD in remarks, plans and tolerance studies without accept.rrmsd
 LINE_TUBES = 1031  # smallest number of tubes per side for the picture of one line of a spectrum
-CLEAR_APERTURE_TOLERANCE = 1e-3  # largest distance of two rims (mm); a scene has one inset per edge, the largest
+CLEAR_APERTURE_TOLERANCE = 1e-3  # largest distance of two rims (mm), since a scene states only an edge's largest inset
 MIN_MOUNT_LOSS = 1e-3  # fraction of the light that a mount must cut away to be given as the reason for a failure
 MAX_FLANGE_LIGHT = 1e-3  # largest fraction of the light through the lens that may meet the flange
 WAVEFRONT = "wavefront error, RMS in waves, piston and tilt removed"
 DRAFT_ACCURACY = 0.01  # relative standard error of the RRMSD of a draft at which sampling ends
-MAX_FLOOR = 0.1  # largest ratio of the rounding of the wavefront error to its limit; above it the verdict is open
-TIME_LIMIT, TIME_LIMIT_PER_MB = 120.0, 3.0  # timeout of OCC (s), and increase per MB: 100 times its usual time
+MAX_FLOOR = 0.1  # largest ratio of the wavefront error's rounding to its limit; above it the verdict is uncertain
+TIME_LIMIT, TIME_LIMIT_PER_MB = 120.0, 3.0  # timeout of OCC (s) and its increase per MB, 100 times the usual time
 
 R = TypeVar("R")
 Lines = tuple[SpectralLine, ...]  # pictures of the lines of a spectrum on one target
@@ -71,22 +71,22 @@ class Nominal:
 
     @cached_property
     def channels(self) -> tuple[Channel, ...]:
-        """Light of the scene; its points on an extended source are not the points of tailoring."""
+        """Channels of the scene's light; their points on an extended source are not the points used in tailoring."""
         return self.scene.verification_channels()
 
     @property
     def heaviest(self) -> Channel:
-        """Channel with the largest weight: the main line, whose wavelength is the unit of wavefront errors."""
+        """Channel with the largest weight, whose wavelength is the unit of wavefront errors."""
         return max(self.channels, key=lambda channel: channel.weight)
 
     def effort(self, given: Effort | None = None) -> Effort:
-        """Return the effort of measuring this design, smaller for a draft; given: a limit, None: no limit."""
+        """Return the effort of measuring this design, smaller for a draft; given: upper limit; None: no limit."""
         given, tailoring = given or FULL, self.scene.tailoring
         accuracy = DRAFT_ACCURACY if tailoring.quality == "draft" else FULL.accuracy
         return replace(given, seed=tailoring.seed, accuracy=max(given.accuracy, accuracy))
 
     def light(self, lens: Lens, goal: Goal, effort: Effort) -> Light:
-        """Return the light that a made lens throws on a target."""
+        """Return the light of a lens on a target."""
         return measure_goal(lens, self.channels, goal, effort, ghost=self.scene.ghost, draw=self.scene.draw)
 
 
@@ -138,9 +138,9 @@ def verify(
 ) -> Proof:
     """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all.
 
-    submit: with bstcad.runs.processes.submit a second process reads the STEP file by OCC, while this one reads its text
-    and the mesh.  on_lens: called with the lens of the STEP file as soon as it has been read.  on_light: called with
-    its light on each target, the lines of a spectrum there, and the index of the target.
+    submit: with bstcad.runs.processes.submit, a second process reads the STEP file by OCC, while this one reads the
+    file's text and the mesh.  on_lens: called with the lens of the STEP file once it has been read.  on_light: called
+    for each target with the light there, the lines of a spectrum, and the target's index.
     """
     effort = nominal.effort(effort)
     effort = replace(effort, seed=effort.seed + VERIFY_SEED, seconds=effort.seconds / len(nominal.goals))
@@ -198,11 +198,11 @@ def _check_solids(path: Path, nominal: Nominal, part: Part, points: int, submit:
 
 
 def _read_text(path: Path, read: Future[Lens]) -> StepText:
-    """Read the text of lens.step, whose errors are more precise than OCC's; read: OCC's job, ended after an error."""
+    """Read the text of lens.step, whose errors are more precise than OCC's.  read: OCC's job; an error ends it."""
     try:
         return part21.read_lens(path)
     except ValueError:
-        if not read.done():  # OCC may hang over a damaged file
+        if not read.done():  # a damaged file may hang OCC
             end()
         raise
 
@@ -221,15 +221,15 @@ def _measure_targets(lens: Lens, nominal: Nominal, effort: Effort, on_light: OnL
 
 
 def _with_design_facts(lens: Lens, designed: Lens) -> Lens:
-    """Return the re-read lens with facts that no file states: elements around it and, of two nets, shaped faces."""
+    """Return the re-read lens with data that no file states: elements around it, and which of two nets are tailored."""
     shaped = designed.shaped if lens.front.is_net else None
     return replace(lens, before=designed.before, behind=designed.behind, shaped=shaped)
 
 
 def _mounted_lens(read: Future[Lens], bare: Lens, nominal: Nominal, path: Path) -> tuple[Lens, list[Check], str]:
-    """Return the lens of part.step beside lens.step, the checks of its clear apertures, and the loss by them in words.
+    """Return the lens of part.step beside lens.step, checks of its clear apertures, and the light lost there in words.
 
-    If the part cannot be read, which other checks report, it is the lens of lens.step with the designed apertures.
+    If the part cannot be read, which other checks report, return the lens of lens.step with the designed apertures.
     """
     designed, mount = nominal.lens, nominal.scene.mount
     flange = None if mount is None else mount.flange
@@ -287,18 +287,18 @@ def examine(path: Path, submit: Submit = run_here) -> ExaminedFile:
 
 
 def _result(read: Future[R], path: Path, again: Callable[[], Future[R]] | None = None) -> R:
-    """Return the result of a job of OCC's process; again: a retry, if another file may have crashed that process."""
+    """Return the result of a job of OCC's process; again: starts it again, if another file may have crashed OCC."""
     limit = time_limit(path)
     try:
         return result(read, limit)
     except Overdue as error:
-        took = f"OpenCASCADE did not finish reading it within {limit:.0f} s and was stopped"
+        took = f"OpenCASCADE did not read this file within {limit:.0f} s and was stopped"
         raise ValueError(f"{path.name}: {took}; export only the lens, or export it from another program") from error
     except BrokenExecutor as error:
         if again is not None:
             return _result(again(), path)
         raise ValueError(
-            f"{path.name}: OpenCASCADE crashed while reading it, so it is damaged; write it again"
+            f"{path.name}: OpenCASCADE crashed while reading this file, which is damaged; write it again"
         ) from error
 
 
@@ -308,9 +308,9 @@ def time_limit(path: Path) -> float:
 
 
 def _ripple_checks(shape: Mapping[str, float | None]) -> list[Check]:
-    """State the RMS slope of the alternating heights of control points of each tailored face.
+    """State the RMS slope of the ripple of each tailored face: control points that lie alternately high and low.
 
-    There is no limit: the RRMSD judges its effect on the light, and the bounds of the scene its effect on a tool.
+    There is no limit: the RRMSD judges the effect on the light, and the bounds of the scene the effect on a tool.
     """
     slopes = {"": shape["ripple_slope"], " of the front": shape.get("front_ripple_slope")}
     measured = "RMS slope of control points that lie alternately high and low"
@@ -319,7 +319,7 @@ def _ripple_checks(shape: Mapping[str, float | None]) -> list[Check]:
 
 
 def _ripple_rrmsd(lens: Lens, nominal: Nominal) -> dict[str, float]:
-    """Return the RRMSD by the ripple of each tailored face alone, by keys of Proof.shape."""
+    """Return the RRMSD due to the ripple of each tailored face alone, by keys of Proof.shape."""
     light = nominal.heaviest
     channel = replace(light, source=light.source.central, weight=1.0)
     faces: dict[Face, str] = {"back": "", "front": "front_"} if lens.shapes("front") else {"back": ""}
@@ -332,8 +332,8 @@ def bound_checks(
 ) -> tuple[list[Check], dict[str, AtBound]]:
     """Check the bounds of a scene on its tailored faces, and return the bounds that these meet, by key.
 
-    The bounds are tool_radius, max_slope and the thicknesses of [lens]; shape: dimensions of the re-read lens.  They
-    hold for a tailored front as for the back, seen from outside: a tool has to fit into its valleys.
+    The bounds are tool_radius, max_slope and the thicknesses of [lens]; shape: dimensions of the re-read lens.  Those
+    of a tool apply to a tailored front and to the back, each seen from outside: a tool has to fit into its valleys.
     """
     checks: list[Check] = []
     found: dict[str, list[tuple[float, Extreme, str]]] = {}
@@ -382,7 +382,7 @@ def _target_check(goal: Goal, stored: np.ndarray) -> Check:
 def _mesh_checks(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> list[Check]:
     """Check the facets of the STL file against the faces of the re-read solid, whose volume is in mm³.
 
-    The error of the volume inside facets of total area A (mm²) is at most A times their tolerance (mm).
+    The error of the volume inside facets of total area A (mm²) is at most A times the facets' tolerance (mm).
     """
     size = float(np.abs(mesh.vertices).max(initial=0.0))
     tolerance, finest = nominal.scene.mesh_tolerance, len(mesh.faces) >= 0.9 * meshes.DEFAULT_MAX_TRIANGLES
@@ -409,7 +409,7 @@ def _light_checks(
 ) -> list[Check]:
     """Check the irradiance through the re-read geometry, by rays and by flux tubes, which share only the trace.
 
-    of: one of several targets, as Goal.suffix; why: reason for a limit of accept that is not met.
+    of: suffix of the checks' names, for one of several targets (Goal.suffix).  why: reason why a limit is not met.
     """
     closure, tubes = abs(sum(light.flux.values()) - 1), light.witness
     off, error = RESOLVED * light.standard_error, f"standard error of the RRMSD, times five{of}"

@@ -1,4 +1,4 @@
-"""Jobs of OCC for the second process: functions whose import loads no OCC into the process that submits them."""
+"""Jobs of OCC for the second process: functions whose import does not load OCC in the process that submits them."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Checks of the solid in a STEP file, read by OCC: lens.step and part.step against the design, or a file alone.
 
-They run in a second process, because OCC may crash over a damaged file.
+They run in a second process, because a damaged file may crash OCC.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from bstcad.verify.verdict import Check
 
 NORMAL_TOLERANCE = 1e-9  # largest angle (rad) between normals
 CURVATURE_TOLERANCE = 1e-12  # largest difference of curvatures (1/mm)
-CONIC_TOLERANCE = 1e-9  # largest difference of sag (mm) by the conic constant, which a nearly flat front leaves open
-GAP_TOLERANCE = 5e-7  # largest gap (mm); shapes are written with a tolerance of 1e-7
-PART_EDGE_TOLERANCE = 1e-6  # largest distance (mm) between edges of two parts; written with a tolerance of 1e-7
+CONIC_TOLERANCE = 1e-9  # largest difference of sag (mm) due to the conic constant, uncertain for a nearly flat front
+GAP_TOLERANCE = 5e-7  # largest gap (mm); shapes are written with a tolerance of 1e-7 mm
+PART_EDGE_TOLERANCE = 1e-6  # largest distance (mm) between edges of two parts, written with a tolerance of 1e-7 mm
 PART_FILE = "part.step"
 
 
 def one_sentence(work: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a job so that any error of OCC is a ValueError in one sentence; path: the file or its folder."""
+    """Decorate a job so that any error of OCC becomes a ValueError in one sentence; path: the file or its folder."""
 
     @functools.wraps(work)
     def checked(path: Path, *arguments: Any, **options: Any) -> Any:
@@ -64,20 +64,20 @@ class ExaminedFile:
     """Checks and contents of a STEP file without a design."""
 
     checks: tuple[Check, ...]
-    lens: Lens  # lens of the file, in its own frame, with an arbitrary index
+    lens: Lens  # lens of the file, in its own frame, with an arbitrary refractive index
     whole: WholePart | None  # part around the lens; None: a bare lens
     placement: Placement  # placement of the lens's frame in the file
 
 
 @one_sentence
 def lens(path: Path, index: float, passes: Passes = LENS) -> Lens:
-    """Read the lens of a STEP file, which states neither index nor passes of the light; ValueError if there is none."""
+    """Read the lens of a STEP file; index, passes: properties that no file states.  ValueError if it has no lens."""
     return replace(step_reading.lens(_read(path, _stamp(path)), index), own_passes=passes)
 
 
 @one_sentence
 def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, ...]:
-    """Check the solid in the STEP file of a design; ValueError if the file has none.
+    """Check the solid in the STEP file of a design; ValueError if the file has no lens.
 
     form: tolerance of the tailored faces and of the front's vertex (mm); points: number of points per compared face.
     """
@@ -94,10 +94,10 @@ def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, .
 
 @functools.lru_cache(maxsize=1)
 def _read(path: Path, stamp: object) -> StepLens:
-    """Read a file by OCC, and cache it, because `lens` and `check` use the same file in turn.
+    """Read a file by OCC, and cache the result, because `lens` and `check` use the same file in turn.
 
-    The second process may crash and reads it at once, while the first one reads its text.  Without a second process the
-    text is read first.  stamp: differs for another file of the same name.
+    The second process, which may crash, reads the file while the first one reads its text.  Without a second process,
+    the text is read first, to find damage.  stamp: changes if the file changes.
     """
     if not processes.is_second():
         part21.read_lens(path)
@@ -105,7 +105,7 @@ def _read(path: Path, stamp: object) -> StepLens:
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Return number, size and time of change of a file; None if it cannot be read: `_read` then gives the reason."""
+    """Return inode, size and modification time of a file; None if it cannot be read (`_read` gives the reason)."""
     with contextlib.suppress(OSError):
         status = path.stat()
         return status.st_ino, status.st_size, status.st_mtime_ns
@@ -114,8 +114,8 @@ def _stamp(path: Path) -> tuple[int, int, int] | None:
 
 @one_sentence
 def examine(path: Path) -> ExaminedFile:
-    """Check a STEP file without a design: compare its two readers, and its statements with its faces."""
-    text = part21.read_lens(path, any_unit=True)  # first, because OCC may hang over a damaged file
+    """Check a STEP file without a design: compare its readings by two readers, and its statements with its faces."""
+    text = part21.read_lens(path, any_unit=True)  # first, because a damaged file may hang OCC
     reread = step_reading.read(path)
     lens_read, placed = step_reading.lens(reread, index=1.5), reread.placement
     properties = solid_properties.of_solid(reread.shape)
@@ -160,7 +160,7 @@ def _solid_checks(solid: Any, of_part: bool = False) -> Iterator[Check]:
 
 
 def _edge_checks(reread: StepLens, lens: Lens, bare: bool = True) -> Iterator[Check]:
-    """Check the distance of edges from faces and, of a bare lens (no flange, no leaning walls), from its wall."""
+    """Check the distance of edges from faces and, for a bare lens (no flange, no leaning walls), from its wall."""
     (faces, on_face), (wall, on_wall) = step_reading.edge_deviations(reread.shape, lens)
     name = "solid: distance of edges from the faces they bound"
     yield Check.at_most(name, faces, GAP_TOLERANCE, unit="mm", where=on_face, id="edges-off-faces")
@@ -172,7 +172,7 @@ def _edge_checks(reread: StepLens, lens: Lens, bare: bool = True) -> Iterator[Ch
 def _form_checks(
     reread: StepLens, face: BSplineSurface, tolerance: float, count: int, *, of: str = "back"
 ) -> Iterator[Check]:
-    """Check distances (mm) and angles between normals (rad) of a face at `count` Sobol points, evaluated by OCC."""
+    """Check a face, evaluated by OCC at `count` Sobol points, against the design: distances (mm), angles of normals."""
     form = f"form: deviation of the {of} in the file from the designed one"
     if of == "front" and not reread.front.is_net:
         yield Check.true(form, False, "the file's front is not a net", id="form")
@@ -241,7 +241,7 @@ def lens_of_part(folder: Path, designed: Lens, mount: Mount) -> Lens:
     """
     path = folder / PART_FILE
     if not path.exists():
-        raise ValueError(f"{PART_FILE}: is missing")
+        raise ValueError(f"{PART_FILE}: is missing; generate the design again")
     reread, up = step_reading.read(path, _part(path, _stamp(path))[1]), mount.origin(designed.front_vertex)
     front, back = (face.moved(face.z + up) for face in (reread.front, reread.back))
     return replace(designed, front=front, back=back, clear=reread.clear, losses=None)
@@ -249,7 +249,7 @@ def lens_of_part(folder: Path, designed: Lens, mount: Mount) -> Lens:
 
 @one_sentence
 def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Check, ...]:
-    """Check the part in a design's folder; part: facts that the file should state."""
+    """Check the part in a design's folder; part: data that the file should state."""
     path = folder / PART_FILE
     try:
         wanted, why = mounting.part_of(lens, mount).solid.wrapped, "generate the design again"
@@ -286,7 +286,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
 
 
 def _part_edge_check(wanted: Any, reread: Any, why: str) -> Check:
-    """Check the largest distance (mm) between the edges of two solids; why: reason if the wanted one is None."""
+    """Check the largest distance (mm) between edges of two solids; why: reason why `wanted` is None, if so."""
     name = f"{PART_FILE}: distance of edges from the mount's"
     if wanted is None:
         return Check.true(name, False, why, id="part-edges")

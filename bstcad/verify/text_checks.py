@@ -19,10 +19,10 @@ from bstcad.scene.mount import Part
 from bstcad.step_text.part21 import FreeformSurface, StepText, ValidationProperties
 from bstcad.verify.verdict import Check
 
-SOURCE = "STEP text"  # source of the checked values, with which the names of the checks begin
+SOURCE = "STEP text"  # source of the checked values, at the beginning of the checks' names
 NET_TOLERANCE = 1e-11  # absolute tolerance of control points (mm): rounding to sixteen digits of text
 RELATIVE_ROUNDING = 2e-15  # relative tolerance of coordinates, larger than NET_TOLERANCE beyond 5 m from the origin
-MEASURE_TOLERANCE = 1e-6  # relative tolerance of area, volume and centroid; over a rough back integrals err by 1e-9
+MEASURE_TOLERANCE = 1e-6  # relative tolerance of area, volume and centroid; integrals over a rough back err by 1e-9
 VALUE_TOLERANCE = 1e-12  # absolute tolerance of stated numbers (mm or g/cm³), more than their rounding in the text
 
 Numbers = tuple[float, ...]
@@ -104,7 +104,7 @@ def _largest_difference(read: np.ndarray, designed: np.ndarray, name: str) -> tu
 def measure_checks(
     stated: ValidationProperties, shape: MassProperties | None, outline: Outline, name: str = SOURCE
 ) -> Iterator[Check]:
-    """Check the stated properties against the shape's (None if the file states none); outline: size of the lens."""
+    """Check the stated properties against those of the shape (None if none are stated); outline: of the lens."""
     if stated.of_shape:
         assert shape is not None
         measures = ("area", "mm²", stated.areas, shape.area), ("volume", "mm³", stated.volumes, shape.volume)
@@ -180,6 +180,6 @@ def _words(values: Numbers, unit: str) -> str:
 
 
 def _missing_statements(name: str, stated: Mapping[str, Sequence]) -> Iterator[Check]:
-    """Yield a check that names the quantities which the file does not state; it always passes."""
+    """Yield a check, which always passes, that names the quantities which the file does not state."""
     if missing := [quantity for quantity, values in stated.items() if not values]:
         yield Check(f"{name}: states {', '.join(missing)}", False, None, unit="", passed=True, id="not-stated")

@@ -1,4 +1,4 @@
-"""The verdict on a design, and its checks, each a value judged by a limit."""
+"""The verdict on a design, and its checks, each of a value against a limit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Check:
     value: float | bool | None  # measured value; None: could not be measured
     limit: float | bool | None  # limit; None: the value is stated, but not judged
     unit: str  # unit of value and limit; empty: a pure number
-    passed: bool  # True if the value keeps the limit
+    passed: bool  # True if the value is within the limit
     where: str = ""  # position or reason of a failure: "control point (12, 40)", counted from 0, x or u first
     id: str = ""  # section in checks.md without "check-", such as "rrmsd"; empty: a script's check without a section
 

@@ -138,7 +138,7 @@ def test_a_place_that_is_none_is_refused():
         (disc(1.0, 2.0, 4.5), "give one solid that reaches all around each lens"),
         (cq.Workplane("XY").sphere(9.0), "lens: the body must surround the lens between two"),
         (cq.Workplane("XY", origin=(0, 0, 1)).circle(RADIUS).workplane(offset=2).circle(7.5).loft()
-         .rotate((0, 0, 0), (1, 0, 0), 5), "lens: the body meets it in a face that is not a plane z = const"),
+         .rotate((0, 0, 0), (1, 0, 0), 5), "lens: the body meets the lens in a face other than a plane"),
         (None, "mount: the body is NoneType; give one cadquery solid"),
         (cq.Workplane("XY"), "mount: the body is a Workplane of 0 objects; give one"),
         (cq.Workplane("XY").rarray(20, 20, 2, 1).box(9, 9, 9, combine=False), "a Workplane of 2 objects; give one"),
