@@ -40,7 +40,7 @@ SCALE_PATCHES = 16  # patches of a face with independent form errors that resemb
 MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty by form errors, in half widths, above which a motion is not determined
 MIN_SENSITIVITY = 1e-7  # mm of distance per mm of motion; smaller values are rounding
 RIM_MARGIN = 2e-3  # width, in half widths, of the rim that is ignored: points there may lie on the edge
-FACE_DISTANCE_FRACTION = 0.25  # fraction of the minimum thickness: points farther off are on front, sides or fixture
+FACE_DISTANCE_FRACTION = 0.25  # largest distance of a point of the face, as a fraction of the minimum thickness
 MOTION_NAMES = ("shift in x", "shift in y", "shift in z", "rotation about x", "rotation about y", "rotation about z")
 
 
@@ -88,7 +88,7 @@ class BackFace:
         return points[:, 2] - sag(self.lens.back, *points[:, :2].T)
 
     def columns(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return the change of each distance, (n, 6), per mm of shift in x, y, z and per mm at the rim of rotation."""
+        """Return the change (n, 6) of each distance per mm of shift along x, y, z, and of rotation, at the rim."""
         return np.hstack([normals, np.cross(points - self.pivot, normals) / self.reach])
 
 
@@ -130,7 +130,7 @@ class Alignment:
     distances: np.ndarray = field(repr=False)  # signed distances along the normal (n,), mm
     normals: np.ndarray = field(repr=False)  # unit normals of the face at the points (n, 3)
     motions: np.ndarray = field(repr=False)  # orthonormal motions (6, k) that the face determines
-    undetermined: tuple[str, ...]  # names of the other motions
+    undetermined: tuple[str, ...]  # names of the motions that the face does not determine
     outside: int  # number of points outside the outline, or on its rim
     off_face: int  # number of points inside the outline, but far from the face
     outliers: np.ndarray = field(repr=False)  # isolated points near the face (k, 3), mm, in the frame of the design
@@ -187,7 +187,7 @@ def _least_squares(face: BackFace, cloud: np.ndarray, pose: Pose) -> Pose:
 def gauss_newton_step(
     face: BackFace, points: np.ndarray, distances: np.ndarray, normals: np.ndarray, weight: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a Gauss-Newton step (6,) towards zero distances, and the orthonormal motions (6, k) it determines."""
+    """Return a Gauss-Newton step (6,) towards zero distances, and the orthonormal motions (6, k) determined."""
     columns = face.columns(points, normals)
     weight = np.full(len(points), 1 / len(points)) if weight is None else weight / weight.sum()
     weighted = columns * weight[:, None]
@@ -200,7 +200,7 @@ def gauss_newton_step(
 
 
 def _face_points(face: BackFace, cloud: np.ndarray, pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the points of the face, and for the whole cloud: inside the outline?, near the face?"""
+    """Return the points of the face, and masks of the cloud's points that are inside the outline, and near the face."""
     points = pose.to_design(cloud)
     inside, near = face.contains(points), np.abs(face.height(points)) <= face.max_distance
     chosen = points[inside & near]
@@ -212,7 +212,7 @@ def _face_points(face: BackFace, cloud: np.ndarray, pose: Pose) -> tuple[np.ndar
 
 
 def _undetermined(motions: np.ndarray) -> tuple[str, ...]:
-    """Return the names of the motions that `motions` (6, k) leave out; a combined motion is one entry."""
+    """Return the names of the motions that `motions` (6, k) do not contain; a combined motion is one entry."""
     size, directions = np.linalg.eigh(np.eye(len(MOTION_NAMES)) - motions @ motions.T)
     return tuple(
         " with ".join(name for name, part in zip(MOTION_NAMES, direction, strict=True) if abs(part) > 0.3)
@@ -237,7 +237,7 @@ def scale(face: BackFace, alignment: Alignment) -> tuple[float, float]:
 # --- outliers ---------------------------------------------------------------------------------------------------------
 
 NEIGHBOURS = 24  # number of nearest points with which each point is compared
-MIN_CLUSTER = 8  # number of neighbours with a distance equal within 50 % from which a point counts as form
+MIN_CLUSTER = 8  # number of neighbours, equally far within 50 %, from which on a point counts as form
 OUTLIER_THRESHOLD = 6.0  # minimum deviation of an outlier in standard deviations (from the MAD), global and local
 MAD_TO_SIGMA = 1.4826  # ratio of standard deviation to median absolute deviation (MAD) of a normal distribution
 CAUCHY_SCALE = 2.0  # residual, in standard deviations, at which a neighbour's weight is one half
@@ -251,7 +251,7 @@ def find_outliers(
 ) -> tuple[np.ndarray, float]:
     """Return a mask (n,) of the outliers among points (n, 3) at distances (n,) from the face, and the noise; mm.
 
-    candidates: mask (n,) of the points to judge; the others are only neighbours.  noise: of the face, if it is known.
+    candidates: mask (n,) of the points to judge; the others are only neighbours.  noise: of the face; None: estimated.
     """
     outliers, which = np.zeros(len(points), dtype=bool), np.flatnonzero(candidates)
     if len(points) <= NEIGHBOURS or not len(which):
@@ -272,7 +272,7 @@ def _neighbour_planes(
     """Compare some points with the planes through their neighbours, fitted with Cauchy weights.
 
     Return each point's distance from its plane and the neighbours' spread about it (mm), and the number of neighbours
-    that lie at a similar distance as the point.
+    whose distance is similar to the point's.
     """
     positions = tree.data[part]
     _, near = tree.query(positions, NEIGHBOURS + 1)
@@ -299,7 +299,7 @@ START_TOLERANCE = 1e-4  # distance, in half widths, below which a start is accep
 START_SAMPLE, AXES_SAMPLE = 3000, 1000  # number of points for the starts, and for exchanges of axes
 START_STEPS, AXES_STEPS = 40, 15  # Gauss-Newton steps from each start, and for exchanges of axes
 START_FRACTION = 0.25  # minimum fraction of the points that a start brings onto the face
-IMPROVEMENT_RATIO = 0.5  # ratio of distances below which a later start replaces the best one before
+IMPROVEMENT_RATIO = 0.5  # ratio of distances below which a later start replaces the best earlier one
 DECENTRE_RING = 0.15  # decentre of further starts, in half widths, if the first ones do not fit
 
 
@@ -317,7 +317,7 @@ def first_pose(face: BackFace, cloud: np.ndarray) -> tuple[Pose, float]:
 
 
 def find_axis_exchange(face: BackFace, cloud: np.ndarray, original: float) -> tuple[np.ndarray, str] | None:
-    """Return an exchange of axes by which the cloud fits far better than `original` (mm): matrix (3, 3) and words."""
+    """Return an exchange of axes (matrix (3, 3), words) that moves a cloud far nearer than `original` mm, or None."""
     sample, fitting = _sample(cloud)[:: START_SAMPLE // AXES_SAMPLE], []
     for matrix, words in sorted(_axis_exchanges(), key=lambda exchange: _rarity(exchange[0])):
         turned = sample @ matrix.T
@@ -351,12 +351,12 @@ def _sample(cloud: np.ndarray) -> np.ndarray:
 
 
 def _middle(points: np.ndarray) -> np.ndarray:
-    """Return x and y (mm) of the middle of the points, without the outer percent on each side."""
+    """Return x and y (mm) of the centre of the points' extent, without the outermost percent at each end."""
     return np.percentile(points, (1, 99), axis=0).sum(axis=0)[:2] / 2
 
 
 def _best_start(face: BackFace, sample: np.ndarray, decentres: list[np.ndarray], steps: int) -> tuple[Pose, float]:
-    """Return the best of several starts; a later one only if it is clearly better than those before."""
+    """Return the best of several starts; a later start only if it is clearly better than all earlier ones."""
     shifts = (np.array([*decentre, height]) for decentre in decentres for height in _heights(face, sample, decentre))
     first, *later = (_refine_start(face, sample, identity_pose(face, shift), steps) for shift in shifts)
     best = first

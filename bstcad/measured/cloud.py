@@ -17,7 +17,7 @@ MAX_CLOUD_SIZE = 1_000_000_000  # bytes
 MIN_CLOUD_POINTS = 100  # minimum number of points: six degrees of freedom and a form are fitted to them
 MESH_SUFFIXES = (".ply", ".stl")
 UNIT_SIZES = {"inches": 1 / INCH, "metres": 1e-3, "micrometres": 1e3}  # 1 mm in each unit
-PLAUSIBLE_RATIOS = (0.3, 1.7)  # ratios of a cloud's extent to the lens's: half of a lens, or a lens with its fixture
+PLAUSIBLE_RATIOS = (0.3, 1.7)  # limits of the ratio of the cloud's extent to the lens's: half a lens, or a lens in a fixture
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ def _read(path: Path) -> tuple[MeasuredPoints, bytes]:
     if len(measured.positions) < MIN_CLOUD_POINTS:
         without = f" and {measured.without_data} without data" if measured.without_data else ""
         raise ValueError(
-            f"holds {len(measured.positions)} points{without}, which are too few; measure at least {MIN_CLOUD_POINTS}, "
-            "preferably 10 000"
+            f"contains {len(measured.positions)} points{without}, which are too few; measure at least "
+            f"{MIN_CLOUD_POINTS}, preferably 10 000"
         )
     return measured, data
 

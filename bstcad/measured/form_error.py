@@ -2,8 +2,8 @@
 
 The deviation is modelled as a polynomial plus a random field.  The field is a spline on a net over the lens whose
 cosine amplitudes c_k are Gaussian with a variance S that depends only on the frequency; the points add white noise of
-variance σ².  S (by quarter octaves) and σ are estimated from the points.  The form error is the posterior mean, which
-among all linear estimates of heights, slopes and curvatures has the minimum error.  The posterior can be sampled.
+variance σ².  S (in bands of a quarter octave) and σ are estimated from the points.  The form error is the posterior
+mean, the linear estimate of heights, slopes and curvatures with the minimum error.  The posterior can be sampled.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import sag, sampled
 
 POLYNOMIAL_DEGREE = 2
-NET_MARGIN = 0.2  # margin of the field's net around the face, in sides, because cosines have zero slope at its ends
+NET_MARGIN = 0.2  # margin of the field's net around the face, in sides; cosines have zero slope at the net's ends
 POINTS_PER_NET_CELL = 6.0  # mean number of points in a cell of the net
 FIELD_NET_LIMITS = (9, 513)  # minimum and maximum number of control points per side
 MAX_REFINEMENT = 4  # maximum ratio of control points per side to the net of the lens, since the nets are not nested
 BANDS_PER_OCTAVE = 4
-SPECTRUM_ROUNDS = 8  # alternating estimates of field and spectrum
+SPECTRUM_ROUNDS = 8  # number of alternating estimates of field and spectrum
 FIRST_MOTION_ROUND = 3  # round from which the spectrum is good enough to weight the motions
 MAX_FIELD_STEPS, FIELD_TOLERANCE = 30, 1e-4  # maximum steps of conjugate gradients, and their relative tolerance
 DETECTION_SIGMAS = 3.0  # excess over noise, in standard deviations, at which a band of frequencies contains form
 UNDETECTED_VARIANCE = 1e-4  # variance of a band without detected form, relative to the noise
-MAX_RELIEF_UNCERTAINTY = 0.001  # uncertainty by fine relief, in half widths, above which a motion stays zero
-EXTRAPOLATION_BANDS = 6  # number of bands whose slope is extrapolated into the noise
+MAX_RELIEF_UNCERTAINTY = 0.001  # uncertainty of a motion from fine relief, in half widths, above which it stays zero
+EXTRAPOLATION_BANDS = 6  # number of bands from which the spectrum is extrapolated below the noise
 MIN_NOISE_RATIO = 1e-3  # lower bound of the noise relative to the deviation
 SAMPLING_STRIPS = 32  # number of strips in which a net is sampled, which bounds the memory
 
@@ -52,7 +52,7 @@ class FormError:
     random_field: BSplineSurface = field(repr=False)
     spread: np.ndarray = field(repr=False)  # standard deviations (m, m) of the field's cosine amplitudes, mm
     noise: float  # RMS noise of the points, mm
-    motion: np.ndarray  # motion (6,) of the fine relief against the alignment (biased by form), as in BackFace.columns
+    motion: np.ndarray  # motion (6,) of the fine relief relative to the alignment, which form biases (BackFace.columns)
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return δz (mm) at (x, y) in mm, relative to the alignment by least squares."""
@@ -62,7 +62,7 @@ class FormError:
         return smooth + sag(self.random_field, x, y) + moved @ self.motion
 
     def add_to(self, surface: BSplineSurface) -> BSplineSurface:
-        """Return `surface` plus this form error, interpolated at the control points of the finer of both nets."""
+        """Return `surface` plus this form error, interpolated at the control points of the finer of the two nets."""
         sides = [
             own if count <= own else max(count, min(MAX_REFINEMENT * own, FIELD_NET_LIMITS[1]))
             for count, own in zip(self.random_field.shape, surface.shape, strict=True)
@@ -74,7 +74,7 @@ class FormError:
         return replace(finer, heights=finer.heights + torch.from_numpy(interpolating_net(values)))
 
     def posterior_sample(self, draw: np.ndarray, sign: float = 1.0) -> FormError:
-        """Return a sample of the posterior; draw: normal numbers (m, m); sign: ±1, by which they are multiplied."""
+        """Return a sample of the posterior; draw: standard normal numbers (m, m); sign: ±1, their factor."""
         change = torch.from_numpy(scipy.fft.idctn(draw * self.spread, norm="ortho"))
         return replace(self, random_field=replace(self.random_field, heights=self.random_field.heights + sign * change))
 
@@ -113,7 +113,7 @@ def frequencies(net: BSplineSurface) -> np.ndarray:
 
 
 def _legendre(back: BSplineSurface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the products (n, 6) of Legendre polynomials of x and y up to POLYNOMIAL_DEGREE; net: [-1, 1] each way."""
+    """Return the products (n, 6) of Legendre polynomials of x and y up to POLYNOMIAL_DEGREE, -1 to 1 on the net."""
     u, v = (2 * (t - low) / (high - low) - 1 for t, (low, high) in zip((x, y), (back.x, back.y), strict=True))
     i, j = np.indices((POLYNOMIAL_DEGREE + 1, POLYNOMIAL_DEGREE + 1))
     products = np.polynomial.legendre.legvander2d(u, v, (POLYNOMIAL_DEGREE, POLYNOMIAL_DEGREE))
@@ -125,8 +125,8 @@ def _field(
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
     """Return heights (m, m), standard deviations of the cosine amplitudes, noise and motion of the random field.
 
-    motions: changes (n, k) by the motions of the alignment, without polynomials.  Their amounts follow by generalised
-    least squares: the residual of the field's fit to `off` is σ² V⁻¹ off, V the covariance of field plus noise.
+    motions: changes (n, k) of the deviations `off` by motions of the part, without polynomials.  Generalised least
+    squares gives the motion: the field's fit to `off` has the residual σ² V⁻¹ off, V the covariance of field + noise.
     """
     (m, _), n = net.shape, len(off)  # the net is square
     gram = (rows.T @ rows).tocsr()
@@ -162,7 +162,7 @@ def _field(
 def _motion_by_relief(
     motions: np.ndarray, off: np.ndarray, whitened: np.ndarray, *, noise2: float, reach: float
 ) -> np.ndarray:
-    """Return the motion by generalised least squares; whitened: σ² V⁻¹ motions."""
+    """Return the motion (k,) by generalised least squares; whitened: σ² V⁻¹ motions (n, k)."""
     normal = whitened.T @ motions / noise2
     size, directions = np.linalg.eigh((normal + normal.T) / 2)
     detected = size > 1 / (MAX_RELIEF_UNCERTAINTY * reach) ** 2  # determined by fine relief
@@ -172,8 +172,8 @@ def _motion_by_relief(
 def _variances(energy: np.ndarray, modes: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Estimate the variance of the form in each band from its energy relative to the noise.
 
-    Bands below the noise continue the last bands above it by a power law of the frequency, which polished and turned
-    faces follow, but stay below the limit of detection.
+    Bands below the noise continue the last bands above the noise with a power law of the frequency, which polished and
+    turned faces follow, but stay below the limit of detection.
     """
     least = DETECTION_SIGMAS * np.sqrt(2 / modes)
     detected = energy > 1 + least
@@ -197,8 +197,8 @@ def _posterior_mean(
 ) -> np.ndarray:  # fmt: skip
     """Return the posterior mean (m, m) of the amplitudes c, by conjugate gradients.
 
-    (1 + sqrt(S) Cᵀ G C sqrt(S) / σ²) c / sqrt(S) = sqrt(S) Cᵀ b / σ² is solved for c / root, after preconditioning
-    with the square root of its diagonal for evenly spaced points.
+    (1 + sqrt(S) Cᵀ G C sqrt(S) / σ²) c / sqrt(S) = sqrt(S) Cᵀ b / σ² is solved for c / sqrt(S), preconditioned
+    with the square root of the matrix's diagonal for evenly spaced points.
     """
     m, even = len(variance), 1 + variance * per_mode / noise2
     root = np.sqrt(variance / even)
@@ -216,7 +216,7 @@ def _posterior_mean(
 
 
 def _basis_rows(u: np.ndarray, v: np.ndarray, m: int) -> scipy.sparse.csr_array:
-    """Return the matrix (n, m²) of the nine products of basis functions at each point."""
+    """Return the matrix (n, m²) of the nine nonzero products of basis functions at each point."""
     in_u, in_v = basis_matrix(u, m), basis_matrix(v, m)
     n = len(u)
     columns = in_u.indices.reshape(n, 3, 1) * m + in_v.indices.reshape(n, 1, 3)
@@ -240,7 +240,7 @@ def _bands(frequency: np.ndarray) -> tuple[np.ndarray, int]:
 
 # --- figures of a deviation -------------------------------------------------------------------------------------------
 
-DEVIATION_MAP_POINTS = 301  # number of points each way of the deviation map
+DEVIATION_MAP_POINTS = 301  # number of points per side of the deviation map
 ZERNIKE_ORDER = 10  # maximum n + |m| of the 36 terms of the fringe set
 ZERNIKE_FIT_POINTS = 50_000  # approximate number of points to which the terms are fitted
 MAP_FILES = ("deviation.npz", "deviation.csv")  # file names of the deviation map
@@ -306,7 +306,7 @@ def deviation(lens: Lens, alignment: Alignment, form: FormError) -> Deviation:
 
 
 def _octaves(form: FormError, x: np.ndarray, y: np.ndarray, total: np.ndarray) -> tuple[Band, ...]:
-    """Split the total (3, n) into all except the random field, and the field by octaves, longest period first."""
+    """Split the form's height and slopes (3, n) into the part without the random field, and octaves of the field."""
     shortest = SHORTEST_PERIOD * max(form.random_field.pitch)
     period = 2 * max(high - low for low, high in (form.random_field.x, form.random_field.y))  # first cosine (mm)
     bands = [_band(None, total - np.stack(sampled(form.random_field, x, y)))]
@@ -379,7 +379,7 @@ def _farthest(distances: np.ndarray) -> np.ndarray:
 
 
 def _chebyshev(columns: np.ndarray, distances: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return motion and largest distance of these points, solved in units of their largest distance."""
+    """Return the motion that minimises the largest distance of these points, and that distance (mm)."""
     unit = max(float(np.abs(distances).max()), 1e-12)
     size = np.abs(columns).max(axis=0)
     scaled, ones = columns / size, np.ones((len(columns), 1))

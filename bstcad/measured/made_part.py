@@ -22,12 +22,12 @@ from bstcad.verify.checks import WAVEFRONT, Nominal
 from bstcad.verify.verdict import Check
 
 MAX_RMS_DISTANCE = 3e-3  # RMS distance after alignment, in half widths, above which a part is of another design
-MIN_RELIEF = 0.5  # a part is of another design below this fine relief, as a fraction of the design
-COARSE_DEGREE = 4  # degree of the polynomial that is not fine relief: parts of equal optical power share it
+MIN_RELIEF = 0.5  # fine relief, as a fraction of the design's, below which a part is of another design
+COARSE_DEGREE = 4  # degree of the polynomial without which relief is fine: parts of equal optical power share it
 MIN_DESIGN_RELIEF = 3e-5  # RMS fine relief, in half widths, that a design needs to be recognised by it
-SCALE_TOLERANCE = 2e-4  # tolerance of the scale, about a thermal expansion
+SCALE_TOLERANCE = 2e-4  # tolerance of the scale, about that of thermal expansion
 SCALE_SIGMAS = 3.0  # tolerance of the scale, in standard uncertainties, if larger than SCALE_TOLERANCE
-MIN_MEASURED_FRACTION = 0.8  # minimum fraction of the face that is measured; elsewhere the form is a guess
+MIN_MEASURED_FRACTION = 0.8  # minimum measured fraction of the face; elsewhere the form is extrapolated
 COVERAGE_POINTS = 20  # mean number of points in a cell of the grid from which the coverage is counted
 RELIEF_POINTS = 20_000  # maximum number of points from which the fine relief is estimated
 MAX_OUTLIER_FRACTION = 0.1  # fraction of outliers near the face above which face and outliers are indistinguishable
@@ -82,7 +82,7 @@ def _cloud_checks(
 ) -> Iterator[Check]:
     """Check that a cloud is in mm and has the design's axes, and that it is of this face, complete, clean and in place.
 
-    axes: exchange of axes that the cloud needs, in words; scale: its scale and uncertainty; decentre: in mm.
+    axes: exchange of axes that the cloud needs, in words; scale: of the cloud, with uncertainty; decentre: limit (mm).
     """
     extent = f"its extent is the lens's in {cloud.unit}"
     yield Check.true("made part: the cloud is in mm", cloud.unit == "mm", extent, id="made-unit")
@@ -130,7 +130,7 @@ def _wavefront(lens: Lens, nominal: Nominal) -> Iterator[Check]:
 
 
 def _align(face: BackFace, points: np.ndarray) -> tuple[Alignment, str]:
-    """Return the alignment and the exchange of axes it needs, in words ("" if the cloud fits as it is)."""
+    """Return the alignment and the exchange of axes that the cloud needs, in words; "" if it fits as given."""
     pose, distance = aligning.first_pose(face, points)
     poor = distance > aligning.START_TOLERANCE * face.reach
     if poor and (exchange := aligning.find_axis_exchange(face, points, distance)):
@@ -143,7 +143,7 @@ def _align(face: BackFace, points: np.ndarray) -> tuple[Alignment, str]:
 
 
 def _identity_checks(face: BackFace, alignment: Alignment) -> tuple[Check, Check]:
-    """Return the checks that the part is of this design: its distance, and the fine relief that forms the picture."""
+    """Return the checks that the part is of this design: its distance, and its fine relief, which forms the picture."""
     relief, limit = _relief(face, alignment.points), MAX_RMS_DISTANCE * face.reach
     other = "the cloud is of another lens or of another face"
     name = "made part: distance from the design after alignment, RMS"

@@ -1,7 +1,7 @@
 """Read the vertices of PLY and STL files.
 
-The amount of data that a header declares is compared with the size of the file before anything is allocated.  If they
-differ, the message states both.
+The amount of data that a header declares is compared with the size of the file before memory is allocated.  If the two
+differ, the message states each.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ def read_mesh(data: bytes, ending: str) -> MeasuredPoints:
     try:
         positions = (_ply if ending == ".ply" else _stl)(data)
     except _Damaged as error:
-        raise ValueError(f"is no {ending[1:].upper()} file that can be read ({error}); write it again") from None
+        raise ValueError(f"is not a readable {ending[1:].upper()} file ({error}); write it again") from None
     points = make_points(positions)
     if not len(points.positions):
-        raise ValueError("holds no points; export the vertices of the measured face")
+        raise ValueError("contains no points; export the vertices of the measured face")
     return MeasuredPoints(np.unique(points.positions, axis=0), points.without_data)
 
 
 class _Damaged(Exception):
-    """Raised for a file without the format of its suffix."""
+    """A file does not have the format of its suffix."""
 
 
 # ---- PLY -------------------------------------------------------------------------------------------------------------
@@ -70,7 +70,7 @@ def _ply(data: bytes) -> np.ndarray:
     form, elements, start = _header(data)
     vertex = next((element for element in elements if element.name == "vertex"), None)
     if vertex is None or not {"x", "y", "z"} <= {name for name, _, length in vertex.properties if not length}:
-        raise ValueError("holds no points: its header names no vertex with x, y and z; export the measured vertices")
+        raise ValueError("contains no points: its header has no vertex with x, y and z; export the measured vertices")
     if vertex.has_lists:
         raise ValueError("its points have lists as properties; export x, y and z only")
     if form == "ascii":
@@ -97,7 +97,7 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
             case ["ply"] | ["comment" | "obj_info", *_] | []:
                 pass
             case _:
-                raise _Damaged(f"{line.strip()[:40]!r} in its header")
+                raise _Damaged(f"its header contains {line.strip()[:40]!r}")
     if form != "ascii" and form not in ORDERS:
         raise _Damaged(f"its format is {form[:40]!r}")
     return form, elements, end.end()
@@ -105,7 +105,7 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
 
 def _add_property(element: _Element, name: str, kind: str, length: str) -> _Element:
     if name in {known for known, _, _ in element.properties}:
-        raise _Damaged(f"property {name[:40]!r} twice")
+        raise _Damaged(f"its header declares {name[:40]!r} twice")
     return _Element(element.name, element.count, (*element.properties, (name, kind, length)))
 
 
@@ -155,7 +155,7 @@ def _binary_vertices(data: bytes, elements: list[_Element], at: int, order: str)
 
 
 def _end_of_list_rows(data: bytes, element: _Element, at: int, order: str) -> int:
-    """Return the offset behind the rows of an element with lists: at once if all rows are equally long, else by row."""
+    """Return the offset after the rows of an element with lists, row by row unless all rows have equal length."""
     types = ((order + kind, order + length if length else None) for _, kind, length in element.properties)
     parts = [(np.dtype(kind), None if length is None else np.dtype(length)) for kind, length in types]
     uniform_end = _end_of_uniform_rows(data, parts, at, element.count)
@@ -169,11 +169,11 @@ def _end_of_list_rows(data: bytes, element: _Element, at: int, order: str) -> in
     return at
 
 
-Parts = list[tuple[np.dtype, np.dtype | None]]  # types of the items of each property, and of its length if it is a list
+Parts = list[tuple[np.dtype, np.dtype | None]]  # types of each property's items, and of its length if it is a list
 
 
 def _next_row(data: bytes, parts: Parts, at: int) -> tuple[list[int], int]:
-    """Return the numbers of items of the row at an offset, and the offset behind it, past the data if it is cut off."""
+    """Return the numbers of items of the row at an offset, and the offset after it: after the data if it is cut off."""
     sizes = []
     for kind, length in parts:
         size = 1
@@ -186,7 +186,7 @@ def _next_row(data: bytes, parts: Parts, at: int) -> tuple[list[int], int]:
 
 
 def _end_of_uniform_rows(data: bytes, parts: Parts, at: int, count: int) -> int | None:
-    """Return the offset behind the rows if their lists are as long as in the first row (triangles); None if not."""
+    """Return the offset after the rows if all their lists are as long as in the first row (triangles); else None."""
     sizes, end = _next_row(data, parts, at)
     if count == 0 or not 0 < (end - at) * count <= len(data) - at:
         return at if count == 0 else None

@@ -19,23 +19,23 @@ import numpy as np
 
 INPUT_HINT = "give x, y and z in mm, one point per line"
 INCH = 25.4  # mm
-UNITS_IN_MM = {  # units as they are written in headings
+UNITS_IN_MM = {  # sizes (mm) of units as they are written in headings
     "mm": 1.0, "millimetre": 1.0, "millimeter": 1.0, "cm": 10.0, "m": 1e3, "metre": 1e3, "meter": 1e3, "um": 1e-3,
     "\u00b5m": 1e-3, "\u03bcm": 1e-3, "micron": 1e-3, "microns": 1e-3, "nm": 1e-6, "in": INCH, "inch": INCH,
     "inches": INCH, '"': INCH,
 }  # fmt: skip
-# Words that may accompany x, y or z in the heading of a coordinate; "nx", "normal x" and "x deviation" are others.
+# Words that may accompany x, y or z in the heading of a coordinate, unlike those of "normal x" and "x deviation".
 COORDINATE_WORDS = {"coord", "coordinate", "koordinate", "pos", "position", "point", "axis", "achse"}
 ACTUAL_WORDS = {"act", "actual", "meas", "measured", "ist", "istwert", "messwert"}
 NOMINAL_WORDS = {"nom", "nominal", "soll", "sollwert", "theo", "theoretical", "cad", "ref", "reference"}
 HEADING_LINES = 50  # number of lines that are searched for a heading
 SAMPLE_LINES = 200  # number of lines from which the columns are inferred if there is no heading
-MAX_POSITION = 1e6  # largest coordinate (mm) that is accepted; a larger one is an error of the file
-FOREIGN_FORMATS = {  # first bytes of files that hold no points as text
+MAX_POSITION = 1e6  # largest accepted coordinate (mm); a larger one is an error of the file
+FOREIGN_FORMATS = {  # names of formats that are not text, by a file's first bytes
     b"PK\x03\x04": "a zip archive, such as X3P", b"aISO-": "an SDF file (ISO 25178-71)", b"bISO-": "an SDF file (ISO "
     "25178-71)", b"VCA DATA": "an OPD file of an interferometer", b"\x89HDF": "an HDF5 file, such as DATX",
 }  # fmt: skip
-# Pattern of a field that marks missing data; an empty field marks them, too.
+# Pattern of a field that marks missing data, as an empty field does.
 NO_DATA = (
     r"[+-]?nan(?:\(\w*\))?|[+-]?1\.#(?:qnan|ind|snan)0*|no[ _]?data|bad|invalid|missing|masked|null|none|n/?a"
     r"|-{1,3}|\*+"
@@ -85,7 +85,7 @@ def read_text(data: bytes) -> MeasuredPoints:
     if not heading.lines:
         lines = _without_title(lines)
     if not lines:
-        raise ValueError(f"holds no points; {INPUT_HINT}")
+        raise ValueError(f"contains no points; {INPUT_HINT}")
     layout = _Layout.of(lines[0][1], forced)
     if not heading.lines:  # a tab at the beginning of a line is no empty column
         lines = [(number, line.lstrip("\t")) for number, line in lines]
@@ -102,8 +102,8 @@ def _read_zygo(every: list[tuple[int, str]]) -> MeasuredPoints:
     """Read points from the numbered lines of a Zygo XYZ file: pixel column, pixel row and height in µm.
 
     MetroPro Reference Guide, ASCII data file format: the seventh number of line 8 is the width of a pixel in metres,
-    0 if the lateral scale was not calibrated.  Points stand between two lines "#".  Rows are counted from the top; if
-    an instrument counts them from the bottom, the alignment reports that y is reversed.
+    0 if the lateral scale was not calibrated.  Points are listed between two lines "#".  Rows are counted from the top;
+    if an instrument counts them from the bottom, the alignment reports that y is reversed.
     """
     marks = [place for place, (_, line) in enumerate(every) if line == "#"]
     if "xyz" not in every[0][1].lower() or not marks:
@@ -118,7 +118,7 @@ def _read_zygo(every: list[tuple[int, str]]) -> MeasuredPoints:
         )
     lines = [(number, line) for number, line in every[marks[0] + 1 :] if line != "#"]
     if not lines:
-        raise ValueError(f"holds no points; {INPUT_HINT}")
+        raise ValueError(f"contains no points; {INPUT_HINT}")
     width = 1e3 * pixel
     positions = _table(lines, _Layout(None, False), (0, 1, 2)) * [width, -width, 1e-3]
     columns = f"x (pixels of {width:.4g} mm), y (rows of pixels from the top) and z (\u00b5m)"
@@ -179,7 +179,7 @@ class _Layout:
         return FORTRAN_EXPONENT.sub("e", text) if words else text
 
     def fields(self, line: str) -> list[str]:
-        """Return the fields of a line, without empty ones at its end, with numbers in Python's notation."""
+        """Return the fields of a line, without empty fields at its end, with numbers in Python's notation."""
         if self.separator is None:
             return self.normalise(line).split()
         line = line.rstrip(f"{self.separator} ")
@@ -216,9 +216,9 @@ def _table(lines: list[tuple[int, str]], layout: _Layout, columns: Sequence[int]
 
 @dataclass(frozen=True)
 class _Heading:
-    lines: int = 0  # number of lines up to its last one; 0: there is no heading
+    lines: int = 0  # number of lines up to the heading's last line; 0: there is no heading
     columns: tuple[int, ...] = (0, 1, 2)  # indices of x, y and z in a line
-    units: np.ndarray | float = 1.0  # units in mm, one for all columns or one for each
+    units: np.ndarray | float = 1.0  # size of the unit (mm), one for all columns or one for each
     fields: int = 3  # number of columns
     actual_columns: str = ""  # names of the actual columns, if there are nominal ones, too
 
@@ -261,9 +261,9 @@ def _words(line: str) -> list[str]:
 
 
 def _coordinate(word: str) -> tuple[str, str, float] | None:
-    """Parse the heading of a column, such as "X [mm]": "actual", "nominal" or ""; "x", "y" or "z"; the unit in mm.
+    """Return role ("actual", "nominal" or ""), axis ("x", "y" or "z") and unit (mm) of a heading such as "X [mm]".
 
-    Returns None if the column is not a coordinate.  Raises ValueError for a unit that UNITS_IN_MM does not have.
+    Returns None if the column is not a coordinate.  Raises ValueError for a unit that UNITS_IN_MM does not contain.
     """
     parts = re.findall(r"[a-z\u00b5\u03bc]+|\"", word.strip().strip("'\"").lower())
     words = [piece for part in parts for piece in _split_role(part)]
@@ -296,7 +296,7 @@ def _check_field_counts(heading: _Heading, lines: list[tuple[int, str]], layout:
             continue
         if (count := len(layout.fields(line))) > heading.fields:
             raise ValueError(
-                f"line {number} holds {count} fields, but its heading names {heading.fields} columns; write decimals "
+                f"line {number} has {count} fields, but its heading names {heading.fields} columns; write decimals "
                 "with points, and names as one word or in quotes"
             )
 
@@ -315,7 +315,7 @@ def _without_title(lines: list[tuple[int, str]]) -> list[tuple[int, str]]:
 
 
 def _columns_without_heading(lines: list[tuple[int, str]], layout: _Layout) -> tuple[int, ...]:
-    """Return the indices of x, y and z; other columns may hold names of the points or their running number."""
+    """Return the column indices of x, y and z; other columns may contain names or consecutive numbers of points."""
     sample = [layout.fields(line) for _, line in lines[:SAMPLE_LINES]]
     count, first = max(map(len, sample)), lines[0][0]
     numbers = [
@@ -327,11 +327,11 @@ def _columns_without_heading(lines: list[tuple[int, str]], layout: _Layout) -> t
         numbers = numbers[1:]
     if len(numbers) > 3:
         raise ValueError(
-            f"line {first} holds {count} columns, but no heading names x, y and z; add one, such as "
+            f"line {first} has {count} columns, but no heading names x, y and z; add one, such as "
             "x,y,z,nx,ny,nz, or give these three columns only"
         )
     if len(numbers) < 3:
-        raise ValueError(f"line {first} holds {len(numbers)} number{'s' * (len(numbers) != 1)}; {INPUT_HINT}")
+        raise ValueError(f"line {first} has {len(numbers)} number{'s' * (len(numbers) != 1)}; {INPUT_HINT}")
     if len(lines) > SAMPLE_LINES:
         _check_field_counts(_Heading(fields=count), lines, layout)
     return tuple(numbers)

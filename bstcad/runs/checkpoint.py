@@ -25,7 +25,7 @@ import torch
 from bstcad.runs import files
 from bstcad.runs.files import SceneError
 
-MAGIC = b"bstcad checkpoint 9\n"  # version; raise it when a record of a state, or the purpose, changes its fields
+MAGIC = b"bstcad checkpoint 9\n"  # version; increase it if fields of a state's records or of the purpose change
 DIGEST_SIZE = 65  # bytes of the line with the SHA-256
 MAX_SIZE = 8 << 30  # largest size of a checkpoint (bytes); 2049 x 2049 control points need 1 GB
 MAX_WRITING_FRACTION = 0.02  # largest fraction of the run's time that checkpoints may take
@@ -177,7 +177,7 @@ class Keeper:
             write(path, self.purpose, self.latest)
         except (OSError, MemoryError):
             path.parent.rmdir()
-            return "the design so far is lost: there is no space beside the folder or for temporary files"
+            return "the design so far is lost, for lack of space beside the folder and for temporary files; free some"
         return f"the design so far is kept in {path}; move it to {self.path} and use --resume to continue it"
 
     def load(self) -> Any:
@@ -206,7 +206,7 @@ class Keeper:
 
 
 def _differences(then: Any, now: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
-    """Iterate over the differences of two trees: (dotted key, value then, value now)."""
+    """Yield the differences of two purposes: (dotted key, earlier value, present value)."""
     if isinstance(then, dict) and isinstance(now, dict):
         for name in sorted(then.keys() | now.keys()):
             yield from _differences(then.get(name), now.get(name), f"{key}.{name}" if key else name)

@@ -17,11 +17,11 @@ from typing import Any, Protocol
 from bstcad.runs import environment, signals
 from bstcad.runs.files import MachineError, SceneError, first_line
 
-CONNECTION_TIMEOUT = 30.0  # seconds until the scheduler answers, and until the first worker is there
-JOB_INTERVAL = 0.5  # seconds between two checks whether a job has ended
+CONNECTION_TIMEOUT = 30.0  # timeout (s) for the scheduler's answer, and for the first worker
+JOB_INTERVAL = 0.5  # time (s) between two checks for finished jobs
 RETRIES = 2  # retries of a job after an error of a worker
 MAX_WORKERS = 1000
-THIS_MACHINE = "here"  # `Answer.where` of a job on this machine; of others it is the address of the worker
+THIS_MACHINE = "here"  # `Answer.where` of a job on this machine; otherwise it is the address of the worker
 
 _one_at_a_time = threading.Lock()  # limits a worker process to one job, whatever its number of threads
 
@@ -32,8 +32,8 @@ class Answer:
 
     key: Any  # key with which the job was started
     where: str  # THIS_MACHINE, or the address of the worker (of the scheduler, if no worker answered)
-    value: Any = None
-    reason: str = ""  # reason why there is no value
+    value: Any = None  # result; None if the job failed
+    reason: str = ""  # reason why the job failed
 
 
 class Machines(Protocol):
@@ -52,7 +52,7 @@ class Machines(Protocol):
 
 @contextlib.contextmanager
 def connect(scheduler: str | None, workers: int | None = None) -> Iterator[Cluster | None]:
-    """Yield the workers of a scheduler, or `workers` local processes that end with the block; None without either."""
+    """Yield the workers of a scheduler, or `workers` local processes that end with the block; None if both are None."""
     check(scheduler, workers)
     with contextlib.ExitStack() as stack:
         address = scheduler
@@ -62,7 +62,7 @@ def connect(scheduler: str | None, workers: int | None = None) -> Iterator[Clust
 
 
 def check(scheduler: str | None, workers: int | None) -> None:
-    """Raise SceneError for invalid values of these options."""
+    """Raise SceneError for invalid values of the options --scheduler and --workers."""
     if scheduler is not None and workers is not None:
         raise SceneError("--workers and --scheduler: exclude each other; give one of the two")
     if workers is not None and not 1 <= workers <= MAX_WORKERS:
@@ -92,7 +92,7 @@ class Cluster:
             self._client = self._distributed.Client(address, timeout=patience, set_as_default=False)
         except (OSError, ValueError) as error:  # a timeout is an OSError
             raise SceneError(
-                f"--scheduler {address}: no scheduler answers ({first_line(error)}); run: dask scheduler"
+                f"--scheduler {address}: no scheduler answers ({first_line(error)}); start one with: dask scheduler"
             ) from None
         try:
             self._client.wait_for_workers(1, timeout=patience)
@@ -122,7 +122,7 @@ class Cluster:
         self._keys[future] = key
 
     def next(self, tick: Callable[[], None] = lambda: None) -> Answer:
-        """Wait for the next answer; `tick` is called meanwhile.  MachineError if the scheduler is lost."""
+        """Wait for the next answer and call `tick` meanwhile.  MachineError if the scheduler is lost."""
         return self._ended(self._keys, tick)
 
     def _ended(self, futures: Collection[Any], tick: Callable[[], None] = lambda: None) -> Answer:
@@ -136,7 +136,7 @@ class Cluster:
                 self._distributed.wait(list(futures), timeout=JOB_INTERVAL, return_when="FIRST_COMPLETED")
 
     def spread(self, work: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]) -> Iterator[Any]:
-        """Iterate over work(shared, item) of each item, in order.  MachineError if a worker fails.
+        """Yield work(shared, item) for each item, in order.  MachineError if a worker fails.
 
         `shared` is sent once.  The scheduler stores it, unlike scattered data, so that it outlives lost workers.
         """
@@ -149,7 +149,7 @@ class Cluster:
         for future in list(self._keys):
             answered = self._ended([future])
             if answered.reason:
-                raise MachineError(f"{self.address}: a worker failed ({answered.reason})")
+                raise MachineError(f"{self.address}: a worker failed ({answered.reason}); run the command again")
             yield answered.value
 
     def _check(self) -> None:
@@ -166,7 +166,7 @@ class Cluster:
 
 
 def answer(wanted: str, key: Any, work: Callable[..., Any], *arguments: Any) -> Answer:
-    """Do a job on a worker, provided that its bstcad has the version `wanted`."""
+    """Do a job on a worker, if the worker's bstcad has the version `wanted`; key: key of the job."""
     from distributed import get_worker
 
     with _one_at_a_time:

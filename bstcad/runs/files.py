@@ -156,7 +156,7 @@ def names(path: Path) -> list[str]:
 
 
 def net(path: Path, most: int) -> np.ndarray:
-    """Return control_points (m, n, 3) as float64 from an .npz archive, m and n at most `most`; errors as `arrays`."""
+    """Return control_points (m, n, 3) as float64 from an .npz archive, m and n at most `most`; errors: see `arrays`."""
     with zipfile.ZipFile(io.BytesIO(contents(path, MAX_ARCHIVE_SIZE))) as archive:
         with archive.open("control_points.npy") as file:
             (m, n, *_), _ = _header(file, "control_points")
@@ -191,7 +191,7 @@ def _header(file: IO[bytes], name: str) -> tuple[tuple[int, ...], str]:
 
 
 def check_free(folder: Path, ours: Sequence[str] = DESIGN_FILES, whose: str = "a design's") -> None:
-    """Raise SceneError unless a design may use the folder: a new or empty folder, or one of an earlier design.
+    """Raise SceneError unless a design may use the folder: it must be new, empty, or that of an earlier design.
 
     ours: files by which such a folder is recognised.  whose: owner of the folder in the sentence.
     """

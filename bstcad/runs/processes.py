@@ -28,7 +28,7 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 
 from bstcad.runs.signals import TERMINAL_SIGNALS, ignored_by_children
 
-PARENT_INTERVAL = 0.5  # seconds between two checks whether the parent is alive
+PARENT_INTERVAL = 0.5  # time (s) between two checks that the parent is alive
 
 
 def is_alive(process: int) -> bool:
@@ -65,7 +65,7 @@ def _end_with(parent: int, end: Callable[[], Any]) -> None:
 
 # --- the second process -----------------------------------------------------------------------------------------------
 
-IDLE_TIMEOUT = 300.0  # seconds without work after which the second process ends
+IDLE_TIMEOUT = 300.0  # time (s) without work after which the second process ends
 PRELOADED = (  # modules that the second process loads at its start
     "bstcad.cad.step_writing",
     "bstcad.verify.step_checks",
@@ -75,7 +75,7 @@ PRELOADED = (  # modules that the second process loads at its start
 )
 # Memory limit of loky in bytes: by default it would mistake a solid in memory for a leak and end the process.
 MEMORY_LEAK_LIMIT = "1000000000000000"
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # glibc's names for mallopt (malloc.h)
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # parameters of glibc's mallopt (malloc.h)
 MAX_KEPT = (1 << 31) - 1  # largest total of freed memory that stays with the process (bytes)
 MAX_KEPT_ARRAY = 1 << 27  # largest freed array that stays with the process (bytes)
 
@@ -86,7 +86,7 @@ _is_second = False  # True in the second process
 
 
 class Submit(Protocol):
-    """Function that has another function called, such as `submit` and `run_here`."""
+    """Function that calls another function, now or later, such as `submit` and `run_here`."""
 
     def __call__(self, work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> Future[R]:
         """Return the Future of work(*arguments, **options)."""
@@ -202,7 +202,7 @@ def _serve(parent: int) -> None:
 
 
 def peak_memory() -> float | None:
-    """Return the peak memory of this process (GB), which psutil lacks on Linux; None if the system has none."""
+    """Return the peak memory of this process (GB), which psutil lacks on Linux; None if the system lacks it."""
     with contextlib.suppress(OSError, StopIteration):  # on Linux getrusage includes the parent process
         lines = Path("/proc/self/status").read_text().splitlines()
         return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) * 1024 / 1e9
@@ -217,9 +217,9 @@ def peak_memory() -> float | None:
 def keep_freed() -> None:
     """Let up to 2 GB of freed memory stay with this process, in arrays of up to 128 MiB; needs glibc.
 
-    By default glibc returns freed arrays of more than 32 MiB to the system, which clears each new array page by page:
-    an eighth of the time of an evaluation of a few million tubes.  Freed arrays of more than 128 MiB would fragment a
-    third of all memory.
+    By default, glibc returns freed arrays of more than 32 MiB to the system, which clears each new array page by page.
+    This takes an eighth of the time of an evaluation of a few million tubes.  Keeping freed arrays of more than 128 MiB
+    would fragment a third of all memory.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
@@ -236,8 +236,8 @@ def return_freed() -> None:
 
 # --- commands in child processes --------------------------------------------------------------------------------------
 
-CHILD_INTERVAL = 0.02  # seconds between two checks whether the child has ended
-TERMINATION_TIMEOUT = 5.0  # seconds that a child has to end after SIGTERM
+CHILD_INTERVAL = 0.02  # time (s) between two checks for the end of a child
+TERMINATION_TIMEOUT = 5.0  # time (s) in which a child has to end after SIGTERM
 PARENT = "BSTCAD_PARENT"  # environment variable of a child: process id of its parent
 Tick = Callable[[], None]  # function called regularly while a child works
 
@@ -266,7 +266,7 @@ def run(
 ) -> ExitStatus:
     """Run `bstcad` with these arguments in a child process, which is killed after `limit` seconds.
 
-    tick: its exception ends the child.  environment: additional variables.
+    tick: called regularly; an exception of tick ends the child.  environment: additional variables.
     """
     source = str(Path(__file__).parents[2])  # the child runs these sources
     paths = os.pathsep.join(filter(None, (source, os.environ.get("PYTHONPATH"))))

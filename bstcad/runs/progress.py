@@ -1,6 +1,6 @@
 """Progress of long work: bars on a terminal or in a notebook, plain lines elsewhere.
 
-Each display is a context manager that yields a function progress(stage, done, total, text); `text` is the merit.
+Each display is a context manager that yields a function progress(stage, done, total, text); text: the merit so far.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 ProgressFunction = Callable[[str, int, int, str], None]
-LINE_INTERVAL = 3.0  # seconds between two lines of a stage, where the terminal shows no progress bar
-REDRAW_INTERVAL = 0.2  # seconds between two drawings in a notebook
+LINE_INTERVAL = 3.0  # time (s) between two lines of a stage, where the terminal shows no progress bar
+REDRAW_INTERVAL = 0.2  # time (s) between two updates in a notebook
 
 
 class Throttled:

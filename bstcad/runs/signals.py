@@ -75,9 +75,9 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def ignored_by_children() -> Iterator[None]:
-    """Make processes that start in the block ignore the signals of a terminal; this process gets them after the block.
+    """Make processes that start in the block ignore a terminal's signals; this process receives them after the block.
 
-    In the block the signals are blocked, if the system can do that; otherwise they would be ignored and lost.
+    In the block, the signals are blocked, so that they are kept; a system that cannot block signals loses them.
     """
     masks = hasattr(signal, "pthread_sigmask")
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL_SIGNALS) if masks else ()
@@ -95,7 +95,7 @@ def ignored_by_children() -> Iterator[None]:
 
 @contextlib.contextmanager
 def exit_on_signal() -> Iterator[None]:
-    """End this process at once, with a sentence, on a signal in the block, in which libraries load.
+    """End this process at once, with a sentence, on a signal while the block loads libraries.
 
     Some libraries swallow the exception of a signal while they load and stay half loaded.  Loading all of them can take
     ten seconds on a busy machine.  Nothing has been written yet.

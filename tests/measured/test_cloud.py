@@ -33,15 +33,15 @@ def zygo(heights, pixel):
 
 
 WRONG = {
-    "two columns": (lines(GOOD[:, :2], ","), "line 1 holds 2 numbers; give x, y and z in mm"),
+    "two columns": (lines(GOOD[:, :2], ","), "line 1 has 2 numbers; give x, y and z in mm"),
     "infinite": (lines(GOOD, ",") + "\n1,inf,3", "line 201: y = inf mm exceeds 1000000 mm"),
     "a placeholder": (lines(GOOD, " ") + "\n1 2 -1e10", "leave out points that were not measured"),
-    "decimal commas": ("x,y,z\n" + lines(GOOD, ",").replace(".", ","), "line 2 holds 6 fields, but its heading"),
+    "decimal commas": ("x,y,z\n" + lines(GOOD, ",").replace(".", ","), "line 2 has 6 fields, but its heading"),
     "nominal alone": ("X_nom,Y_nom,Z_nom\n" + lines(GOOD, ","), "its heading, 'X_nom,Y_nom,Z_nom', names nominal"),
     "pixels": ("Zygo XYZ Data File - Format 2\n#\n0 0 No Data\n0 1 16025.3\n#", "header states no width of a pixel"),
     "a zip archive": (b"PK\x03\x04" + bytes(50), "is a zip archive, such as X3P"),
     "half of UTF-16": ("x,y,z\n".encode("utf-16") + b"1", "is not text in UTF-16"),
-    "more columns": (lines(np.hstack([GOOD, GOOD]), ","), "holds 6 columns, but no heading names x, y and z"),
+    "more columns": (lines(np.hstack([GOOD, GOOD]), ","), "has 6 columns, but no heading names x, y and z"),
     "x twice": ("x,y,z,x\n" + lines(GOOD[:, [0, 1, 2, 0]], ","), "names x, y or z twice"),
     "another unit": ("x [ft],y [ft],z [ft]\n" + lines(GOOD, ","), "'x[ft]', has an unknown unit; give mm"),
     "metres": (lines(GOOD / 1000, ","), "as if they were in metres; give them in mm"),
@@ -63,7 +63,7 @@ def test_a_wrong_cloud_ends_the_command_with_2_and_changes_nothing(small_design,
     assert cli.run(["verify", str(small_design.folder), "--measured", str(tmp_path / "none.csv")]) == 2
     assert "none.csv: cannot be read (No such file" in capsys.readouterr().err
     (tmp_path / "few.csv").write_text(lines(GOOD[:10], ","))
-    with pytest.raises(SceneError, match="few.csv: holds 10 points"):
+    with pytest.raises(SceneError, match="few.csv: contains 10 points"):
         commands.verify(small_design.folder, measured=tmp_path / "few.csv")
     assert (small_design.folder / "report.json").read_bytes() == before
 
@@ -182,7 +182,7 @@ def test_a_ply_file_is_held_to_what_its_header_promises(tmp_path, order):
         "declares 999999999999999999 rows of element 'face', but 2 follow": ply(order, faces=10**18 - 1),
         "declares 2 rows of element 'face', but 1 follow": ply(order, triangles=1),
         "follow": ply(order, more=b"1 2 3\n"),
-        "is no PLY file that can be read ('element vertex -5' in its header)": ply(order, -5),
+        "is not a readable PLY file (its header contains 'element vertex -5')": ply(order, -5),
     }
     for sentence, data in wrong.items():
         path.write_bytes(data)
