@@ -65,32 +65,32 @@ class HeadersInTime(H11Protocol):
 
 @contextlib.contextmanager
 def bound(port: int) -> Iterator[socket.socket]:
-    """Listen on a port of the loopback address; port 0 takes a free one.  SceneError if the port is taken."""
+    """Listen on a port of the loopback address; 0: any free port.  SceneError if the port is not available."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as own:
         own.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             own.bind(("127.0.0.1", port))
         except OSError as error:
-            raise SceneError(f"--port {port}: is not available ({error.strerror}); give another or none") from None
+            raise SceneError(f"--port {port}: is not available ({error.strerror}); give another, or omit it") from None
         own.listen()  # browsers that connect before the server runs are queued
         yield own
 
 
 def uvicorn_server(app: Any, ends: Callable[[], None] = lambda: None) -> uvicorn.Server:
-    """Return a server of an application that prints nothing; `ends` is called when a signal ends it."""
+    """Return a server of an application, without output; `ends` is called when a signal ends the server."""
     quiet = {"log_level": "critical", "access_log": False, "server_header": False, "lifespan": "off", "ws": "none"}
     config = uvicorn.Config(app, http=HeadersInTime, timeout_graceful_shutdown=SHUTDOWN_TIMEOUT, **quiet)
     return _Server(config, ends)
 
 
 class _Server(uvicorn.Server):
-    """A server that wakes waiting requests as soon as a signal asks it to end."""
+    """A server that ends waiting requests as soon as a signal tells the server to end."""
 
     def __init__(self, config: uvicorn.Config, ends: Callable[[], None]) -> None:
         super().__init__(config)
         self._ends = ends
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Handle a signal."""
+        """Wake the waiting requests, then end the server."""
         self._ends()
         super().handle_exit(sig, frame)

@@ -24,7 +24,7 @@ from bstcad.runs import files, processes, signals
 from bstcad.runs.files import SentenceError, note
 
 JOB, SCENE = "job.json", "scene.toml"  # input files of a run
-CLOUD = "cloud"  # stem of the file with the measured points; the ending tells the format
+CLOUD = "cloud"  # stem of the file with the measured points; the suffix states the format
 PROGRESS, LIGHT, STATE = "progress.jsonl", "light.png", "state.json"
 MAX_JOB_SIZE = 1_000_000  # bytes of job.json
 MAX_PICTURE_SIDE = 512  # longer side of the picture of the light (pixels)
@@ -36,7 +36,7 @@ SOURCE_POINTS = 16  # points that represent an extended source in the picture
 
 @dataclass(frozen=True)
 class State:
-    """State of a run, as state.json has it."""
+    """State of a run, the contents of state.json."""
 
     __pydantic_config__ = {"extra": "forbid", "strict": True, "allow_inf_nan": False}  # rules for reading a file
 
@@ -123,7 +123,7 @@ def design(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool)
 
 
 def tolerance(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool) -> State:
-    """Study the tolerances of a finished design.  job: grade and yield (0 to 1), either may be None."""
+    """Study the tolerances of a finished design.  job: grade and yield (0 to 1), each of which may be None."""
     from bstcad import commands
     from bstcad.tolerance.study import StudySettings
 

@@ -31,8 +31,8 @@ from bstcad.scene.scene import Scene
 DESIGN = "design"  # kind of a run that designs a lens; the other kinds work on a finished design
 MAX_PROGRESS_SIZE = 50_000_000  # bytes of a run's largest file
 SCENE_TEXT = "written.toml"  # file of a run: the text of the scene on the page, with its comments
-ENDING_TIMEOUT = 1.0  # seconds that an ending server waits for runs to write checkpoints; they finish without it, too
-START_TIMEOUT = 30.0  # seconds that the process of a run has to start
+ENDING_TIMEOUT = 1.0  # time (s) that an ending server waits for runs to write checkpoints; slower runs still do
+START_TIMEOUT = 30.0  # time (s) in which the process of a run has to start
 PROCESS_LOST = "its process was killed, or this machine had too little memory for it"
 NO_RUN = State("none")
 
@@ -181,7 +181,7 @@ class Run:
 
 
 def _read(line: str) -> list[Any] | None:
-    """Return a line of progress; None for a line that a full disk or a kill has cut."""
+    """Parse a line of progress; None for a line that is incomplete after a full disk or a kill."""
     try:
         at, stage, done, total, text = json.loads(line)
     except (ValueError, TypeError, RecursionError):
@@ -193,7 +193,7 @@ def _read(line: str) -> list[Any] | None:
 def begin_design(scene: Scene, design: Path, text: str = "") -> Run:
     """Start the design of a scene into a folder; `text` of the scene file is kept with the run.
 
-    SceneError if the folder holds other files, or a run is already running.
+    SceneError if the folder contains other files, or a run is already running.
     """
     files.check_free(design)
     run = Run(design)

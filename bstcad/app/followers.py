@@ -2,7 +2,7 @@
 
 A beam that fills the lens keeps filling it.  A lens that is moved or made thicker keeps its distance from the wall.
 A beam with another profile gets a width of that profile.  With a closed lock, width and height keep their ratio.
-No key follows an invalid value.  In the text of a scene each key can still be set by itself.
+No key follows an invalid value.  In the text of a scene, each key can still be set alone.
 
 `impossible_choices` tries the choices of a form and returns those that the scene cannot have, with the reasons.
 """
@@ -20,21 +20,21 @@ from bstcad.app.scene_text import changed, is_same, tables
 from bstcad.app.words import typed
 from bstcad.runs.files import SentenceError
 
-SHAPES = {"lens.outline": "source.aperture"}  # outline: the outline that follows it while both are equal
+SHAPES = {"lens.outline": "source.aperture"}  # outline: the outline that follows it while the two are equal
 BACK_PLANE = "lens.back.z"  # key of the plane from which targets keep their distance
 WIDTHS = {  # key of the beam's width, by (kind of the source, profile)
     ("collimated", "gaussian"): "radius_1e2",
     ("point", "gaussian"): "half_angle_1e2",
     ("point", "uniform"): "half_angle",
 }
-PICTURE_KEYS = ("rotate", "fit", "seen_from", "sample")  # keys of the picture, not tried, since reading a photo is slow
+PICTURE_KEYS = ("rotate", "fit", "seen_from", "sample")  # keys whose choices are not tried: reading a photo is slow
 
 
 def take_change(
     text: str, key: str, value: Any, *, is_valid: Callable[[str], bool], valid_text: str | None = None,
     locked: bool = False,
 ) -> tuple[str, tuple[str, ...]]:  # fmt: skip
-    """Return a scene's text with another value of a key, and the keys that followed.
+    """Return the text of a scene with another value of a key, and the other keys that changed with it.
 
     is_valid: returns True for the text of a valid scene; keys follow only if the resulting scene is valid.
     valid_text: the latest valid text, from which followers are computed, so that an invalid value in between does not
@@ -63,7 +63,7 @@ def take_change(
 
 
 def with_followers(data: Mapping[str, Any], key: str, value: Any, locked: bool = False) -> dict[str, Any]:
-    """Return all changes, by key, that follow from a change of one key in the tables of a scene, that key first.
+    """Return the change of a key in the tables of a scene, and all changes that follow from it, by key.
 
     locked: the other side of a target or an outline keeps its ratio to the changed side.
     """
@@ -94,7 +94,7 @@ def _other_side(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]
 
 
 def _profile_widths(data: Mapping[str, Any], profile: Any) -> dict[str, Any]:
-    """Return the changes of a beam's widths for a profile: its own is set by the lens, those of others are removed."""
+    """Return the changes of a beam's widths for a profile: its width fills the lens, other widths are removed."""
     source = table_at("source", data)
     kind = source.get("kind")
     wanted = WIDTHS.get((kind, profile))
@@ -133,7 +133,7 @@ def _rounded(value: float) -> float:
 
 
 def impossible_choices(text: str, fault: Callable[[str], str | None]) -> dict[str, dict[str, str]]:
-    """Return, by key and choice, the reason why the scene would be refused with it; {} for an invalid scene.
+    """Return, by key and choice, the reason why the scene with this choice is refused; {} for an invalid scene.
 
     fault: returns the sentence that refuses the scene of a text; None for a valid one.
     """

@@ -1,4 +1,4 @@
-"""The form of a scene, as records and as HTML: a field for each key that its tables have or may have, by the schema.
+"""The form of a scene, as records and as HTML: a field for each key that the scene's tables may have by the schema.
 
 A table that the scene lacks, such as a wavefront or a second target, is an addition: a button that adds the table.
 """
@@ -21,7 +21,7 @@ from bstcad.scene.schema import TAGS, Node, records, rows, schema, tags
 if TYPE_CHECKING:
     import jinja2
 
-# Fields that most people change, with their labels by key.  Of several keys in one row the one that is set is shown.
+# Labels, by key, of the fields that most people change.  Of several keys in a row, the form shows the key that is set.
 MAIN_FIELDS: tuple[Mapping[str, str], ...] = (
     {
         "target.image": "Picture: image file", "target.text": "Picture: letters", "target.sample": "Picture: sample",
@@ -53,9 +53,9 @@ SECTIONS = {  # labels, by key, of sections whose key would be unclear as a titl
 }  # fmt: skip
 LOCKED_SIDES = {"x": "y", "y": "x", "width": "height", "height": "width"}  # side: the other side, which a lock changes
 OPTIONAL_TABLES = ("mount",)  # tables that have a meaning even if they are empty
-MAX_TABLES = 1000  # tables in a list without a limit of its own
+MAX_TABLES = 1000  # largest number of tables in a list for which the schema states none
 MIN_STEPS = 100  # smallest number of steps of a slider
-STEP_DIGITS = (5, 2, 1)  # digits that a step of a slider may have
+STEP_DIGITS = (5, 2, 1)  # possible first digits of a slider's step; all others are 0
 
 Control = Literal["number", "pair", "numbers", "choice", "check", "text", "lines"]
 Table = Mapping[str, Any]
@@ -73,7 +73,7 @@ class Field:
     unit: str  # "" without a unit
     minimum: float | None  # smallest value; None without a limit
     maximum: float | None  # largest value; None without a limit
-    meaning: str  # description of the key, a sentence
+    meaning: str  # meaning of the key, a sentence
     default: str  # "" without a default
     example: str
     control: Control
@@ -95,7 +95,7 @@ class Addition:
 
 @dataclass(frozen=True)
 class Group:
-    """Fields of a table or of a list of tables; or the keys of a section that are in no table."""
+    """Fields of a table or of a list of tables; or the fields of a scene that are not in a table."""
 
     key: str  # dotted key of the table; "" for name and title
     label: str
@@ -198,7 +198,7 @@ def _group(key: str, node: Node, table: Table, data: Table, removable: bool = Fa
 
 
 def _list(key: str, node: Node, value: Any, data: Table, maximum: int) -> Group:
-    """Return the group of a list of tables; if the only table needs no list, such as a target, the table's group."""
+    """Return the group of a list of tables; of a single table that needs no list, such as a target, only its group."""
     tables = [part if isinstance(part, dict) else {} for part in (value if isinstance(value, list) else [value])]
     tables = tables if value else []
     behind = f"{key}[{len(tables)}]"
@@ -239,7 +239,7 @@ def _field(key: str, node: Node, table: Table, options: list[Any], required: boo
 
 
 def _control(node: Node, value: Any) -> Control:
-    """Return the control that edits a value; it depends on the value if the key takes a number or a list."""
+    """Return the control that edits a value; it depends on the value if the key allows a number or a list."""
     if "enum" in node or "const" in node:
         return "check" if node.get("const") is True else "choice"
     forms = {form.get("type"): form for form in alternatives(node)}
@@ -290,7 +290,7 @@ class Slider:
 
 
 def slider(field: Field) -> Slider | None:
-    """Return a slider from half to twice the number of a field, or the width of its pair; None without a number."""
+    """Return a slider from half to twice a field's number, or the width of its pair; None if it has no number."""
     words, middle = field.value or field.default or field.example, ""
     value = number(words) if field.control == "number" else None
     if field.control == "pair":
@@ -314,7 +314,7 @@ def html(form: SceneForm, errors: Mapping[str, str], has_docs: bool = False) -> 
 
     A control has its key as data-key and name, a slider as data-key only.  A button has data-key, and in data-value the
     JSON of the value that `scene_text.changed` sets; null removes the table.
-    errors: sentences by key, which are shown beside their controls, or at the top without a control.
+    errors: sentences by key, each shown beside the key's control, or at the top if there is no such control.
     has_docs: True if the documentation is available, to which the sections link.
     """
     known = [*(field.key for field in form.first), *(key for section in form.sections for key in _keys(section))]
@@ -349,7 +349,7 @@ def html_id(key: str) -> str:
 
 
 def _owner(key: str, known: Iterable[str]) -> str:
-    """Return the key of the field or of the innermost group to which a sentence on a key belongs; "" if none."""
+    """Return the key of the field, or else of the innermost group, beside which a sentence on a key is shown, or ""."""
     alike = {other.replace("[0]", ""): other for other in known} | {other: other for other in known}
     while key:
         if found := alike.get(key) or alike.get(key.replace("[0]", "")):

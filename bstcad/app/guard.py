@@ -1,8 +1,8 @@
 """The guard before every request, since any web page and any local program can talk to a server on loopback.
 
-A request is accepted if all of this holds: its Host is this server (a foreign name may point here); its Origin, if
-any, is this server (another page may send it); and it has the token of this start, from the address that the terminal
-prints or from the cookie that this address sets.  The size of a body is checked while it arrives.
+A request is accepted on three conditions: its Host is this server (a foreign name may point here); its Origin, if any,
+is this server (another page may send a request); and it has the token of this start, from the address that the
+terminal prints or from the cookie that this address sets.  The size of a body is checked while the body arrives.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Guard:
     """ASGI middleware that protects the application of one start."""
 
     def __init__(self, app: Any, port: int, token: str, larger: tuple[str, int] = ("", 0)) -> None:
-        """Guard `app`.  larger: regular expression of the paths with larger bodies, and their limit in bytes."""
+        """Guard `app`.  larger: regular expression of the paths that allow larger bodies, and the limit in bytes."""
         self._app, self._token, self._larger = app, token, larger
         self.cookie = f"bstcad-{port}"  # browsers share cookies between ports
         self._hosts = {f"{name}:{port}" for name in ("127.0.0.1", "localhost")}
@@ -115,8 +115,8 @@ def _refusal(why: str, code: int) -> Response:
 def _redirect(path: str, from_own: bool) -> Response:
     """Return an answer that leads to the same page without the token in its address.
 
-    Browsers count a redirect as a request of the page that began it.  From a terminal in a web page it would arrive as
-    a foreign request without the strict cookie, so there a page of our own leads on.
+    Browsers count a redirect as a request of the page that began it.  From a terminal in a web page, it would arrive as
+    a foreign request without the strict cookie; then, a page of this server leads to the address instead.
     """
     address = quote("/" + path.lstrip("/"))  # //name would be another server; no quotation mark is left
     if from_own:

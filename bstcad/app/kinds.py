@@ -19,7 +19,7 @@ SIZE_MODELS = {  # new outline: (table from which it takes its size, factor)
     "mount.flange.outline": ("lens.outline", 2.0), "lens.front.outline": ("lens.outline", 0.5),
     "target.outline": ("target", 1.0), "target.profile": ("target", 1.0),
 }  # fmt: skip
-FIRST_OPTIONS = {  # first key of tables that need one of several keys, by (table, kind)
+FIRST_OPTIONS = {  # key with which a new table begins that needs one of several keys, by (table, kind)
     ("target", ""): {"uniform": True},
     ("tolerance", ""): {"grade": "precise"},
     ("lens.front", "bspline"): {"optimise": True},
@@ -64,7 +64,7 @@ def records_at(key: str, data: Table) -> list[Node]:
 
 
 def node_at(key: str, data: Table) -> Node | None:
-    """Return the schema's node of a dotted key; None if its table has no such key."""
+    """Return the schema's node of a dotted key; None if the key's table does not allow the key."""
     parent, _, last = key.rpartition(".")
     union = matching_records(records_at(parent, data), table_at(parent, data))
     name = without_numbers(last)
@@ -89,16 +89,16 @@ def alternatives(node: Node) -> list[Node]:
 
 
 def choices(node: Node) -> list[Any]:
-    """Return the values that a node allows by name, itself or for the items of its lists."""
+    """Return the choices (enumerated values) of a node, or of its alternatives and list items."""
     found = [*node.get("enum", ()), *([node["const"]] if "const" in node else ())]
     inner = [*alternatives(node), node.get("items", {})]
     return found or [value for part in inner if part and part is not node for value in choices(part)]
 
 
 def cast(node: Node, value: Any) -> Any:
-    """Return a value with the types of a node, in tables too: integers become floats where the node takes floats.
+    """Return a value, or a table of values, with the types of a node: integers become floats where it has floats.
 
-    Ranges are not checked.  ValueError if the node takes no such value.
+    Ranges are not checked.  ValueError if the node does not allow the value.
     """
     if union := records(node):
         return [_cast_table(union, part) for part in value] if isinstance(value, list) else _cast_table(union, value)
@@ -156,7 +156,7 @@ def convert_table(key: str, tag: Mapping[str, str], data: Table) -> dict[str, An
 
 
 def _is_common(before: Node | None, after: Node | None, value: Any) -> bool:
-    """Return True if a key has the same meaning in two kinds of table and the second takes its value."""
+    """Return True if a key has the same meaning in two kinds of table and the second allows its value."""
     if before is None or after is None or before["description"] != after["description"] or "const" in after:
         return False
     try:
@@ -207,7 +207,7 @@ def _completed(key: str, record: Node, common: Table, data: Table) -> dict[str, 
 
 
 def _needed_value(key: str, node: Node, data: Table) -> Any:
-    """Return a value for a required key, by the sizes and positions in the scene, else the schema's example."""
+    """Return a value for a required key, from the sizes and positions in the scene, or else the schema's example."""
     parent, _, name = key.rpartition(".")
     sizes, like = extent(table_at(parent, data)), SIZE_MODELS.get(without_numbers(parent))
     if sizes is None and like is not None and (found := extent(table_at(like[0], data))):
@@ -220,7 +220,7 @@ def _needed_value(key: str, node: Node, data: Table) -> Any:
     return node["examples"][0] if made is None else made
 
 
-SIZES: Mapping[str, Callable[[tuple[float, float]], float]] = {  # sizes of an outline, by its (x, y) extent
+SIZES: Mapping[str, Callable[[tuple[float, float]], float]] = {  # sizes of an outline from its (x, y) extent, by key
     "width": lambda sizes: sizes[0],
     "height": lambda sizes: sizes[1],
     "diameter": min,
@@ -264,7 +264,7 @@ def _screw_circle(data: Table) -> float | None:
 
 
 def _source_z(data: Table) -> float | None:
-    """Return z of a source that cannot be at z = 0 (mm), else None: in front of the lens, or facing a mirror."""
+    """Return z (mm) of a new source: before the lens, or on the light's side of a mirror; None if z = 0 is possible."""
     source, front, back = table_at("source", data), _scaled_z(data, "lens.front"), _scaled_z(data, "lens.back")
     if front is None or back is None:
         return None
@@ -280,11 +280,11 @@ def is_mirror(data: Table) -> bool:
     return any(table_at(f"lens.{face}", data).get("reflect") is True for face in ("front", "back"))
 
 
-SOURCE_ORIGINS: Mapping[str, Callable[[Table], Any]] = {  # position of sources that need it stated
+SOURCE_ORIGINS: Mapping[str, Callable[[Table], Any]] = {  # functions that return a new source's position, by key
     "source.position": lambda data: _on_axis(_source_z(data)),
     "source.z": lambda data: _source_z(data) if is_mirror(data) else None,
 }
-VALUES: Mapping[str, Callable[[Table], Any]] = {  # values of required keys, by key
+VALUES: Mapping[str, Callable[[Table], Any]] = {  # functions that return the value of a required key, by key
     "wavefront.z": lambda data: _scaled_z(data, "target"),
     "wavefront.focus": lambda data: _on_axis(_scaled_z(data, "target", times=2.0)),
     "mount.flange.z": lambda data: _scaled_z(data, "lens.front", more=0.5),

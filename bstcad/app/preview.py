@@ -1,7 +1,7 @@
 """A preview of a scene: the light of its lens after about a second, from a reduced design.
 
 The preview is a quick design (`Task.preview`) of the same scene with fewer pixels, control points, flux tubes and
-evaluations.  A pixel has as many control cells and tubes as in a draft.  Detail finer than its pixels is not shown.
+evaluations.  A pixel has as many control cells and tubes as in a draft.  Details finer than a pixel are not shown.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ TRANSPORT_CELLS = 48  # cells per side of the transport map
 GOALS_SIZE_FACTOR = 0.5  # factor on pixels, net and tubes for a scene of several goals
 GOALS_EVALUATIONS_FACTOR = 3  # factor on the evaluations for a scene of several goals
 MIN_POINT_ROUNDS = 3  # smallest number of rounds of stage 1 for a point source
-TUBES_PER_PIXEL = 2.5  # flux tubes per pixel along each axis for the picture; the lens was tailored with others
+TUBES_PER_PIXEL = 2.5  # flux tubes per pixel along each axis for the picture; tailoring uses other tubes
 LEDGER_RAYS = 160  # rays per side for the ledger of the light
 SHAPE_POINTS = 129  # points per side for the thickness
 IMAGE_POINTS = 16  # points per side of the back for the images of the source
@@ -51,7 +51,7 @@ class PreviewSize:
     tubes: int  # flux tubes per side
     rounds: int  # rounds of stage 1
     evaluations: int  # evaluations of stage 2 for a point source
-    blurred: int  # evaluations of stage 2 for an extended source, each twice as slow
+    blurred: int  # evaluations of stage 2 for an extended source, each of which takes twice the time
 
 
 QUICK = PreviewSize(pixels=72, net=180, tubes=240, rounds=2, evaluations=12, blurred=8)
@@ -72,20 +72,20 @@ class Preview:
     flux: dict[str, float]  # ledger of the light: fractions that sum to 1
     shape: dict[str, float | None]  # shape of the lens, by the keys of report.json
     source_images: tuple[Blur | None, ...]  # image of the source on each target; None for a point
-    lit_fraction: float  # fraction of the back's area, up to its rim, that the central point of the source lights
+    lit_fraction: float  # fraction of the back's area, up to the rim, that the central point of the source lights
     remarks: tuple[str, ...] = ()  # warnings of the scene, and remarks on light that cannot reach the target
     seconds: float = math.nan  # time of the preview (s)
 
     @property
     def rrmsds(self) -> tuple[float, ...]:
-        """RRMSD on each target, by the pixels of the preview."""
+        """RRMSD on each target, on the pixels of the preview."""
         return tuple(rrmsd(target, picture) for target, picture in self.pictures)
 
 
 def preview(scene: Scene, size: PreviewSize = QUICK, outdated: Callable[[], bool] = lambda: False) -> Preview:
-    """Return the preview of a scene, which depends on the scene only, not on earlier previews.
+    """Return the preview of a scene, which does not depend on earlier previews.
 
-    SceneError if a design would be refused; Outdated once `outdated` returns True.
+    SceneError if a design of the scene would be refused; Outdated once `outdated` returns True.
     """
     began, remarks = time.perf_counter(), list(scene.warnings())
     small = reduced_scene(scene, size)
@@ -147,7 +147,7 @@ def _evaluate(scene: Scene, made: Made) -> Preview:
 
 
 def _lit_fraction(scene: Scene, lens: Lens) -> float:
-    """Return the fraction of the back's area, up to its rim, that the central point of the source lights."""
+    """Return the fraction of the back's area, up to the rim, that the central point of the source lights."""
     x, y = (middle(ends).reshape(-1) for ends in corners(lens.apertures[1], IMAGE_POINTS))
     _, flux = landing_pixels(scene.channels()[:1], lens, scene.target.screen, IMAGE_POINTS)
     inside = lens.apertures[1].contains(x, y)

@@ -1,8 +1,8 @@
-"""The thread that makes previews: first of the newest scene of each page; slower answers follow when it is idle.
+"""The thread that makes previews: first for the newest scene of each page; slower answers follow when it is idle.
 
-A request of a page replaces its earlier request, whose work ends at the next step.  The answers come in the order of
-STAGES: a quick preview, a refined preview, the effects that are left out, and predictions for each quality.  There is
-one thread, since two previews at a time on two cores would each take twice as long.
+A request of a page replaces the page's earlier request, whose work ends at the next step.  The answers come in the
+order of STAGES: a quick preview, a refined preview, the effects that are left out, and predictions for each quality.
+There is one thread, since two simultaneous previews on two cores would each take twice as long.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from bstcad.sweep.plan import plan
 
 STAGES = ("preview", "settled", "effects", "predicted")
 MAX_PAGES = 32  # largest number of pages with a stored request
-IDLE_DELAY = 0.7  # seconds between a preview and the work on later answers, in case another change comes
-JOIN_TIMEOUT = 0.5  # seconds that the thread has to end
-PAGE_TIMEOUT = 60.0  # seconds after a page's last poll until its request is given up
+IDLE_DELAY = 0.7  # pause (s) between a preview and the work on later answers, in case another change comes
+JOIN_TIMEOUT = 0.5  # time (s) in which the thread has to end
+PAGE_TIMEOUT = 60.0  # time (s) after a page's last poll until its request is dropped
 
 
 @dataclass(eq=False)
@@ -38,7 +38,7 @@ class PreviewRequest:
     page: str  # id of the page
     number: int  # number of the request; later requests of a page have larger numbers
     scene: Scene
-    text: str = ""  # text of the scene file, whose lines a plan names
+    text: str = ""  # text of the scene file, to whose lines a plan refers
     answers: list[tuple[str, Any]] = field(default_factory=list)  # (stage, answer or the Exception that prevented it)
     replaced: bool = False  # True once a later request of the page has come
     preview_time: float = math.inf  # time of the first preview (time.monotonic)
@@ -62,7 +62,7 @@ class PreviewDesk:
         self._thread.start()
 
     def ask(self, request: PreviewRequest) -> None:
-        """Add a request; an older one of the page is dropped."""
+        """Add a request; an older request of the page is dropped."""
         with self._news:
             before = self._requests.pop(request.page, None)
             if before is not None and before.number > request.number:  # the requests arrived in another order
@@ -77,7 +77,7 @@ class PreviewDesk:
             self._news.notify_all()
 
     def answer(self, request: PreviewRequest, stage: int, patience: float) -> tuple[str, Any] | None:
-        """Wait up to `patience` seconds for an answer by its number; None on timeout or for a replaced request."""
+        """Wait up to `patience` seconds for the answer of a stage (index in STAGES); None if late or replaced."""
         with self._news:
             request.poll_time = time.monotonic()
             self._news.notify_all()  # the request may have been given up
@@ -132,7 +132,7 @@ class PreviewDesk:
         return [request for request in self._requests.values() if not request.done]
 
     def _serve(self, request: PreviewRequest) -> None:
-        """Make the next answer of a request; an interrupted answer is made later if the page still waits."""
+        """Make the next answer of a request; an interrupted answer is made again later, if the page still waits."""
         stage = STAGES[len(request.answers)]
         try:
             found = self._make(request, stage)
@@ -175,6 +175,6 @@ class PreviewDesk:
 
 
 def first_scene() -> Scene:
-    """Return a small scene, letters by a plate, that warms up the thread."""
+    """Return a small scene (a lens for letters), whose preview loads libraries and compiles kernels."""
     text = Plate.of().text("first")
     return of_text(text, tables(text, Path("first.toml")), Path("first.toml"))

@@ -1,4 +1,4 @@
-"""JSON of previews and plans for the page: pictures, formatted figures, and the solid to be turned."""
+"""JSON of previews and plans for the page: pictures, formatted figures, and the solid that a person can rotate."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from bstcad.report.rendering import data_url, turnable
 from bstcad.report.units import Rows, duration, number, quantity, tables
 from bstcad.sweep.prediction import Interval
 
-SOLID_CELLS = 96  # cells per side of the solid to be turned
+SOLID_CELLS = 96  # cells per side of the mesh of the solid on the page
 # Error of the preview's thicknesses and relief, as a fraction of the relief.  The largest differences from finished
 # lenses among ten templates are 0.007 for a back that is lit up to its rim, and 0.43 for a back with dark areas.
 SHAPE_ERROR, DARK_SHAPE_ERROR = 0.03, 0.45
-MIN_LIT_FRACTION = 0.99  # fraction of the back's area from which on it counts as lit up to its rim
+MIN_LIT_FRACTION = 0.99  # smallest lit fraction of the area of a back that counts as lit up to the rim
 
 
 def of_preview(found: Preview) -> dict[str, Any]:

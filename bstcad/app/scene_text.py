@@ -1,4 +1,4 @@
-"""Changes of a scene's text that leave everything else as a person wrote it.
+"""Changes of a scene's text that preserve everything else as a person wrote it.
 
 A text is split into pieces: headers, keys with their values, and the lines between.  Unchanged pieces stay as they are,
 and tomlkit preserves the style inside a changed piece.
@@ -59,8 +59,8 @@ def changed(text: str, key: str, value: Any) -> str:
     A value may come from JSON: 20 is written as 20.0 if the schema has a float.
 
     With another kind (source.kind, lens.outline.shape) the table is converted: keys with the same meaning in both kinds
-    stay, other keys are removed, and missing keys are added with values that fit the scene.  The comments of a key or a
-    table are removed with it: those behind it, below that in the same column, and inside the table.
+    stay, other keys are removed, and missing keys are added with values that fit the scene.  A key or table is removed
+    with its comments: after it on the line, on the lines below in the same column, and inside the table.
     """
     before = tables(text)
     after = _changed_tables(before, key, value)
@@ -76,7 +76,7 @@ def changed(text: str, key: str, value: Any) -> str:
 
 
 def _changed_tables(before: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """Return the tables with another value; a first table becomes a list where the schema has one, empty lists go."""
+    """Return the tables with another value.  A table becomes a list if the schema says so; empty lists are removed."""
     from bstcad.scene.dotted_keys import override  # loads torch
 
     after, node = copy.deepcopy(before), node_at(key, before)
@@ -205,7 +205,7 @@ def _after_comment(found: Sequence[Piece], k: int) -> int:
 
 
 def _table_end(found: Sequence[Piece], k: int) -> int:
-    """Return the index after a table with last piece `k`, also after comments below that a blank line follows."""
+    """Return the index after a table with last piece `k`, and after comments below it before a blank line."""
     end = over = _after_comment(found, k)
     while over < len(found) and found[over].role == "comment":
         over += 1
@@ -234,7 +234,7 @@ def _update(found: list[Piece], path: KeyPath, before: Any, after: Any) -> list[
 def _update_table(
     found: list[Piece], path: KeyPath, before: Mapping[str, Any], after: Mapping[str, Any]
 ) -> list[Piece]:
-    """Replace a table; new keys take the position of the first removed key, else their position in the schema."""
+    """Replace a table; new keys are put at the first removed key, or else at their position in the schema."""
     gone = [name for name in before if name not in after]
     for name, value in after.items():
         if name in before:
@@ -325,7 +325,7 @@ def _remove(found: list[Piece], path: KeyPath) -> list[Piece]:
 
 
 def _add(found: list[Piece], path: KeyPath, value: Any, instead: KeyPath = ()) -> list[Piece]:
-    """Add a key or a table.  instead: path of the key whose position it takes."""
+    """Add a key or a table.  instead: path of the key at whose position it is put."""
     if _has_header(path, value):
         return _add_table(found, path, value)
     parent = path[:-1]
@@ -400,7 +400,7 @@ def _is_table_list(value: Any) -> bool:
 
 
 def _has_header(path: KeyPath, value: Any) -> bool:
-    """Return True if a table or list of tables gets a header; inner tables do only if they contain tables."""
+    """Return True if a table or list of tables gets a header; an inner table gets one only if it contains tables."""
     if isinstance(value, list):
         return len(path) == 1 and _is_table_list(value)
     inner = isinstance(value, dict) and (len(path) == 1 or any(isinstance(part, dict) for part in value.values()))

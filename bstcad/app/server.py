@@ -45,9 +45,9 @@ from bstcad.scene.scene_file import MAX_DOTS
 from bstcad.scene.schema import rows
 
 Body = Mapping[str, Any]  # JSON object that a page sends
-ANSWER_TIMEOUT = 20.0  # seconds until a waiting request returns without an answer and the page polls again
+ANSWER_TIMEOUT = 20.0  # time (s) until a waiting request returns without an answer and the page polls again
 UPLOAD = "/api/picture"
-LARGE_BODY_PATHS = rf"{UPLOAD}|/api/design/[^/]+/measured"  # paths with larger bodies
+LARGE_BODY_PATHS = rf"{UPLOAD}|/api/design/[^/]+/measured"  # paths that allow larger bodies
 STATIC = Path(__file__).parent / "static"
 CONTENT_TYPES = {".html": "text/html", ".json": "application/json", ".png": "image/png", ".pdf": "application/pdf"}
 RRMSD = (
@@ -62,7 +62,7 @@ CLOUD_ENDINGS = ((b"ply", ".ply"), (b"solid", ".stl"))  # (first bytes of a file
 
 
 class Workbench:
-    """Application of one start of the server."""
+    """The server's application: pages, requests, previews and runs from one start of the server to its end."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace, self.desk = workspace, PreviewDesk()
@@ -130,7 +130,7 @@ class Workbench:
         return self._sentence_answer(request, f"{name}{error.strerror or type(error).__name__}; {remedy}", 400)
 
     def _note_disconnect(self, request: Request, error: Exception) -> Response:
-        """Report a request whose client disconnected in the terminal; no one reads the answer."""
+        """Report in the terminal a request whose client has disconnected, so that no one reads the answer."""
         print(f"bstcad: {request.url.path}: the browser cancelled this request, which has no effect", file=sys.stderr)
         return Response(status_code=400)
 
@@ -242,7 +242,7 @@ class Workbench:
         return JSONResponse({"picture": await run_in_threadpool(self.workspace.keep, data)})
 
     def scene_state(self, request: Request) -> Response:
-        """Answer with a scene's text, form and fault; only the revision if the page has it already."""
+        """Answer with a scene's text, form and fault; only with the revision if the page has this revision."""
         known, name = request.query_params.get("revision"), request.path_params["name"]
         if known is not None and known == self.workspace.opened(name).revision:
             return JSONResponse({"revision": known})
@@ -304,13 +304,13 @@ class Workbench:
         return self._state(name) | {"followed": followed}
 
     def photo(self, request: Request) -> Response:
-        """Answer with a small copy of the whole photo of a target, ?key, on which the crop is drawn."""
+        """Answer with a small copy of the whole photo of the target ?key, on which the page draws the crop."""
         name, key = request.path_params["name"], request.query_params.get("key", "target")
         scene = self.workspace.scene(name, self.workspace.opened(name).text)
         return Response(crop.small_photo(crop.target_of(scene, key)), media_type="image/png")
 
     def take_proportions(self, name: str, body: Body) -> dict[str, Any]:
-        """Give the plate and the picture the proportions of a target's photo: {key of the target}."""
+        """Give the plate and the picture the proportions of a target's photo: {key}, the target's key."""
         key = str(body.get("key") or "target")
 
         def with_proportions(text: str) -> str:
@@ -377,7 +377,7 @@ class Workbench:
     def make(self, name: str, body: Body) -> dict[str, Any]:
         """Save the scene and start its design in its own process; answer with the design's name.
 
-        {page}: id of the page, which waits for no preview any more.
+        {page}: id of the page, whose request for previews is dropped.
         """
         self.desk.drop(str(body.get("page")))
         text = self.workspace.opened(name).text
@@ -456,7 +456,7 @@ class Workbench:
         """Start a study of time against accuracy; body: {"budget": seconds}."""
         budget = _number(body.get("budget") or 600, "budget")
         if not 1 <= budget <= 86_400:
-            raise SceneError(f"budget: {budget:g} s is not between 1 s and one day; give seconds, such as 600")
+            raise SceneError(f"budget: {budget:g} s is not between 1 s and one day; give a time in s, such as 600")
         self.workspace.design(f"{name}-tradeoff")  # raises if the folder of the result lies outside
         return self._begin(name, "tradeoff", {"budget": budget})
 

@@ -25,8 +25,8 @@ from bstcad.app.kinds import (
 from bstcad.scene.errors import SceneError, nearest
 from bstcad.scene.schema import Node, records
 
-BARE = re.compile(r"[A-Za-z0-9_-]+")  # name that TOML takes without quotes
-MAX_DIGITS = 300  # largest length of a number
+BARE = re.compile(r"[A-Za-z0-9_-]+")  # name that TOML allows without quotes
+MAX_DIGITS = 300  # largest length of a number (characters)
 SPACES = re.compile(r"(?<=\d)[ \u00a0\u2009\u202f'’_](?=\d{3}(?!\d))")  # spaces before three digits of a number
 THOUSANDS = {mark: re.compile(rf"[+-]?\d{{1,3}}(\{mark}\d{{3}})+") for mark in ",."}
 DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -39,9 +39,9 @@ BOOLEAN_WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": Fa
 def typed(key: str, words: str, data: Mapping[str, Any]) -> Any:
     """Return the value of the words that a person typed for a key; None, which removes the key, for empty words.
 
-    A number has a decimal point or a decimal comma: 0.5 and 0,5.  A single mark is decimal: 1,000 is 1.  If both marks
-    occur, the last is decimal and the other separates thousands, as spaces do: 1.000,5 and 1,000.5 and 1 000,5.  A mark
-    that occurs twice separates thousands; in an integer every mark does: 1.000 pixels are 1000.  A unit may follow.
+    A number has a decimal point or a decimal comma: 0.5 and 0,5.  A single mark is decimal: 1,000 is 1.  If points and
+    commas occur, the last is decimal and the others separate thousands, as spaces do: 1.000,5, 1,000.5 and 1 000,5.  A
+    mark that occurs twice separates thousands, as every mark in an integer: 1.000 pixels are 1000.  A unit may follow.
 
     Items of a list are separated by ";", else by commas with a space, else by spaces: "1,5; 2,5" and "1.5, 2.5" and
     "1,5 2,5"; if none of these occurs, by commas: "1.5,2.5".  Anything in brackets is TOML:

@@ -29,7 +29,7 @@ from bstcad.scene.schema import contents
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")  # name of a scene or a design: no path, no hidden file
 PICTURES = "pictures"  # folder of uploads, beside the scenes
 UNSAVED = "unsaved"  # kind of the hidden file with unsaved changes
-LARGEST_UPLOAD = 100_000_000  # bytes
+LARGEST_UPLOAD = 100_000_000  # largest size of a picture (bytes)
 DESIGN_FILES = ("report.json", "design.npz")  # files by which a design's folder is recognised
 
 
@@ -316,7 +316,7 @@ class Workspace:
 
 
 def _renamed(text: str, name: str) -> str:
-    """Return a scene's text with a new name in the commands of its comments."""
+    """Return a scene's text with a new name of the scene in the commands that its comments quote."""
     before = str(tables(text).get("name"))
     for words in (f"bstcad generate {before}.toml", f"bstcad plan {before}.toml", f"outputs/{before}"):
         text = re.sub(rf"{re.escape(words)}(?![\w-])", words.replace(before, name), text)
@@ -338,7 +338,7 @@ def _folder_pattern(*folders: Path) -> re.Pattern:
 
 
 def _text(path: Path) -> str:
-    """Return the text of a scene file, without a byte order mark and with Unix line ends.  SceneError."""
+    """Return the text of a scene file, without byte order mark, with Unix line ends.  SceneError if not readable."""
     try:
         return _with_unix_ends(files.contents(path, 2 * scene_file.MAX_SCENE_SIZE).decode("utf-8-sig"))
     except UnicodeDecodeError:
