@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 297.0, 210.0  # size of the page, A4 (mm)
 FRAME = (20.0, 10.0, 287.0, 200.0)  # left, lower, right and upper edge of the frame (mm, ISO 5457)
-TABLE_TOP, TITLE_LEFT, LIGHT_LEFT = 60.5, 205.0, 226.0  # edges of tables, title block and column of the light (mm)
+TABLE_TOP, TITLE_LEFT, LIGHT_LEFT = 60.5, 205.0, 226.0  # upper or left edge of each block (mm)
 ROW_HEIGHT, TABLE_FONT, HEADING_FONT = 3.57, 2.3, 2.6  # height of a table row, font sizes of rows and headings (mm)
 PICTURE_PIXELS = 256  # pixels along the longer side of a picture of the light
 APERTURE_ROUNDING = 1e-4  # relative amount by which a printed clear aperture may be too small
@@ -45,17 +45,17 @@ class DataSheet:
 
     scene: Scene
     designed: Lens
-    shape: Mapping[str, float | None]  # shape of the lens inside its mount's rim, and the volume of lens.step
-    order: Order  # order for the shop, with the file that the sheet belongs to
-    target: np.ndarray  # picture of the first target (rows, columns), in coordinates
-    irradiance: np.ndarray  # irradiance on the first target (rows, columns), with the same sum
+    shape: Mapping[str, float | None]  # facts of the lens inside its mount's rim; volume of lens.step
+    order: Order  # order for the shop; order.file is the STEP file that the sheet describes
+    target: np.ndarray  # picture of the first target (rows, columns), row 0 at y max, column 0 at x min
+    irradiance: np.ndarray  # irradiance on the first target, in the form and with the sum of `target`
     figures: Sequence[GoalFigures]  # figures of the light on each target
     passed: bool  # True if every check passed
     version: str  # version of the program
 
     @property
     def mount(self) -> Mount | None:
-        """Mount of the lens in part.step; None: there is none."""
+        """Mount of the lens in part.step; None: the sheet describes lens.step."""
         return self.scene.mount if self.order.file == PART else None
 
     @cached_property
@@ -118,7 +118,7 @@ def draw(sheet: DataSheet) -> bytes:
 
 @styled
 def page(sheet: DataSheet) -> Figure:
-    """Draw the whole page."""
+    """Return the whole page as a figure."""
     from matplotlib.figure import Figure
 
     paper = Paper.of(figure := Figure(figsize=(WIDTH / 25.4, HEIGHT / 25.4), facecolor="white"))
@@ -146,7 +146,7 @@ def page(sheet: DataSheet) -> Figure:
 
 
 def _form(sheet: DataSheet) -> str:
-    """Return the form of the front in a few words; convex (CX) if its centre of curvature lies along +z."""
+    """Return the form of the front in a few words; convex (CX) if the centre of curvature is on the +z side."""
     front = sheet.record["front"]
     radii = {name.removeprefix("radius"): radius for name, radius in front.items() if name[:6] == "radius" and radius}
     words = [f"R{way} {abs(radius):.5g} {'CX' if radius > 0 else 'CC'}" for way, radius in radii.items()]
@@ -167,7 +167,7 @@ def _column(paper: Paper, left: float, heading: str, rows: Rows) -> None:
 
 
 def _title_block(paper: Paper, sheet: DataSheet, scale: str) -> None:
-    """Draw name, title, author and date (ISO 7200), scale and projection, and the STEP file of the sheet."""
+    """Draw name, title, author and date (ISO 7200), scale and projection, and the SHA-256 of the STEP file."""
     scene, part, order, left, right = sheet.scene, sheet.scene.part, sheet.order, TITLE_LEFT, FRAME[2]
     room = right - left - 3.6
     paper.text(left + 1.8, TABLE_TOP - 5.6, scene.name, 4.2, room=room, weight="bold")
@@ -220,7 +220,7 @@ def _light(paper: Paper, sheet: DataSheet, y: float) -> float:
 
 
 def _reduced(picture: np.ndarray) -> np.ndarray:
-    """Return the picture with at most PICTURE_PIXELS along its longer side, each the mean of a block of pixels."""
+    """Return the picture averaged over blocks of pixels, so that its longer side has at most PICTURE_PIXELS."""
     from PIL import Image
 
     return np.asarray(Image.fromarray(picture.astype(np.float32)).reduce(-(-max(picture.shape) // PICTURE_PIXELS)))

@@ -44,7 +44,7 @@ STYLE: dict[str, Any] = {
 }
 DPI = 144
 MARGIN = 0.06  # margin around a picture (inches)
-MAX_PNG_BYTES = 300_000  # size of a PNG above which it is drawn with fewer pixels
+MAX_PNG_BYTES = 300_000  # size above which a PNG is encoded again with fewer pixels (bytes)
 MAX_PALETTE_COLOURS = 600  # number of colours up to which a palette of 256 shows no difference
 
 
@@ -85,7 +85,7 @@ def png(figure: Figure, ground: str = "#ffffff") -> bytes:
 
 
 def darken(figure: Figure) -> Figure:
-    """Change the figure to light text and axes on a dark background, with the same pictures, and return it."""
+    """Recolour the text, axes and background of the figure for dark mode, and return the figure."""
     from matplotlib.text import Text
 
     figure.set_facecolor(DARK_GROUND)
@@ -125,7 +125,7 @@ def steps(name: str, count: int) -> Any:
 
 
 def round_up(value: float) -> float:
-    """Return the next 1, 2 or 5 times a power of ten, so that a colour scale ends on a plain number."""
+    """Return `value` rounded up to 1, 2 or 5 times a power of ten, a plain end of a scale; 1 if it is not positive."""
     if value <= 0.0:
         return 1.0
     decade = 10.0 ** np.floor(np.log10(value))

@@ -29,20 +29,20 @@ from bstcad.report.units import environment, paragraphs
 from bstcad.runs import files
 from bstcad.scene.mount import Mount
 
-SIDECAR = ".txt"  # suffix of a file that states the shift of the light by the interpolation of a table
+SIDECAR = ".txt"  # suffix of a text file that states how far interpolation of a table moves the light
 SHEET = "datasheet"  # kind of export that the caller draws, from the report beside the lens
 
 OUTLINE, RIM, FLANGE, SCREWS, HOLES = "OUTLINE", "RIM", "FLANGE", "SCREW_HOLES", "HOLES"
 CENTRES, TEXT = "CENTRES", "TEXT"
-MARK_OVERSHOOT = 1.5  # length of a centre mark outside its edge (mm)
+MARK_OVERSHOOT = 1.5  # length by which a centre mark extends beyond the edge of a hole or rim (mm)
 SVG_MARGIN = 3.0  # margin around the drawing in the SVG (mm)
 EDGE_WIDTH, CENTRE_WIDTH = 0.25, 0.13  # widths of lines (mm, ISO 128)
 CHAIN_LENGTHS = (4.0, 0.8, 0.4, 0.8)  # lengths of dash, gap, dot and gap of a centre line (mm)
 CAPITAL_HEIGHT = 1.8  # height of a capital (mm, ISO 3098)
-FONT_SIZE = CAPITAL_HEIGHT / 0.72  # font size with such capitals (mm)
+FONT_SIZE = CAPITAL_HEIGHT / 0.72  # font size whose capitals have this height (mm)
 MAX_LINE_LENGTH = 60  # characters per line of text
 LETTER_WIDTH = 0.56 * FONT_SIZE  # upper bound of the mean width of a letter (mm)
-QUARTER_TURN_BULGE = math.tan(math.pi / 8)  # bulge of an arc of 90 degrees: tan of a quarter of its angle
+QUARTER_TURN_BULGE = math.tan(math.pi / 8)  # DXF bulge of an arc of 90 degrees: tan of a quarter of the angle
 EDGES = {"fill": "none", "stroke": "black", "stroke-width": f"{EDGE_WIDTH:g}"}
 STYLES = {  # attributes of the groups in the SVG, except those of edges
     CENTRES: {
@@ -53,7 +53,7 @@ STYLES = {  # attributes of the groups in the SVG, except those of edges
     },
     TEXT: {"font-family": "Helvetica, Arial, sans-serif", "font-size": f"{FONT_SIZE:g}"},
 }
-DXF_SIGNS = str.maketrans({"Ø": "%%c", "°": "%%d", "×": "x"})  # replacements that every font of a CAD system has
+DXF_SIGNS = str.maketrans({"Ø": "%%c", "°": "%%d", "×": "x"})  # codes that CAD systems show in any font
 
 # (layer, kind, numbers): numbers (mm) are x, y, radius of a circle; half width, half height and corner radius of a box
 # around the axis; both ends of a line; or x, y and the string of a text.
@@ -62,28 +62,28 @@ Piece = tuple[str, str, tuple[Any, ...]]
 
 @dataclass(frozen=True)
 class Exported:
-    """Written files."""
+    """Exported files, and notes on their accuracy."""
 
     paths: list[Path]
-    notes: list[str]  # sentences on the shift of the light by the interpolation of grids and tables
+    notes: list[str]  # sentences on how far interpolation of a grid or table moves the light
 
 
 def export(
     lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = None, label: Label = DEFAULT_LABEL,
     mount: Mount | None = None, light: GridLight | None = None,
 ) -> Exported:  # fmt: skip
-    """Write the files of these kinds, except SHEET, to the folder, each completely or not at all.
+    """Write the files of these kinds of files.EXPORTS (SHEET: none) to the folder, each completely or not at all.
 
     points: points along the wider side of grids; by default the number of control points of the back, and for
     OpticStudio the knots of the net.  label: name of meshes and of a part.  mount: mount of the part in drawings; None:
-    drawings show the outline of the lens.  light: light that measures the error of grids and tables; None: no
-    measurement.  ValueError names a kind or number that is not possible.
+    drawings show the outline of the lens.  light: traced to measure the error of grids and tables; None: it is not
+    measured.  ValueError: a kind is unknown, or points is out of range.
     """
     for kind in kinds:
         if kind not in files.EXPORTS:
             raise ValueError(f"'{kind}' cannot be exported; give one of {', '.join(files.EXPORTS)}")
     if points is not None and not MIN_POINTS <= points <= MAX_POINTS:
-        raise ValueError(f"{points} points per side are not possible; give {MIN_POINTS} to {MAX_POINTS}")
+        raise ValueError(f"points = {points} is not possible; give a number from {MIN_POINTS} to {MAX_POINTS}")
     lens, paths, notes = lens.plain(), [], []
     for kind in dict.fromkeys(kinds):
         for name, data in _files(kind, lens, points, label=label, mount=mount, light=light):
@@ -106,7 +106,7 @@ def _files(
             yield "points-front.csv", points_table(lens, lens.front, count)
             yield "points-back.csv", points_table(lens, lens.back, count)
             yield from _sidecar("points", lens, count, light)
-        case "zemax":  # for a front that is not a net, prescription.txt has the numbers
+        case "zemax":  # a front that is not a net has no grid; its numbers are in prescription.txt
             for name, face in (("zemax-back", lens.back), ("zemax-front", lens.front)):
                 if is_net(face):
                     grid = GridSag.of(lens, face, points, light)
@@ -148,13 +148,13 @@ def turning_cloud(lens: Lens, points: int, face: Surface | None = None) -> str:
 
     There are `points` rings of equal spacing from the axis to the farthest point of the outline.  Each ring has the
     number of angles that the outermost ring needs for the same spacing.  Points outside the outline are omitted.  The
-    table has no compensation of the tool's radius.
+    tool radius is not compensated.
     """
     ring = np.linspace(0.0, float(np.hypot(*lens.outline.farthest)), points)
     count = round(2 * np.pi * (points - 1))
     radius, angle = (p.ravel() for p in np.meshgrid(ring, np.arange(count) * 360.0 / count, indexing="ij"))
     x, y = radius * np.cos(np.radians(angle)), radius * np.sin(np.radians(angle))
-    inside = lens.outline.contains(*(torch.from_numpy(p * (1 - 1e-12)) for p in (x, y))).numpy()  # or on the rim
+    inside = lens.outline.contains(*(torch.from_numpy(p * (1 - 1e-12)) for p in (x, y))).numpy()  # on the rim: inside
     face = face or lens.back
     height = sag(face, x[inside], y[inside]) - sag(face, 0.0, 0.0)
     return _csv(radius_mm=radius[inside], angle_deg=angle[inside], sag_mm=height)
@@ -188,7 +188,7 @@ def _csv(**columns: np.ndarray) -> str:
 
 
 def drawing(outline: Outline, mount: Mount | None, label: Label) -> list[Piece]:
-    """Return the pieces of a drawing: lens and mount with centre marks and text; mount None: only the outline."""
+    """Return the pieces of a drawing: lens and mount with centre marks and text; without a mount, only the outline."""
     if mount is None:
         return [_edge(OUTLINE, outline)]
     rim, flange = mount.rim_of(outline).outline, mount.flange
@@ -210,7 +210,7 @@ def drawing(outline: Outline, mount: Mount | None, label: Label) -> list[Piece]:
 
 
 def _edge(layer: str, outline: Outline, x: float = 0.0, y: float = 0.0) -> Piece:
-    """Return a closed curve with centre (x, y); only circles may have another centre than the axis."""
+    """Return a closed curve with centre (x, y); only a circle may be off the axis."""
     if outline.is_round:
         return layer, "circle", (x, y, outline.radius)
     return layer, "box", (*outline.half_extent, math.sqrt(outline.limits[2]))
@@ -261,12 +261,12 @@ def svg(outline: Outline, mount: Mount | None = None, label: Label = DEFAULT_LAB
     return environment().get_template("outline.svg.j2").render(
         layers=layers, left=-a, top=-b, width=right + a, height=b - low, title=texts[0][2] if texts else "",
         styles=STYLES, edges=EDGES, n=lambda value: f"{_plain(value):.15g}",
-        dash=lambda at: (CHAIN_LENGTHS[0] - math.dist(at[:2], at[2:])) / 2 % sum(CHAIN_LENGTHS),  # a dash at the middle
+        dash=lambda at: (CHAIN_LENGTHS[0] - math.dist(at[:2], at[2:])) / 2 % sum(CHAIN_LENGTHS),  # a dash at the centre
     ) + "\n"  # fmt: skip
 
 
 def words(outline: Outline, mount: Mount, label: Label) -> list[str]:
-    """Return the text of a drawing on the sizes of the part, one string per line."""
+    """Return the text of a drawing, which states the sizes of the part, one string per line."""
     return paragraphs("outline.txt.j2", "words", lens=outline, mount=mount, label=label, across=across)
 
 
@@ -279,7 +279,7 @@ def across(outline: Outline) -> str:
 
 
 def pitch_radius(mount: Mount) -> float | None:
-    """Return the radius (mm) of the screws' pitch circle; None outside the flange, where it would look like an edge."""
+    """Return the radius (mm) of the pitch circle of the screws; None: no screws, or a circle outside the flange."""
     screws = mount.flange and mount.flange.screws
     if not screws or 2 * min(mount.flange.outline.outline.half_extent) <= screws.circle:
         return None

@@ -52,11 +52,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-CELLS, LIGHT_PATH_CELLS = 320, 200  # cells per axis of the mesh in the 3-D picture, and in the view with rays
-RAYS = 28  # rays per axis over the light through the lens
-MILLIONTHS = 1e6
+CELLS, LIGHT_PATH_CELLS = 320, 200  # mesh cells per axis in the 3-D picture, and in the view with rays
+RAYS = 28  # rays per axis in the view with rays
+MILLIONTHS = 1e6  # factor from a fraction to millionths
 MAP_POINTS = 401  # samples of a surface map along each axis
-ROUNDING = 1e-6  # relative variation of a map below which it is flat and has no contours
+ROUNDING = 1e-6  # relative variation below which a map has no contour lines
 
 Pngs = dict[str, bytes]  # pictures by name
 
@@ -74,12 +74,12 @@ class Pictures:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
-        if kind is not None:  # Ctrl-C or an error: VTK would take seconds
+        if kind is not None:  # Ctrl-C or an error: do not wait seconds for VTK
             rendering.stop()
         self._vtk.shutdown(cancel_futures=kind is not None)
 
     def begin(self, draw: Callable[..., Pngs], *given: Any, number: int = 0) -> None:
-        """Start a job that draws draw(*given, view); number: index of the target of the view."""
+        """Start the job draw(*given, view); number: index of the target that the view shows."""
         self._jobs.append(self._submit(draw, *given, View.of(self._scene, number)))
 
     def solid(self, lens: Lens) -> None:
@@ -101,7 +101,7 @@ class Pictures:
     def result(self) -> dict[str, bytes | None]:
         """Return PNG bytes by name; None for the 3-D picture if the machine cannot draw it.
 
-        If the second process died, its pictures are missing, since the verified lens is still valid.
+        If the second process died, its pictures are missing without an error: the verified lens is still valid.
         """
         pictures: dict[str, bytes | None] = {"lens": None}
         for job in self._jobs:
@@ -143,12 +143,12 @@ def draw_lens(source: Emitter, lens: Lens, screens: Sequence[Screen], view: View
 
 
 def draw_transport(source: Emitter, lens: Lens, screen: Screen, view: View) -> Pngs:
-    """Return the picture of the map from the source to a screen."""
+    """Return the picture of the transport map from the lens to a screen."""
     return {numbered("transport", view.number): png(transport_map(*ray_map(source, lens, screen.plane), view))}
 
 
 def draw_light(target: np.ndarray, light: Light, lines: Sequence[SpectralLine], view: View) -> Pngs:
-    """Return the pictures of the light, and if there are any, of the ghost and of the lines of a spectrum."""
+    """Return the figures of the irradiance and, if there are any, of the ghost and of the spectral lines."""
     found = light.picture
     pictures = {
         "irradiance": light_figures.irradiance_triptych(target, found, view),
@@ -162,12 +162,12 @@ def draw_light(target: np.ndarray, light: Light, lines: Sequence[SpectralLine], 
 
 
 def draw_wavefront(error: WavefrontError, view: View) -> Pngs:
-    """Return the map of a wavefront error, which does not depend on a target."""
+    """Return the map of a wavefront error; `view` is not used."""
     return {"wavefront": png(wavefront_map(error))}
 
 
 def draw_convergence(report: Contents, view: View) -> Pngs:
-    """Return the convergence curve of a design, if it has a history."""
+    """Return the convergence curve of a design; empty if the report has no history."""
     if not report.history:
         return {}
     return {"convergence": png(convergence(report.history, report.stages, report.rrmsd_noise))}
@@ -237,9 +237,9 @@ def _sample(lens: Lens, face: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 @styled
 def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> Figure:
-    """Draw the section of the lens at y = 0 with rays (n_rays, n_points, 3) in mm projected on x-z: close, and whole.
+    """Draw the section of the lens at y = 0 with rays projected on x-z: the lens close up, and the whole path.
 
-    If there are several screens or one that is tilted, they are drawn in the same projection.
+    rays: (n_rays, n_points, 3) in mm.  Screens are projected too if there are several, or one that is tilted.
     """
     figure = new_figure(11.0, 3.4)
     close, whole = figure.subplots(1, 2, width_ratios=(1, 1.9))
@@ -292,7 +292,7 @@ def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
 
 @styled
 def convergence(history: Sequence[CurvePoint], stages: Sequence[StageRecord], noise: float) -> Figure:
-    """Draw the RRMSD against the seconds since the start: a curve per stage, the values after stages, and the noise."""
+    """Draw the RRMSD against the seconds since the start: a curve per stage, the values after stages, and `noise`."""
     seconds, values = np.array([(point.seconds, point.rrmsd) for point in history], dtype=float).T
     ends = np.cumsum([0.0, *(stage.seconds for stage in stages)])
     after = np.isin(values, [stage.rrmsd for stage in stages if stage.rrmsd is not None])

@@ -25,17 +25,17 @@ Rrmsd = Annotated[float, Field(gt=0, le=1e3)]
 class GoalFigures:
     """Light on a target."""
 
-    key: str  # target, or target[0], target[1], … of several
-    where: str  # position of its receiver, in words
-    weight: Size  # weight of its squared error among all goals
-    rrmsd: Rrmsd  # RRMSD by the flux in each pixel
-    rrmsd_standard_error: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd, by independent sets of rays
-    rrmsd_tent: Rrmsd | None  # RRMSD by linear binning
+    key: str  # target; with several targets target[0], target[1] …
+    where: str  # position of the receiver, in words
+    weight: Size  # weight of the squared error on this target in the merit function
+    rrmsd: Rrmsd  # RRMSD computed from the flux in each pixel
+    rrmsd_standard_error: Annotated[float, Field(ge=0, le=1e3)]  # standard error, from independent sets of rays
+    rrmsd_tent: Rrmsd | None  # RRMSD with each ray divided among four pixels
     light_on_target: Fraction  # fraction of the source's flux on the target
     efficiency: Fraction  # flux on the target, as a fraction of the flux that leaves the back face
     leak: Fraction | None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
-    contrast: Size | None  # mean irradiance of lit pixels relative to dark pixels; None: no dark pixels, no leak
-    unit: str = "mm"  # unit of x and y on its receiver
+    contrast: Size | None  # mean irradiance of lit divided by dark pixels; None: no dark pixels, or no leak
+    unit: str = "mm"  # unit of x and y on the receiver
 
     @property
     def resolved(self) -> bool:
@@ -55,7 +55,7 @@ class GoalFigures:
 
 @dataclass(frozen=True)
 class WavefrontFigures:
-    """Wavefront behind the lens against the requested one; waves are those of `wavelength` in air."""
+    """Error of the wavefront behind the lens; 1 wave is `wavelength` in air."""
 
     z: float  # plane on which the wavefronts are compared (mm)
     wavelength: Size  # nm
@@ -63,7 +63,7 @@ class WavefrontFigures:
     pv: Size  # peak to valley over all rays (waves)
     rms_with_tilt: Size  # RMS error with only piston removed (waves)
     tilt_urad: tuple[float, float]  # removed tilt towards +x and towards +y, relative to the requested light (µrad)
-    angle_rms_urad: Size  # RMS angle between rays and requested rays, weighted by flux, with tilt (µrad)
+    angle_rms_urad: Size  # RMS angle between rays and requested rays, weighted by flux, tilt included (µrad)
     angle_max_urad: Size  # largest angle between rays and requested rays (µrad)
     floor: Size  # upper bound of the rounding error of the RMS (waves)
     flux: Fraction  # fraction of the source's flux that is measured
@@ -71,7 +71,7 @@ class WavefrontFigures:
 
     @classmethod
     def of(cls, error: WavefrontError) -> WavefrontFigures:
-        """Return the figures of a measurement; its flux, a sum over a grid, may exceed 1 by the edge of a beam."""
+        """Return the figures of a wavefront error; its flux is limited to 1, since a sum over a grid may exceed 1."""
         return cls(
             error.z, error.wavelength, error.without_tilt.rms, error.without_tilt.pv,
             rms_with_tilt=error.without_piston.rms, tilt_urad=error.tilt, angle_rms_urad=error.angle_rms,

@@ -5,7 +5,7 @@ in each knot span (optics/bspline.py), and the patch over the four corners of a 
 whose points are the knots, and perhaps points between them, is therefore exact.  In the end spans x(t) is quadratic,
 and the net is not a polynomial in x; there the grid is refined until the light moves by less than MAX_SHIFT.
 
-`Patches` is the surface that such a program interpolates.  Rays through it and through the lens give the shift.
+`Patches` is the surface that OpticStudio interpolates.  Rays through it and through the exact face give the shift.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ MIN_POINTS, MAX_POINTS = 3, 4097  # points per side of a table
 MIN_ZEMAX_POINTS = 5  # points per side: "the nx and ny values must be no smaller than 5" (OpticStudio, Grid Sag)
 MAX_SHIFT = 0.1  # largest shift of the light by a grid of default density (target pixels)
 CELLS_PER_SPAN = (1, 2, 4, 8, 16)  # grid cells per knot span, tried in this order
-MAX_FLUSH_POINTS = 1_050_000  # points up to which a grid ends at the rim; a larger one ends at the knots outside it
-SHIFT_RAYS = 192  # rays per side for the comparison of the light
-RIM_ROUNDING = 1e-9  # distance between a knot and the rim that counts as zero (pitches of the net)
+MAX_FLUSH_POINTS = 1_050_000  # largest grid that ends at the rim; larger grids end at the knots outside the rim
+SHIFT_RAYS = 192  # rays per side of the bundle that measures the shift
+RIM_ROUNDING = 1e-9  # distance between a knot and the rim that counts as zero (in pitches of the net)
 NEWTON_STEPS = 12  # steps of Newton's method to the intersection with the patches; smooth faces need 5
-MIN_DERIVATIVE = 1e-6  # lower bound of the derivative by which a step of Newton's method is divided
-HIT_TOLERANCE = 1e-9  # distance from the face at the last step below which a ray has met it (mm)
+MIN_DERIVATIVE = 1e-6  # lower bound of the derivative in a step of Newton's method
+HIT_TOLERANCE = 1e-9  # residual of the last step below which a ray hits the face (mm)
 
 Pair = tuple[np.ndarray, np.ndarray]  # x and y of the points of a grid (mm)
 
 
 @dataclass(frozen=True)
 class GridLight:
-    """Light by which the error of a grid is measured."""
+    """Light that is traced to measure the error of a grid."""
 
     source: Emitter  # point source or parallel beam of one wavelength
     screens: tuple[Screen, ...]
@@ -53,7 +53,7 @@ class GridLight:
 
 @dataclass(frozen=True)
 class Shift:
-    """Shift of the light of a lens on a target by an approximation of one of its faces."""
+    """Shift of the light on a target that an approximation of one face of the lens causes."""
 
     rms: float  # RMS shift, weighted by flux (in `unit`)
     maximum: float  # largest shift (in `unit`)
@@ -61,7 +61,7 @@ class Shift:
     unit: str  # unit of x and y on the target
 
     def __str__(self) -> str:
-        """Return both shifts in their unit and in pixels."""
+        """Return the RMS and maximum shift in `unit` and in pixels."""
         pixels = f"{number(self.rms / self.pixel)} and {number(self.maximum / self.pixel)} target pixels"
         return f"{number(self.rms)} {self.unit} RMS, {number(self.maximum)} {self.unit} at most ({pixels})"
 
@@ -82,10 +82,10 @@ class Grid:
 
 @dataclass(frozen=True)
 class Patches(Surface):
-    """z = Σ over the corners of a cell of H(s) H(t) z + …: bicubic Hermite patches between the points of a grid.
+    """z = Σ over the corners of a cell of H H z + K H Δx z_x + H K Δy z_y + K K Δx Δy z_xy: bicubic Hermite patches.
 
-    s and t run from 0 to 1 across a cell.  H0 = (1 + 2 s)(1 - s)² and H1(s) = H0(1 - s) belong to heights,
-    K0 = s (1 - s)² and K1(s) = -K0(1 - s) to slopes: z_x has the factor K H, z_y H K, z_xy K K, times the cell's sides.
+    The first factor is a function of s (along x), the second of t (along y); s and t run from 0 to 1 across a cell.
+    At s = 0, H = (1 + 2 s)(1 - s)² and K = s (1 - s)²; at s = 1, H = s² (3 - 2 s) and K = -s² (1 - s).
     """
 
     z: float  # plane from which the heights are measured (mm)
@@ -94,19 +94,19 @@ class Patches(Surface):
 
     @property
     def detail(self) -> float:
-        """Width of the smooth pieces (mm): one cell."""
+        """Width of the smooth pieces (mm): the shorter side of a cell."""
         return min(self.grid.step)
 
     @classmethod
     def through(cls, face: Surface, x: np.ndarray, y: np.ndarray) -> Patches:
-        """Return the bicubic spline through the heights of a face, as a program interpolates a table of sags."""
+        """Return the bicubic spline through the heights of a face, as other programs interpolate a table of sags."""
         heights = sag(face, x[:, None], y[None, :]) - float(face.z)
         spline = RectBivariateSpline(x, y, heights, kx=min(3, len(x) - 1), ky=min(3, len(y) - 1))
         slopes = (spline(x, y, dx=i, dy=j) for i, j in ((1, 0), (0, 1), (1, 1)))
         return cls(float(face.z), Grid(x, y, (heights, *slopes)))
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; a point outside the grid is moved to its rim."""
+        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; a point outside the grid is moved to its boundary."""
         (dx, dy), columns = self.grid.step, len(self.grid.y)
         i, along = _in_cell(x, self.grid.x, dx)
         j, across = _in_cell(y, self.grid.y, dy)
@@ -121,7 +121,7 @@ class Patches(Surface):
         return h, h_x, h_y
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
-        """Return (s in mm, hit): path along rays from (x, y) in the plane z0 to the surface, by Newton's method.
+        """Return (s in mm, hit): path length of rays from (x, y) in the plane z0 to the surface, by Newton's method.
 
         F(s) = s d_z - h(x + s d_x, y + s d_y), s ← s - F / F'.
         """
@@ -134,7 +134,7 @@ class Patches(Surface):
         return s, residual.abs() < HIT_TOLERANCE
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Return the lowest and the highest height of the points and of zero (mm)."""
+        """Return the minimum and the maximum height (mm) of the points and of the plane z0."""
         heights = self.grid.values[0]
         return min(float(heights.min()), 0.0), max(float(heights.max()), 0.0)
 
@@ -143,7 +143,7 @@ Shapes = tuple[tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]], ...]
 
 
 def _in_cell(at: Tensor, nodes: np.ndarray, step: float) -> tuple[Tensor, Shapes]:
-    """Return the cell of each point, and by [height or slope][corner] the Hermite function and its derivative in s."""
+    """Return the cell of each point, and its Hermite functions [H or K][corner], each with the derivative in s."""
     place = ((at - float(nodes[0])) / step).clamp(0.0, len(nodes) - 1.0)
     cell = place.detach().nan_to_num(0.0).floor().clamp(0, len(nodes) - 2)
     s = place - cell
@@ -160,7 +160,7 @@ def _in_cell(at: Tensor, nodes: np.ndarray, step: float) -> tuple[Tensor, Shapes
 def axes(outline: Outline, points: int, least: int = 2) -> tuple[np.ndarray, np.ndarray]:
     """Return x and y (mm) of a grid over the outline's bounding box, with nearly square cells, centred on the axis.
 
-    points: number along the wider side, both ends included.  least: smallest number along each side.
+    points: number along the wider side, both ends included.  least: smallest number of points along each side.
     """
     a, b = outline.half_extent
     spacing = 2 * max(a, b) / (points - 1)
@@ -171,8 +171,8 @@ def axes(outline: Outline, points: int, least: int = 2) -> tuple[np.ndarray, np.
 def through_knots(face: BSplineSurface, outline: Outline, parts: int) -> tuple[np.ndarray, np.ndarray] | None:
     """Return x and y (mm) of a grid through all knots near the outline's bounding box, `parts` cells per knot span.
 
-    None: no such grid is possible.  A grid with one cell per span excludes the end spans, which are one and a half
-    pitches long; the box has to lie inside it.
+    None: no such grid is possible.  A grid with one cell per span excludes the end spans, 1.5 pitches long; the
+    bounding box has to lie between them.
     """
     found = []
     for (low, _), pitch, m, half in zip((face.x, face.y), face.pitch, face.shape, outline.half_extent, strict=True):
@@ -186,7 +186,7 @@ def through_knots(face: BSplineSurface, outline: Outline, parts: int) -> tuple[n
 
 
 def _is_flush(x: np.ndarray, y: np.ndarray, outline: Outline) -> bool:
-    """Return True if a grid ends at the outline's bounding box; most nets have a knot, or half a span, at the rim."""
+    """Return True if a grid ends at the outline's bounding box; most nets have a knot or a span's centre there."""
     box = zip((x, y), outline.half_extent, strict=True)
     return all(max(abs(at[0] + half), abs(at[-1] - half)) < RIM_ROUNDING * (at[1] - at[0]) for at, half in box)
 
@@ -212,7 +212,7 @@ def on_grid(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndar
 
 @torch.no_grad()
 def shift_between(lens: Lens, other: Lens, light: GridLight) -> Shift | None:
-    """Return the shift between the light of two lenses on the target where it is largest in pixels.
+    """Return the shift between the light of two lenses on the target where the RMS is largest in pixels.
 
     None: no light reaches a target.
     """
@@ -250,7 +250,7 @@ class GridSag:
 
     @classmethod
     def of(cls, lens: Lens, face: BSplineSurface, points: int | None = None, light: GridLight | None = None) -> GridSag:
-        """Return a grid with this number of points along the wider side of the outline, or by default at the knots."""
+        """Return a grid with `points` along the wider side; None: at the knots, refined until the shift is small."""
         if points is not None:
             return cls._at(lens, face, axes(lens.outline, max(points, MIN_ZEMAX_POINTS), MIN_ZEMAX_POINTS), light)
         grids = [at for parts in CELLS_PER_SPAN if (at := through_knots(face, lens.outline, parts)) is not None]
@@ -276,7 +276,7 @@ class GridSag:
         """Return the text of the file (.DAT).
 
         Header: nx ny, spacings in x and y, unit (0: mm), decentre in x and y.  Then one line per point, from (-x, +y)
-        along +x and downwards: sag above the vertex, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y, all exact, and 0 (there is data).
+        along +x and downwards: sag above the vertex, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y, all exact, and 0 (the point is valid).
         """
         (x, y), (dx, dy) = (self.grid.x, self.grid.y), self.grid.step
         vertex = float(sag(self.face, 0.0, 0.0)) - self.face.z
@@ -289,7 +289,7 @@ class GridSag:
         return text.getvalue()
 
     def note(self, name: str) -> str:
-        """Return a sentence on the file of this name."""
+        """Return a sentence on the points of the file `name` and on the shift of the light."""
         (dx, dy), grid = self.grid.step, self.grid
         size = f"{name}: {len(grid.x)} x {len(grid.y)} points, spacing {dx:.6g} x {dy:.6g} mm"
         if self.shift is None:

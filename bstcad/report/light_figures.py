@@ -1,8 +1,8 @@
 """Figures of the light on the target, as seen from the side that the scene states.
 
 Seen from the lens, along +z with y up, x grows to the left.  Grey tones are those of an eye or a camera (sRGB), and the
-scales of irradiance are linear.  Pictures are (rows, columns) with the target's sum, "in coordinates": row 0 at
-y max, column 0 at x min.
+scales of irradiance are linear.  Pictures have the shape (rows, columns) and the sum of the target.  "In coordinates"
+means row 0 at y max and column 0 at x min.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from bstcad.measured.made_part import MadePart
     from bstcad.scene.scene import Scene
 
-Extent = tuple[float, float]  # (min, max) in mm
+Extent = tuple[float, float]  # (min, max) in the receiver's unit
 
 SEEN = {  # (target.seen_from, True if the light travels along -z after an odd number of fold mirrors): sentence
     ("lens", False): "Seen from the {optic}, looking along +z: x grows to the left",
@@ -52,7 +52,7 @@ SEEN = {  # (target.seen_from, True if the light travels along -z after an odd n
     ("behind", True): "Seen from the fold mirror, looking along -z: x grows to the right",
 }
 LIT = 0.01  # fraction of the target's maximum above which a pixel is lit
-HEADROOM = 1.06  # end of the grey scale relative to the brightest value, so that even light differs from white paper
+HEADROOM = 1.06  # end of the grey scale relative to the brightest value, so that uniform light differs from white paper
 MAX_GLARE = 2.0  # multiple of the target's maximum up to which the scale includes a hot spot
 GLARE_PERCENTILE = 99.9  # percentile of the irradiance at the end of the scale if a hot spot exceeds MAX_GLARE
 MIN_SCALE = 0.1  # smallest end of a scale of differences, as a fraction of the largest difference
@@ -61,12 +61,12 @@ MARK_LENGTH = 0.045  # length of the marks of a cut, as a fraction of the pictur
 CUTS = {"centre": BLUE, "brightest point": VERMILION}  # position of a cut: colour
 PERCENT_LIT = "% of mean of lit pixels"  # label of a scale of differences
 COLUMNS = 4  # pictures of spectral lines per row
-PANEL_WIDTH, MAX_PANEL_HEIGHT = 2.4, 4.8  # size of such a picture (inches)
-MANY_OUTLIERS = 300  # number of outliers from which their dots are small
+PANEL_WIDTH, MAX_PANEL_HEIGHT = 2.4, 4.8  # size of the picture of a spectral line (inches)
+MANY_OUTLIERS = 300  # number of outliers from which on their dots are small
 FORM_UNITS = ((1e-3, 1e3, "µm"), (0.0, 1e6, "nm"))  # (smallest size in mm, factor, unit as written)
 BINS = 60  # bins of the histogram of trials
 MAX_WORST_TRIALS = 3  # number of the worst trials that are drawn
-# The 1931 standard observer as sums of Gaussians with two widths: weight, centre, width below and above it (nm).
+# CIE 1931 standard observer, sums of Gaussians with two widths: weight, centre, width below and above the centre (nm).
 # Wyman, Sloan and Shirley, Journal of Computer Graphics Techniques 2(2), 2013, multi-lobe fit.
 LOBES = (
     ((1.056, 599.8, 37.9, 31.0), (0.362, 442.0, 16.0, 26.7), (-0.065, 501.1, 20.4, 26.2)),
@@ -119,7 +119,7 @@ class View:
 
     @property
     def proportion(self) -> float:
-        """Height over width of the target, limited to the range that suits a row of pictures."""
+        """Height of the target divided by its width, limited to 0.55 to 1.6 for a row of pictures."""
         return min(max((self.y[1] - self.y[0]) / (self.x[1] - self.x[0]), 0.55), 1.6)
 
     def picture(self, values: np.ndarray) -> np.ndarray:
@@ -127,11 +127,11 @@ class View:
         return values[:, ::-1] if self.seen_from == "lens" else values
 
     def tones(self, light: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """Return the flux in each pixel as grey tones, in coordinates, on a scale for the picture `wanted`."""
+        """Return the grey tones (uint8) of the flux in each pixel, on the scale of the picture `wanted`."""
         return tones(self.irradiance(light), self.irradiance(wanted))
 
     def irradiance(self, flux: np.ndarray) -> np.ndarray:
-        """Return the irradiance of the flux in each pixel, in units of the mean pixel's area."""
+        """Return the flux in each pixel divided by the pixel's area, relative to the mean area."""
         areas = self.receiver.areas(self.x, self.y, flux.shape)
         return flux if areas is None else flux / areas
 
@@ -147,7 +147,7 @@ def lit_mean(target: np.ndarray) -> float:
 
 
 def rrmsd(target: np.ndarray, irradiance: np.ndarray) -> float:
-    """sqrt(Σ (E_s - E)² / Σ E²), the merit function of stage 2; Wang et al. 2023."""
+    """Return sqrt(Σ (E_s - E)² / Σ E²), E_s simulated, E target: the merit function of stage 2; Wang et al. 2023."""
     return float(np.sqrt(np.sum((irradiance - target) ** 2) / np.sum(target**2)))
 
 
@@ -197,7 +197,7 @@ def _signed(axes: Axes, values: np.ndarray, view: View, *, most: float, title: s
 def _side_by_side(
     pictures: Mapping[str, np.ndarray], difference: str, view: View, *, height: float, spot: float = MIN_SCALE
 ) -> tuple[Figure, np.ndarray]:
-    """Return a figure and its axes: pictures by title on one grey scale, and the last minus the one before it.
+    """Return a figure and its axes: `pictures`, by title, on one grey scale, and the difference of the last two.
 
     The first picture is the target.  height: height of the figure (inches).  spot: see `_largest`.
     """
@@ -216,7 +216,7 @@ def _side_by_side(
 
 
 def _largest(values: np.ndarray, spot: float = MIN_SCALE) -> float:
-    """Return the end of a scale of differences: their 99.5th percentile, at least `spot` times the largest."""
+    """Return the end of a scale of differences: their 99.5th percentile, at least `spot` times the maximum."""
     size = np.abs(values)
     return round_up(max(float(np.percentile(size, 99.5)), spot * float(size.max())))
 
@@ -323,7 +323,7 @@ def reach_picture(target: np.ndarray, reachable: np.ndarray, view: View) -> Figu
 def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
     """Draw the light that is reflected twice inside the lens, in percent of the mean of the lit pixels.
 
-    ghost: (rows, columns) in coordinates, normalised as the irradiance that has the target's sum.
+    ghost: (rows, columns) in coordinates, multiplied by the factor that gives the irradiance the sum of the target.
     """
     share = 100.0 * view.irradiance(ghost) / lit_mean(view.irradiance(target))
     figure = new_figure(5.6, 4.6, layout="compressed")
@@ -368,7 +368,7 @@ def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Fig
 def spectral_lines(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[SpectralLine], view: View) -> Figure:
     """Draw the picture of all spectral lines in colour, then the picture of each line alone.
 
-    target, irradiance by all lines, and pictures: (rows, columns) in coordinates, with equal sums.
+    target, irradiance of all lines, picture of each line: (rows, columns) in coordinates, with equal sums.
     """
     even = view.irradiance(target)
     unit = lit_mean(even)
@@ -397,7 +397,7 @@ def spectral_lines(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[S
 
 
 def primary(wavelength: float) -> np.ndarray:
-    """Return linear sRGB (3,) of one wavelength (nm), with negative components set to zero."""
+    """Return linear sRGB (3,) of light of one wavelength (nm), with negative components set to zero."""
     xyz = [
         sum(
             weight * np.exp(-0.5 * ((wavelength - centre) / (below if wavelength < centre else above)) ** 2)
@@ -425,13 +425,13 @@ def balanced(pictures: Sequence[np.ndarray], wavelengths: Sequence[float], share
 
 
 def draw_judges(judges: Sequence[Comparison], view: View) -> dict[str, bytes]:
-    """Return the pictures by other programs, without those that declined, as PNG bytes by name."""
+    """Return a figure for each other program that did not decline, as PNG bytes by name."""
     return {each.judge.figure: png(judged_picture(each, view)) for each in judges if not each.judge.declined}
 
 
 @styled
 def judged_picture(compared: Comparison, view: View) -> Figure:
-    """Draw target, bstcad's picture, the other program's and the difference, in % of the mean of the lit pixels."""
+    """Draw the target, bstcad's picture, the other program's picture, and the difference of the two pictures."""
     name = compared.judge.name
     pictures = {"Target": compared.target} | {
         f"By {by} (RRMSD {rrmsd(compared.target, picture):.3g})": picture
@@ -488,7 +488,7 @@ def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
 def histogram(design: float, limit: float, linear: np.ndarray, full: np.ndarray, adjusted: np.ndarray) -> Figure:
     """Draw histograms of the RRMSD of trials, in percent of the trials of each kind.
 
-    linear: trials by superposed pictures; full: trials by full traces; adjusted: these with the screen adjusted.
+    linear: by superposed pictures; full: by full traces; adjusted: by superposed pictures, with the screen adjusted.
     """
     figure = new_figure(7.6, 3.1)
     axes = figure.subplots()
@@ -497,7 +497,7 @@ def histogram(design: float, limit: float, linear: np.ndarray, full: np.ndarray,
     low, high = min(low, limit), max(high, limit) if limit < 2 * high else high
     room = 0.03 * (high - low)
     bins = np.linspace(low - room, high + room, BINS + 1)
-    wide_bins = bins[:: BINS // 20]  # for fewer trials
+    wide_bins = bins[:: BINS // 20]  # for the kinds with fewer trials
     for values, edges, style in (
         (linear, bins, {"fill": True, "color": BLUE, "alpha": 0.55, "label": f"{len(linear)} trials"}),
         (full, wide_bins, {"color": VERMILION, "linewidth": 2.6, "label": f"{len(full)} by full traces"}),
@@ -516,7 +516,7 @@ def histogram(design: float, limit: float, linear: np.ndarray, full: np.ndarray,
 def worst_trials(
     design: float, nominal: np.ndarray, worst: Sequence[tuple[int, float, np.ndarray]], view: View, of: str = ""
 ) -> Figure:
-    """Draw the light as designed, the light of the worst trials, and below each trial the difference.
+    """Draw the light as designed, the light of the worst trials, and below each trial its difference from the design.
 
     worst: (number, RRMSD, picture) of each trial; picture (rows, columns) in coordinates, with the target's sum.
     of: suffix such as ", target[0]" if there are several targets.

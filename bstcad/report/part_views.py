@@ -1,8 +1,8 @@
 """Drawing of a part on its data sheet, in mm of paper: a plan from the side of the back, and two sections.
 
 All views have one scale of the standard series (ISO 5455), in first-angle projection (ISO 128-30).  The plan, which is
-the view from the right, along -z, is left of the section that is seen along +x.  Inside the rim it is a map of heights;
-flange and holes are around it.  Lines, arrows and dimensions follow ISO 128 and ISO 129-1, in black, so that a copy of
+the view from the right, along -z, is left of the section that is seen along +x.  Inside the rim it is a contour map;
+flange and holes surround it.  Lines, arrows and dimensions follow ISO 128 and ISO 129-1, in black, so that a copy of
 a copy is legible.  They are drawn with matplotlib.  The drawing add-on of ezdxf 1.4.5 renders DIMENSION entities on
 such a page, but it fills the hole of "Ø" and converts text to curves, so that a reader cannot search the page or copy
 the SHA-256 from it.
@@ -42,15 +42,15 @@ TAIL = 4.5  # length of a dimension line outside the measured length (mm)
 LETTERS, NOTES, NUMBERS = 2.5, 2.1, 1.9  # font sizes of dimensions, of leaders and notes, of numbers on contours (mm)
 CHAIN = (0, (14, 2.5, 2, 2.5))  # dashes and gaps of a centre line, in line widths
 FAMILY = STYLE["font.family"]
-MIN_FONT_SCALE = 0.8  # smallest scale of a text that has little room; a longer text is cut
+MIN_FONT_SCALE = 0.8  # smallest factor on the size of a text that is too wide; it is then cut
 UNKNOWN = "\u25a1"  # box for a character that the font lacks
 CONTOUR_POINTS, SECTION_POINTS = 241, 401  # points of the map of heights per axis, and of each face of a section
 MAX_CONTOURS = 18  # largest number of contour lines
 NOTE_CORNERS = ((1, 1), (-1, -1), (1, -1))  # corners of the plan (right, up) for the notes on kinds of holes
 EQUAL_DIMENSIONS = 5e-4  # difference below which two dimensions print the same number (mm)
 AXIS_LENGTH = 7.0  # length of the arrows of the coordinate frame (mm)
-# Margins on paper (mm): left of the plan, between it and the first section, between the sections, right of the last;
-# above all views, and below them.
+# Margins on paper (mm): left of the plan, between plan and first section, between the sections, right of the second;
+# above and below all views.
 SIDE_MARGINS, TOP_MARGIN, BOTTOM_MARGIN = (17.0, 26.0, 21.0, 9.0), 17.0, 22.0
 RIGHT, UP, DOWN = np.array([1.0, 0.0]), np.array([0.0, 1.0]), np.array([0.0, -1.0])
 
@@ -68,7 +68,7 @@ class Paper:
 
     @classmethod
     def of(cls, figure: Figure) -> Paper:
-        """Return the whole figure as paper."""
+        """Return a sheet of the size of the figure."""
         width, height = figure.get_size_inches() * 25.4
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()
@@ -91,7 +91,7 @@ class Paper:
     def text(
         self, x: float, y: float, text: str, size: float = LETTERS, *, room: float | None = None, **style: Any
     ) -> None:
-        """Write text with an em of `size` mm; if it is wider than `room` (mm), it is made smaller, then cut."""
+        """Write text with an em of `size` mm; if it is wider than `room` (mm), it is scaled down, then cut."""
         text = drawable(text)
         if room is not None:
             text, size = fitted(text, size, room, style.get("weight") == "bold")
@@ -105,9 +105,9 @@ class Paper:
     def dimension(
         self, ends: tuple[float, float], level: float, feet: tuple[float, float], text: str, upright: bool = False
     ) -> None:
-        """Draw a dimension along x between two ends, its line at y = level.
+        """Draw a dimension along x between two ends, with the dimension line at y = level.
 
-        upright: along y, its line at x = level, read from the right.  feet: y (upright: x) of the part at the ends.
+        upright: along y, with the line at x = level, read from the right.  feet: y (upright: x) of the measured points.
         """
 
         def at(along: float, beside: float) -> Point:
@@ -148,7 +148,7 @@ class Paper:
 
 
 def drawable(text: str) -> str:
-    """Return the text with a box for each character that the font lacks; every machine has this font."""
+    """Return the text with a box for each character that the font lacks; matplotlib contains this font."""
     return "".join(c if ord(c) in _letters() else UNKNOWN for c in text)
 
 
@@ -205,7 +205,7 @@ def closed(outline: Outline) -> np.ndarray:
 class CrossSection:
     """Cross-section of a part: polygons (z, u) in mm, u along the cut, in the frame of the part's file.
 
-    The cut meets each wall at right angles, so that its draft lies in the plane of the cut.
+    The cut meets each wall at right angles, so that the section shows the draft in true size.
     """
 
     bodies: tuple[np.ndarray, ...]  # polygons (n, 2), with the first point again at the end
@@ -222,9 +222,9 @@ class CrossSection:
 
 
 def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> CrossSection:
-    """Return the section of a lens in its mount; upright: along y at x = 0, else along x at y = 0.
+    """Return the section of a lens in its mount; upright: cut along y at x = 0, else along x at y = 0.
 
-    Lens and mount have to fit.  origin: z of the file's origin in the frame of the scene (mm).
+    Lens and mount have to fit each other.  origin: z of the file's origin in the frame of the scene (mm).
     """
 
     def height(surface: Surface, u: np.ndarray) -> np.ndarray:
@@ -258,7 +258,7 @@ def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> Cro
 def _flange(
     flange: Flange, half: float, upright: bool, low: float
 ) -> tuple[list[shapely.Polygon], shapely.Geometry, list[np.ndarray]]:
-    """Return the sections of the flange on both sides of the rim, its holes, and the edges of its planes."""
+    """Return (in z, u) the flange's section on each side of the rim, its holes, and the edges of its planes."""
     high, lean, b = low + flange.thickness, math.tan(math.radians(flange.draft)), flange.bevel
     reach = flange.outline.outline.half_extent[upright]
     foot, head = reach - lean * b, reach - lean * (flange.thickness - b)  # ends of the wall with draft
@@ -296,7 +296,7 @@ def _depth(front: Callable[[float], float], z: float, u: float, lean: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Part that is drawn, in the frame of its file; mm."""
+    """Part to draw, in the frame of its STEP file (mm)."""
 
     lens: Lens  # lens inside the rim
     mount: Mount  # Mount() for a bare lens
@@ -419,7 +419,7 @@ def _plan(paper: Paper, views: Views, at: PaperFrame) -> None:
 
 
 def _draw_flange(paper: Paper, views: Views, flange: Flange, at: PaperFrame) -> None:
-    """Draw flange and holes around the lens, with notes on rim and holes."""
+    """Draw the flange and its holes around the lens, with notes on the sizes of rim and holes."""
     outer = views.outermost
     over, under = (at.y + sense * (at.scale * outer.half_extent[1] + 6.2) for sense in (1, -1))  # y of notes
     paper.line(at(closed(outer)), THICK, zorder=5)
@@ -445,7 +445,7 @@ def _draw_flange(paper: Paper, views: Views, flange: Flange, at: PaperFrame) -> 
 
 
 def kinds_of_holes(mount: Mount) -> Iterator[tuple[str, list[tuple[float, float, float]]]]:
-    """Yield each kind of holes through the flange: its note, and x, y and diameter (mm) of its holes."""
+    """Yield for each kind of hole through the flange its note, and x, y and diameter (mm) of each hole."""
     flange = mount.flange
     if flange is not None and (screws := flange.screws) is not None:
         yield f"{screws.count} \u00d7 \u00d8{mm(screws.diameter)} on \u00d8{mm(screws.circle)}", list(screws.holes())
@@ -456,7 +456,7 @@ def kinds_of_holes(mount: Mount) -> Iterator[tuple[str, list[tuple[float, float,
 
 
 def _contours(paper: Paper, views: Views, at: PaperFrame) -> str:
-    """Draw contours of z; return their step in words, "" if there are none."""
+    """Draw contours of z; return the step between them in words, "" if the back is flat."""
     x, y = (np.linspace(-end, end, CONTOUR_POINTS) for end in views.rim.half_extent)
     grid_x, grid_y = np.meshgrid(x, y)
     z = sag(views.lens.back, grid_x, grid_y) - views.origin
@@ -484,12 +484,12 @@ def _contours(paper: Paper, views: Views, at: PaperFrame) -> str:
 
 
 def _section(paper: Paper, views: Views, which: int, scale: float, *, left: float, middle: float) -> None:
-    """Draw a section, z to the right, its lowest z at `left`; which: 0 for x = 0 with y up, 1 for y = 0 with x up."""
+    """Draw a section, z to the right from `left` on; which: 0 for x = 0 with y up, 1 for y = 0 with x up."""
     cut, half = views.cuts[which], [scale * half for half in views.outermost.half_extent]
     (lowest, highest), _ = cut.ends
     at, right = PaperFrame(scale, left - scale * lowest, middle), left + scale * (highest - lowest)
     reach, sense = half[1 - which], views.lens.passes.sense
-    for body in cut.bodies:  # cut material: a tone, and thin lines at 45 degrees (ISO 128-50)
+    for body in cut.bodies:  # cut material: tinted, with thin lines at 45 degrees (ISO 128-50)
         paper.area(at(body), facecolor=GLASS, hatch="//", edgecolor=GREY, zorder=0.5)
         paper.line(at(np.concatenate([body, body[1:2]])), THICK, zorder=5)
     for edge in cut.behind:
@@ -519,7 +519,7 @@ def _section(paper: Paper, views: Views, which: int, scale: float, *, left: floa
 def _thicknesses(
     views: Views, which: int, at: PaperFrame, reach: float
 ) -> Iterator[tuple[tuple[float, float], float, tuple[float, float]]]:
-    """Yield dimensions along z of edge or flange and of the whole part: z (mm), level and feet on paper."""
+    """Yield (ends z, level, feet) of the dimensions along z of edge or flange and of the part; see Paper.dimension."""
     cut, flange, (front, back) = views.cuts[which], views.mount.flange, views.vertices
     middle, top, foot = at.y, at.y + reach, at.y - reach
     if flange is None:
@@ -538,7 +538,7 @@ def _thicknesses(
 
 
 def _walls(paper: Paper, views: Views, at: PaperFrame, reach: float) -> None:
-    """Write draft and bevel of the lens's walls beside the lower end of the cut, and those of the flange below it."""
+    """Write draft and bevel of the lens's walls beside the cut's lower end, and of the flange's walls below the cut."""
     mount, cut, flange = views.mount, views.cuts[1], views.mount.flange
     if words := wall_words(mount):
         tip = at((cut.front[0], cut.front_ends[0]))
@@ -549,7 +549,7 @@ def _walls(paper: Paper, views: Views, at: PaperFrame, reach: float) -> None:
 
 
 def wall_words(walls: Mount | Flange) -> str:
-    """Return draft and bevel in the words of a drawing, "" without both."""
+    """Return draft and bevel in the words of a drawing, "" if both are 0."""
     draft, bevel = f"draft {walls.draft:g}\u00b0", f"{walls.bevel:g} \u00d7 45\u00b0"
     return ", ".join([draft] * bool(walls.draft) + [bevel] * bool(walls.bevel))
 

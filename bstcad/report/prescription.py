@@ -1,7 +1,7 @@
 """Numbers of a lens and its part: the prescription, the order for a shop, and the facts of a STEP file alone.
 
-The prescription states every surface as it was designed, with source and target, with all digits.  These may differ
-from the numbers of the scene, whose radius may be free and whose back may be moved:
+The prescription states every surface as it was designed, with source and target, with all digits.  It may differ
+from the scene, since tailoring may change a free radius and move the back.
 
     lens:    front at its vertex, glass, back at its vertex (intersections with the axis)
     signs:   light travels along +z; a radius is positive if the centre of curvature is on the +z side of the vertex
@@ -49,22 +49,22 @@ Lengths in mm, angles in degrees, wavelengths in nm.  The axis is x = y = 0.
 A radius is positive if the centre of curvature lies on the +z side of the vertex.
 {exact}
 """
-EXACT_FACES = (  # sentences for one tailored face and for two
+EXACT_FACES = (  # sentence on a freeform back, and on two freeform faces
     "The freeform back is exact in lens.step, and its control points are in design.npz.",
     "Both freeform faces are exact in lens.step, and their control points are in design.npz.",
 )
 SHEET, PART, LENS = "datasheet.pdf", "part.step", "lens.step"
 DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # mount.datum: plane z = 0
-EDGE_TOLERANCE = 1e-3  # fraction of an outline's area outside an edge below which the edge equals the outline
+EDGE_TOLERANCE = 1e-3  # largest fraction of an outline's area beyond an edge that counts as none
 
 Point = tuple[float, float, float]
 Measures = tuple[Point, Point, float | None]  # smallest and largest x, y, z (mm); volume (mm³), None: unknown
 
 
 def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the prescription of a lens for a scene; shape: facts by analysis.shape.describe, and the volume."""
+    """Return the prescription of a lens for a scene; shape: facts of analysis.shape.describe, and the volume."""
     front, material = lens.front, scene.lens.material
-    own = scene.lens.front.with_parameters(front).surface.plain().parameters()  # heights, if it is a net
+    own = scene.lens.front.with_parameters(front).surface.plain().parameters()  # control points, if the front is a net
     numbers = ({"curvature": 0.0} if front.level else {}) | {n: v for n, v in own.items() if isinstance(v, float)}
     fitted = {"within": FIT_TOLERANCE} if front.is_net and scene.lens.front.kind != "bspline" else {}  # mm
     rho = density(material) if material else None
@@ -74,7 +74,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "name": scene.name,
         "title": scene.title,
         "wavelength": scene.source.main_wavelength,  # main line of a spectrum
-        "material": material,  # None: only the index is known, or it is a mirror
+        "material": material,  # None: only the index is known, or the optic is a mirror
         "index": lens.index,
         "outline": asdict(lens.outline),
         "clear": lens.clear and tuple(map(asdict, lens.clear)),  # clear apertures of front and back; None: no mount
@@ -111,9 +111,9 @@ def _knots(shape: tuple[int, int]) -> str:
 
 
 def _face(kind: str, z: float, numbers: Mapping[str, float]) -> dict[str, Any]:
-    """Return a surface with its vertex at z; curvature, radius and conic constant are None if it has none.
+    """Return the entries of a surface with its vertex at z; missing curvature, radius and conic constant are None.
 
-    numbers: parameters of its shape.  Each curvature adds its radius, such as radius_x for curvature_x; None: a plane.
+    numbers: shape parameters.  Each curvature adds a radius, such as radius_x for curvature_x, None if it is 0.
     """
     curvatures = {name: value for name, value in numbers.items() if name.startswith("curvature")}
     radii = {name.replace("curvature", "radius"): 1 / c if c else None for name, c in curvatures.items()}
@@ -122,7 +122,7 @@ def _face(kind: str, z: float, numbers: Mapping[str, float]) -> dict[str, Any]:
 
 
 def _own_outline(front: Surface) -> dict[str, Any]:
-    """Return the outline of a front that has its own, and z of the plane around it."""
+    """Return the outline of a front that has one, and z of the plane around it; else nothing."""
     return {} if front.outline is None else {"outline": asdict(front.outline), "around": front.around.z}
 
 
@@ -145,13 +145,13 @@ def scene_text(scene: Scene, lens: Lens) -> str:
 
 
 def _passes(record: Mapping[str, Any]) -> passes.Passes:
-    """Return the passes of light; a mirror that light does not enter has the index 1."""
+    """Return the kind of the optic; a mirror that light does not enter has the index 1."""
     mirror = passes.MIRROR if record["index"] == 1 else passes.SECOND_SURFACE
     return mirror if record["reflects"] else passes.LENS
 
 
 def sections(record: Mapping[str, Any]) -> dict[str, Rows]:
-    """Return the rows of a prescription by their headings; numbers with all digits."""
+    """Return the rows of a prescription by heading, with all digits."""
     return tables("prescription.txt.j2", lens=record, passes=_passes(record))
 
 
@@ -172,7 +172,7 @@ def text(record: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Order:
-    """File for a shop and its facts; lengths in mm, coordinates of the file; None: not stated, or unknown."""
+    """File for a shop and its facts, in mm and in the frame of the file; None: not stated, or unknown."""
 
     file: str  # name of the file with the geometry: part.step for a scene with a mount, else lens.step
     sha256: str  # SHA-256 of that file, hexadecimal
@@ -188,7 +188,7 @@ class Order:
     tool_radius: float | None  # smallest concave radius of the optical faces; None: no concave face
     back_profile: float | None  # profile tolerance of the back (ISO 1101)
     front_profile: float | None  # profile tolerance of the front (ISO 1101)
-    thickness_tolerance: float | None  # tolerance ± of the centre thickness
+    thickness_tolerance: float | None  # tolerance of the centre thickness (±)
     roughness: float | None  # largest Ra of the optical faces (nm)
     coating: str | None  # coating of the optical faces
     unbuilt: bool  # True if the scene has a mount, but part.step could not be built
@@ -248,11 +248,11 @@ def order_rows(order: Order) -> Rows:
 def part(
     lens: Lens, whole: WholePart | None = None, stated: float | None = None, placement: Mapping[str, Any] | None = None
 ) -> dict[str, str]:
-    """Return the facts of a part in a STEP file, in the order of the set-up of a machine; no design is needed.
+    """Return the facts of a part in a STEP file, in the order in which a machine is set up; no design is needed.
 
-    whole: walls around the lens; then the lens's outline only encloses the edge of its back.  None: a bare lens.
-    stated: density (g/cm³) in the file; None: the file states none, or several.
-    placement: placement of the lens in the file, in words; None: the frame of the lens is that of the file.
+    whole: part around the lens, whose outline then only encloses the edge of the back; None: a bare lens.
+    stated: density (g/cm³) in the file; None: the file states no density, or several.
+    placement: placement of the lens in the file, in words; None: lens and file have the same frame.
     """
     import shapely  # takes 0.05 s, which a design does not need
 

@@ -2,8 +2,8 @@
 
 The record is assembled from a design, its verification and its diagnosis, with remarks.
 
-Records are built from computed values without validation; only `read` validates, by type and range.  An unknown or
-missing key, a string instead of a number or a number out of range refuse the whole file, with one sentence.
+Records are built from computed values without validation; only `read` validates, by type and range.  A file with an
+unknown or missing key, a string instead of a number or a number out of range is refused in one sentence.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ from bstcad.verify.verdict import NO_LIMIT, Check, verdict
 if TYPE_CHECKING:
     from bstcad.optics.emitters import Emitter
 
-BY_HAND = "by hand"  # DesignCourse.stopped of a lens that was changed after it was designed, or comes from elsewhere
-MAX_REPORT_BYTES = 20_000_000  # size limit of a report that is read; ten thousand evaluations reach it
+BY_HAND = "by hand"  # DesignCourse.stopped of a lens that was changed after its design, or designed elsewhere
+MAX_REPORT_BYTES = 20_000_000  # size limit of a report (bytes): room for 300 000 points of the curve
 MAX_STRING_LENGTH = 1000  # characters of a string in a report that is read
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 LEFT_OUT = {  # LeftOut.kind: name of the effect in the report
@@ -61,11 +61,11 @@ LEFT_OUT = {  # LeftOut.kind: name of the effect in the report
     "stray light": "stray light",
     "diffraction": "diffraction",
 }
-NEGLIGIBLE_CHANGE = 1e-4  # change of the flux (fraction of 1) or of the RRMSD below which the report shows NEGLIGIBLE
-NEGLIGIBLE_BLUR = 5e-3  # blur in pixels below which the report shows NEGLIGIBLE
+NEGLIGIBLE_CHANGE = 1e-4  # change of the flux (as a fraction) or of the RRMSD that the report shows as NEGLIGIBLE
+NEGLIGIBLE_BLUR = 5e-3  # blur (pixels) that the report shows as NEGLIGIBLE
 NEGLIGIBLE, UNKNOWN_CHANGE = "≈ 0", "unknown"  # words for a negligible and for an unknown change
 
-# Keys of a report whose values are those of its worst goal, and their names in GoalFigures.
+# Key of a report that repeats a figure of the worst goal: name of this figure in GoalFigures.
 WORST_GOAL_KEYS = {key: key for key in ("rrmsd", "rrmsd_tent", "light_on_target", "efficiency", "leak", "contrast")}
 WORST_GOAL_KEYS["rrmsd_noise"] = "rrmsd_standard_error"
 
@@ -89,7 +89,7 @@ class CurvePoint:
     """One point of the convergence curve."""
 
     seconds: Seconds  # time since the start
-    rrmsd: Rrmsd  # RRMSD computed with the tubes of the stage
+    rrmsd: Rrmsd  # RRMSD computed with the flux tubes of the stage
 
 
 class PrecisionTest(TypedDict):
@@ -101,12 +101,12 @@ class PrecisionTest(TypedDict):
     evaluations: int  # evaluations in each precision
     rrmsd_float64: Rrmsd  # RRMSD after the evaluations in float64
     rrmsd_float32: Rrmsd  # RRMSD after the evaluations in float32
-    heights: Size  # largest difference of a control point after them (mm)
+    heights: Size  # largest difference of a control point after the evaluations (mm)
 
 
 @dataclass(frozen=True)
 class LineFigures:
-    """The light of one spectral line alone."""
+    """Figures of the light of one spectral line alone."""
 
     wavelength: Size  # nm
     share: Fraction  # fraction of all light
@@ -122,14 +122,14 @@ class DesignCourse:
     history: tuple[CurvePoint, ...] = ()
     machine: Mapping[str, Scalar] | None = None
     versions: Mapping[str, str] | None = None  # versions of the libraries
-    # grid, iterations, mass error, reason to stop; fraction of light and largest slope (degrees) of analysis.steepness
+    # record of the transport solver: grid, iterations, mass error, reason to stop; steepness (analysis.steepness)
     transport: Mapping[str, Scalar] | None = None
     skipped_steps: int | None = None  # number of steps skipped because their gradient was not finite
     stopped: str | None = None  # reason why tailoring ended
-    twins: PrecisionTest | None = None
+    twins: PrecisionTest | None = None  # float32 against float64
 
     def with_stages(self, *last: StageRecord) -> DesignCourse:
-        """Return this record with these stages at the end, which replace earlier stages of the same names."""
+        """Return this record with `last` after its other stages; earlier stages of these names are removed."""
         names = [stage.name for stage in last]
         again = sum(stage.seconds for stage in self.stages if stage.name in names)
         seconds = self.seconds_total - again + sum(stage.seconds for stage in last)
@@ -142,12 +142,12 @@ class LeftOut:
     """An effect that is not simulated, and its estimated change (analysis.neglected_effects.Change); None: unknown."""
 
     kind: str  # key of LEFT_OUT
-    flux_change: float | None  # change of the flux on the target, fraction of 1
+    flux_change: float | None  # change of the flux on the target, as a fraction
     rrmsd_change: float | None  # RRMSD of a lens that would be perfect without the effect
     blur_pixels: float | None  # full width of the blur on the target (pixels)
     detail: str = ""  # assumption of the estimate, or reason why nothing is known
     simulate_by: str = ""  # line of a scene file that simulates the effect; empty: bstcad cannot simulate it
-    assumed: bool = False  # True if the size is an example that neither the scene nor nature states
+    assumed: bool = False  # True if `detail` is an assumed example, not a known fact
 
 
 @dataclass(frozen=True)
@@ -158,13 +158,13 @@ class Contents:
 
     name: str  # name of the design and of its folder
     title: str  # title of the scene
-    # verdict by `passed` and `given_up`; "no limit was asked": all checks passed, no limit on the light in the scene
+    # verdict, from `passed` and `given_up`; "no limit was asked": all checks passed, no limit on the light in the scene
     verdict: Literal["passed", "passed with remarks", "no limit was asked", "failed"]
     passed: bool  # True if every check passed
     # figures of the light on each target; figures outside this list are for the target with the largest RRMSD
     goals: Annotated[tuple[GoalFigures, ...], Field(min_length=1, max_length=100), FailFast()]
-    rrmsd: Rrmsd  # RRMSD of the irradiance against the target, by the flux in each pixel
-    rrmsd_tent: Rrmsd | None  # RRMSD by linear binning
+    rrmsd: Rrmsd  # RRMSD of the irradiance against the target, from the flux in each pixel
+    rrmsd_tent: Rrmsd | None  # RRMSD with each ray divided among four pixels
     rrmsd_noise: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd
     light_on_target: Fraction  # fraction of the source's flux on the target
     efficiency: Fraction  # flux on the target relative to the flux that leaves the back face
@@ -179,22 +179,22 @@ class Contents:
     versions: Mapping[str, str]  # versions of the libraries, by name
     seed: int  # seed of every random choice
     version: str | None = None  # version of bstcad that wrote the report
-    rrmsd_whole: Rrmsd | None = None  # RRMSD against the whole picture if light reaches only a part; None: all of it
+    rrmsd_whole: Rrmsd | None = None  # RRMSD against the whole picture; None: light reaches all of it
     # unreachable part of the target: area (fraction of the target), light (fraction of the picture), angle (degrees;
     # largest deflection by a face of the index; None: a mirror); None: light reaches all of it
     unreachable: Mapping[str, Size | None] | None = None
     leak: Fraction | None = None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
-    contrast: Size | None = None  # mean irradiance of lit relative to dark pixels; None: no dark pixels, no leak
+    contrast: Size | None = None  # mean irradiance of lit divided by dark pixels; None: no dark pixels, or no leak
     optic: Literal["lens", "mirror"] = "lens"  # kind of the design
     quality: str | None = None  # tailoring.quality of the scene
-    # grid, iterations, mass error, reason to stop; fraction of light and largest slope (degrees) of analysis.steepness
+    # record of the transport solver: grid, iterations, mass error, reason to stop; steepness (analysis.steepness)
     transport: Mapping[str, Scalar] | None = None
-    skipped_steps: Annotated[int, Field(ge=0)] | None = None  # number of steps with a gradient that is not finite
+    skipped_steps: Annotated[int, Field(ge=0)] | None = None  # steps skipped: gradient not finite
     stopped: str | None = None  # reason why tailoring ended
     twins: PrecisionTest | None = None  # float32 against float64; None: there was no time for it
     rrmsd_asked: Size | None = None  # accept.rrmsd of the scene; None: no limit
     rays_traced: int | None = None  # number of all rays of the verification
-    shape: Mapping[str, float | None] | None = None  # thickness, radii (mm), slope (degrees), volume (mm³) …
+    shape: Mapping[str, float | None] | None = None  # analysis.shape.describe, volume (mm³)
     # margin to total reflection (degrees) and of Newton's method, largest curvature (1/mm), number of non-finite values
     stability: Mapping[str, float | int | None] | None = None
     blur: Blur | None = None  # blur by the source's size; None: a point source or parallel light
@@ -215,7 +215,7 @@ class Contents:
     # tailored); None: the scene has no bounds
     bounds: Mapping[str, Any] | None = None
     judges: tuple[Judge, ...] = ()  # results of other programs (--against)
-    # made part by its cloud, keys of measured.made_part: points, alignment, pv, rms, rrmsd_predicted, passed …
+    # made part, from its point cloud; keys of measured.made_part, such as points, pv, rms, rrmsd_predicted, passed
     measured: Mapping[str, Any] | None = None
     order: Order | None = None  # order for a machine shop
     flat_tops: tuple[FlatTop, ...] = ()  # figures of the targets with a flat profile
@@ -237,10 +237,10 @@ class Contents:
         return tuple(starmap(Remark, zip_longest(self.remarks, self.given_up, fillvalue="")))
 
     def facts(self) -> dict[str, Any]:
-        """Return the entries of report.json as plain values, in their order, without unknown ones (but KEYS_KEPT)."""
+        """Return the entries of report.json as plain values, in their order, without empty ones except KEYS_KEPT."""
         found = {key: value for key, value in plain(self).items() if key in KEYS_KEPT or value not in (None, [])}
         for judge in found.get("judges", ()):
-            if not judge["target"]:  # only named if there are several targets
+            if not judge["target"]:  # a target has a name only among several
                 del judge["target"]
         return found
 
@@ -281,7 +281,7 @@ def contents_of(
 ) -> Contents:
     """Return the contents of report.json.
 
-    circumstances: version, machine and versions of libraries now; known ones in `making` replace them.
+    circumstances: present version, machine and versions of libraries; those known in `making` have priority.
     estimates: effects that are not simulated.  diagnosis: convergence, remaining_error and bounds.
     """
     scene, goals = design.scene, design.goals
@@ -338,14 +338,14 @@ def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
 
 
 def _with_remarks(contents: Contents, *more: Remark) -> Contents:
-    """Return the contents with more remarks, and the verdict that follows."""
+    """Return the contents with more remarks, and the verdict that follows from them."""
     every, limited = (*contents.all_remarks, *more), contents.verdict != NO_LIMIT
     ids, texts = (tuple(part) for part in zip(*every, strict=True)) if every else ((), ())
     return replace(contents, given_up=texts, remarks=ids, verdict=verdict(contents.passed, texts, limited))
 
 
 def _finest_detail(scene: Scene, proof: Proof, screen: Screen, estimates: tuple[LeftOut, ...]) -> FinestDetail | None:
-    """Return the finest detail by the size of the source in the scene, or by the size that the estimates assume."""
+    """Return the finest detail for the source size of the scene, else for the assumed one; None: there is neither."""
     if proof.blur:
         of = ", ".join(f"source.{key} = {size}" for key, size in extent(scene.source))
         return finest_detail(proof.blur.pixels, proof.lens, screen, of)
@@ -396,7 +396,7 @@ def bounds(found: Mapping[str, Any] | None) -> str:
 
 
 def read(path: Path) -> Contents:
-    """Read a report.json; ValueError, one sentence, if it is missing, damaged or by another program."""
+    """Read a report.json; ValueError (one sentence) if it is missing, damaged or from another program."""
     return read_as(Contents, path, "run bstcad verify to write it again")
 
 
@@ -409,7 +409,7 @@ def making(path: Path) -> DesignCourse:
 
 
 def read_as(kind: type[Record], path: Path, remedy: str) -> Record:
-    """Read a record of this kind from a JSON file; ValueError, one sentence, if it is not valid."""
+    """Read a record of this kind from a JSON file; ValueError (one sentence) if it is not valid."""
     try:
         return of_json(files.contents(path, MAX_REPORT_BYTES), kind)
     except ValueError as error:
@@ -485,7 +485,7 @@ def write_json(report: Contents, path: str | Path) -> None:
 
 
 def _rounded(value: Any, where: str) -> Any:
-    """Round floats to DIGITS, except in the prescription, which keeps designed numbers.  where: key in the report."""
+    """Round floats to DIGITS, except in the prescription, which keeps designed numbers.  where: path of the value."""
     if isinstance(value, dict):
         return {key: _rounded(part, f"{where}.{key}") for key, part in value.items()}
     if isinstance(value, list):
@@ -525,7 +525,7 @@ class Report:
     contents: Contents
     irradiances: tuple[np.ndarray, ...]  # irradiance on each target (rows, columns), row 0 = y max, the target's sum
     # made part of this verification: facts, outliers (n, 3), predicted irradiances, and the deviation map with x, y and
-    # form (rows y, columns x; mm, + out of the glass, NaN outside); None: there is none
+    # form (rows y, columns x; mm, + out of the glass, NaN outside); None: no part was measured
     measured: Any = None
     notes: tuple[str, ...] = ()  # sentences on the exported files, also in their sidecar files
 
@@ -561,12 +561,12 @@ class Report:
 
 
 def rrmsds(report: Contents) -> str:
-    """Return the RRMSD on each target, in their order."""
+    """Return the RRMSD on each target, in the order of the scene."""
     return ", ".join(number(each.rrmsd) for each in report.goals)
 
 
 def changes(entry: LeftOut) -> tuple[str, str, str]:
-    """Return the change of flux on the target, of RRMSD and of blur by an effect, in words."""
+    """Return in words the changes that an effect causes: flux on the target, RRMSD and blur."""
     flux, rrmsd, blur = entry.flux_change, entry.rrmsd_change, entry.blur_pixels
     if rrmsd is None:
         return UNKNOWN_CHANGE, UNKNOWN_CHANGE, UNKNOWN_CHANGE

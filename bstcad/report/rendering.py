@@ -47,11 +47,11 @@ GROUND, INK, SOFT = "#0e1116", "#e6eaee", "#8b96a1"
 GLASS_FINISH = {"color": "#b9d4ea", "specular": 0.9, "opacity": 0.42}
 METAL_FINISH, LAMP = {"color": "#9aa3ad", "specular": 0.4}, "#fff3c4"
 DARKEST = 0.35  # start of the colour map of flux, so that the smallest flux is visible on the dark background
-ASIDE = (0.95, 0.42, 0.62)  # direction to the eye: sideways, up, and along the axis to the picture's side
+ASIDE = (0.95, 0.42, 0.62)  # direction to the eye: sideways, up, and along the axis towards the seen side
 NEAR = (0.9, 0.5, 0.75)  # direction to the eye in the close view, which faces the back
 TITLE_WIDTH = 46  # letters per line of the title
 PATH_ANGLE = 24.0  # vertical angle of view (degrees)
-PATH_FILL, LENS_FILL = 0.88, 0.6  # fraction of a view that the whole path fills, and the lens with room for its rays
+PATH_FILL, LENS_FILL = 0.88, 0.6  # fraction of a view filled by the whole path, and by the lens close up
 SCREEN_OPACITY = 0.8  # opacity of a screen in front of another one
 RAY_REACH, RAY_STEP = 2.0, 5  # close view: length of the rays outside the lens (diagonals); every fifth ray is drawn
 
@@ -59,8 +59,8 @@ RAY_REACH, RAY_STEP = 2.0, 5  # close view: length of the rays outside the lens 
 FINE, COARSE = 256, 64  # cells per axis of a net, and of a surface without knots
 MAX_MODEL_RAYS = 200  # largest number of rays in the model
 POSITION_DECIMALS, FLUX_DECIMALS = 4, 3  # decimals of a position (mm), and of a relative flux
-STEPS = 65535  # integer steps over the range of a number
-MIN_RANGE = 1e-9  # smallest range of values that are all equal (mm, or a slope)
+STEPS = 65535  # largest 16-bit integer: a range of values has this number of steps
+MIN_RANGE = 1e-9  # lower bound of a range, for values that are all equal (mm, or a slope)
 
 
 _drawing: list[subprocess.Popen] = []  # processes that are drawing
@@ -92,7 +92,7 @@ def _run(arrays: Mapping[str, np.ndarray], picture: str, patience: float | None)
         np.savez(given, **arrays)
         # -P keeps this folder, with its report.py and units.py, off the import path.
         command = [sys.executable, "-P", __file__, str(given), picture]
-        # With this variable pyvista does not test first whether it can open a window; if not, the process ends.
+        # With this variable pyvista omits its test for a display; without a display the process ends.
         env = os.environ | {"ALLOW_PLOTTING": "true"}
         try:
             with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=env) as drawing:
@@ -132,7 +132,7 @@ def main(arrays: str, picture: str) -> None:
 
 
 def draw_clay(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return an RGBA image (rows, columns, 4) of the triangles `faces` (n, 3) on `vertices` (k, 3) in mm, back up."""
+    """Return an RGBA image (rows, columns, 4) of triangles `faces` (n, 3) on `vertices` (k, 3; mm), back upwards."""
     import pyvista
 
     centre = (vertices.min(0) + vertices.max(0)) / 2
@@ -175,11 +175,11 @@ class LightPath:
     faces: np.ndarray  # vertex indices of its triangles, (k, 3)
     rays: np.ndarray  # points of each ray from the source over the faces to the furthest screen, (rays, points, 3)
     flux: np.ndarray  # flux of each ray at its end, (rays,), in millionths of the source's light
-    screens: tuple[np.ndarray, ...]  # corners of each screen, (4, 3): (x min, y min), (x max, y min), (x max, y max), …
+    screens: tuple[np.ndarray, ...]  # corners of each screen, (4, 3), around it from (x min, y min) via (x max, y min)
     pictures: tuple[np.ndarray, ...]  # tones of the irradiance on each screen, (rows, columns) uint8, row 0 at y max
-    lamp: np.ndarray  # position of a point source, (1, 3), or (0, 3)
+    lamp: np.ndarray  # position of a point source, (1, 3); otherwise (0, 3)
     seen_along: int  # +1: the picture is seen along +z, from the side of the source; -1: from behind the screen
-    mirror: bool
+    mirror: bool  # True if no light enters the solid
     title: str
     words: str  # caption of one or two lines
 
@@ -285,7 +285,7 @@ def _add_screen(plotter: Any, screen: np.ndarray, picture: np.ndarray, opacity: 
 
 
 def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarray, filled: float) -> None:
-    """Set the camera so that all points are in the view, y up, from the side away from the screen."""
+    """Set the camera along `towards`, y up, so that the points fill the fraction `filled` of the view."""
     towards = _clear_of_screen(path, towards)
     right = np.cross([0.0, 1.0, 0.0], towards)
     right /= np.linalg.norm(right)
@@ -309,7 +309,7 @@ def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarra
 
 
 def _clear_of_screen(path: LightPath, towards: np.ndarray) -> np.ndarray:
-    """Return the direction to the eye (a unit vector) on the side away from the screen."""
+    """Return `towards` as a unit vector, mirrored in x so that the first screen does not cover the lens."""
     offset = path.screens[0][:, 0].mean() - path.vertices[:, 0].mean()
     return towards * [-1 if offset > 0 else 1, 1, 1] / np.linalg.norm(towards)
 
@@ -326,9 +326,9 @@ def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> st
     since a solid of one material needs a shader of twenty lines, not a library of 0.6 to 1 MB.  The slopes are those of
     the surface, not of the triangles, so that the shading is exact at any distance.
 
-    The key `values` is base64 of 16-bit integers, low byte first, each a fraction of its range.  For each face these
-    are the positions x, y, z of (cells + 1)² nodes and their slopes along x and y; then x, y, z of the front and z of
-    the back around the rim.  A path adds the keys of `_light`.
+    The key `values` is base64 of 16-bit integers, low byte first, each a fraction of the range of its coordinate.
+    For each face these are the positions x, y, z of (cells + 1)² nodes and their slopes along x and y; then x, y, z of
+    the front and z of the back around the rim.  A path adds the keys of `_light`.
     """
     from bstcad.cad.mesh import nodes, rim
     from bstcad.optics.surfaces import sampled
@@ -384,7 +384,7 @@ def _light(path: LightPath) -> dict[str, Any]:
     ray, 1 for the brightest.  screens: corners as in LightPath, and the picture as a data URL, row 0 at y max.
     lamp: position of a point source, or empty.  aside: direction to the eye for the whole path, y up.
     """
-    every = math.ceil(len(path.rays) / MAX_MODEL_RAYS) | 1  # odd: an even step takes only some columns
+    every = math.ceil(len(path.rays) / MAX_MODEL_RAYS) | 1  # odd, since an even step would omit whole columns of rays
     rays, flux = path.rays[::every], path.flux[::every] / path.flux.max()
     return {
         "rays": np.round(rays, POSITION_DECIMALS).tolist(),

@@ -1,6 +1,6 @@
 """Report of a design for people: report.html, a summary on the terminal, and report.junit.xml for build servers.
 
-All of them show the record of report.json (record.Contents) or the record of a plan, without any computation.
+Each shows the record of report.json (record.Contents) or the record of a plan, without any computation.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ BADGES = {  # verdict of a report: (sign, style on the page, style on the termin
 }
 # style on the terminal of each kind of a plan's verdict
 PLAN_STYLES = {"blurred": "bold red", "beyond": "bold red", "within": "bold green", "no limit": "bold cyan"}
-GLASS_LINES = ("lost through the sides", "total internal reflection")  # lines of the ledger that few mirrors have
+GLASS_LINES = ("lost through the sides", "total internal reflection")  # lines omitted for a mirror if 0
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
@@ -54,7 +54,7 @@ def counts(checks: Sequence[Check]) -> str:
 
 
 def explanation(report: Contents) -> str:
-    """Return the verdict in sentences: numbers of checks, doubts on the RRMSD, and that a draft is a draft."""
+    """Return sentences beside the verdict: numbers of checks, doubts, and for a draft how to reduce the RRMSD."""
     draft = 'A draft has few evaluations: the quality "standard" gives a smaller RRMSD.'
     texts = (f"{counts(report.checks)}.", *(doubt.text for doubt in doubts(report)))
     return " ".join((*texts, draft) if report.quality == "draft" else texts)
@@ -87,7 +87,7 @@ def machine(facts: Mapping[str, Any]) -> Rows:
 
 
 def ledger(flux: Mapping[str, float], of: str) -> dict[str, float]:
-    """Return the lines of a flux ledger in words, with the kind of the optic, `of`."""
+    """Return a flux ledger with its lines in the words of a report; of: lens or mirror."""
     lines = {line: part for line, part in flux.items() if of == "lens" or part or line not in GLASS_LINES}
     for old, new in (("the lens", f"the {of}"), ("glass", "material"), ("on t", "on the t"), ("off t", "beside the t")):
         lines = {line.replace(old, new): part for line, part in lines.items()}
@@ -118,9 +118,9 @@ def html(
     """Return report.html, one file that contains pictures and styles and loads nothing.
 
     figures: PNG bytes by name; a picture that is None or absent is omitted, with a sentence for the 3-D picture.
-    scene: TOML text with all defaults.  prescription: rows by bstcad.report.prescription.sections.  solid: JSON by
-    bstcad.report.rendering.turnable; empty: a page without a script.  tolerances: HTML by bstcad.report.tolerances.
-    sections: (heading, HTML) by a script of the user.
+    scene: TOML text with all defaults.  prescription: rows from bstcad.report.prescription.sections.  solid: JSON from
+    bstcad.report.rendering.turnable; empty: a page without a script.  tolerances: HTML from bstcad.report.tolerances.
+    sections: (heading, HTML) from a script of the user.
     """
     from markupsafe import Markup
 

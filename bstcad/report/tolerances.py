@@ -28,7 +28,7 @@ MAX_PAGE_BYTES = 30_000_000  # size limit of a page that is changed
 MAX_PICTURE_BYTES = 1_000_000  # size limit of a picture that is read
 PNG = b"\x89PNG\r\n\x1a\n"
 FIGURES = ("tolerance_trials", "tolerance_worst")  # names of the pictures
-MAX_DISAGREEMENT = 0.1, 0.03  # largest 95th percentile and median of model against full traces
+MAX_DISAGREEMENT = 0.1, 0.03  # largest relative disagreement with full traces: 95th percentile, median
 MIN_FRACTION = 1e-3  # fraction of the change of the picture below which an error is listed in a second table
 WIDEST = 10.0  # largest factor on the width of an error in the search for the loosest tolerances
 MAX_NAMED_ERRORS = 3  # number of errors that are named per trial
@@ -37,7 +37,7 @@ Yield = tuple[Fraction, Fraction, Fraction]  # lower bound, estimate and upper b
 Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
 Width = Annotated[float, Field(gt=0, le=1e6)]
 Spread = TypedDict("Spread", {"5 %": Size, "50 %": Size, "95 %": Size})  # percentiles of RRMSD
-Disagreement = TypedDict("Disagreement", {"median": Size, "95 %": Size})  # relative
+Disagreement = TypedDict("Disagreement", {"median": Size, "95 %": Size})  # relative errors
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Sensitivity:
     cost: Width  # relative cost of the limit (default 1)
     sigma: Width  # standard deviation, in `unit`
     rrmsd_change: float  # change of RRMSD by one sigma; with several targets, on the one that changes most
-    share: Fraction  # fraction of the mean square change of the picture (of all pictures) by all errors
+    share: Fraction  # fraction of the mean square change that all errors cause in all pictures
     wavefront_change: float | None = None  # change of the RMS wavefront error by one sigma (waves); None: no wave
 
 
@@ -78,7 +78,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Inverse:
-    """Loosest tolerances for a requested yield, by superposed pictures."""
+    """Loosest tolerances for a requested yield, computed with superposed pictures."""
 
     wanted: Fraction  # requested yield
     passed: Annotated[Yield, Field(alias="yield")]  # yield of new trials with these tolerances
@@ -87,24 +87,24 @@ class Inverse:
 
 @dataclass(frozen=True)
 class TargetStudy:
-    """One of several targets in the same trials."""
+    """Results on one of several targets, from the same trials."""
 
     key: str  # target[0], target[1], …
-    where: str  # position of its receiver, in words
+    where: str  # position of the receiver, in words
     rrmsd: Rrmsd  # RRMSD of the design on this target
     passed: Annotated[Yield, Field(alias="yield")]  # yield of the limit on this target
     passed_full: Annotated[Yield, Field(alias="yield_full")]  # yield of the trials traced in full
-    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of these with this screen adjusted
+    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of these trials, this screen adjusted
     rrmsd_trials: Spread  # RRMSD of the trials by superposed pictures
     rrmsd_full: Spread  # RRMSD of the trials traced in full
-    rrmsd_adjusted: Spread  # RRMSD of these with this screen adjusted (shift, focus, tilt, rotation)
+    rrmsd_adjusted: Spread  # RRMSD of these trials by superposed pictures, with this screen adjusted
     model_off: Disagreement  # disagreement of superposed pictures with full traces
-    sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # sensitivities on it, the worst first
+    sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # the worst first
 
 
 @dataclass(frozen=True)
 class WavefrontStudy:
-    """Wavefront in the same trials: RMS error in waves, piston and tilt removed."""
+    """Results on the wavefront from the same trials: RMS error in waves, piston and tilt removed."""
 
     rms: Size  # RMS error of the design
     rms_trials: Spread  # RMS error of the trials by superposed wavefronts
@@ -118,7 +118,7 @@ class WavefrontStudy:
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Content of tolerance.json: one field per key, in the order of the file; `passed…` are its keys `yield…`."""
+    """Content of tolerance.json: one field per key, in the order of the file, which names `passed…` `yield…`."""
 
     __pydantic_config__ = STRICT
 
@@ -126,18 +126,18 @@ class Tolerances:
     version: str  # version of bstcad
     grade: Grade  # grade of all tolerances that the scene does not state
     seed: Annotated[int, Field(ge=0)]  # seed of the trials
-    tubes: Count  # tubes per side and channel
+    tubes: Count  # flux tubes per side, for each channel
     limit: Rrmsd  # largest RRMSD of a lens that passes
     rrmsd: Rrmsd  # RRMSD of the design; with several targets, here and below that of the worst target of each lens
     trials: Count  # number of trials by superposed pictures
     full_trials: Count  # number of trials by full traces
-    # yield by superposed pictures: lenses within the limit on all targets and within that of the wavefront
+    # yield by superposed pictures: lenses within `limit` on all targets and within the limit of the wavefront
     passed: Annotated[Yield, Field(alias="yield")]
     passed_full: Annotated[Yield, Field(alias="yield_full")]  # yield of the trials traced in full
-    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of these with the screen adjusted
+    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of these trials, screen adjusted
     rrmsd_trials: Spread  # RRMSD of the trials by superposed pictures
     rrmsd_full: Spread  # RRMSD of the trials traced in full
-    rrmsd_adjusted: Spread  # RRMSD of these with the screen adjusted (shift, focus, tilt, rotation)
+    rrmsd_adjusted: Spread  # RRMSD of these trials by superposed pictures, with the screen adjusted
     model_off: Disagreement  # disagreement of superposed pictures with full traces
     sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # sensitivities, the worst first
     worst: Annotated[tuple[Trial, ...], Field(max_length=100)]  # worst of the fully traced trials
@@ -163,14 +163,14 @@ class Tolerances:
 
 
 def _file_keys(value: Any) -> Any:
-    """Return a value with the keys of the file, without unknown entries."""
+    """Return a value with the keys of tolerance.json, without entries that are None."""
     if isinstance(value, dict):
         return {key.replace("passed", "yield"): _file_keys(part) for key, part in value.items() if part is not None}
     return list(map(_file_keys, value)) if isinstance(value, list) else value
 
 
 def read(path: Path) -> Tolerances:
-    """Read a tolerance.json; ValueError, one sentence, if it is damaged or by another program."""
+    """Read a tolerance.json; ValueError (one sentence) if it is damaged or from another program."""
     return read_as(Tolerances, path, "run bstcad tolerance to write it again")
 
 
@@ -206,7 +206,7 @@ def of_folder(folder: Path, optic: str) -> str:
 
 
 def put_into(page: Path, section: str) -> bytes | None:
-    """Return the page with this section instead of an earlier one; None if the page has no position for it."""
+    """Return the page with this section instead of its present one; None if the page cannot be read or has none."""
     try:
         text = files.contents(page, MAX_PAGE_BYTES).decode("utf-8")
     except (OSError, ValueError):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 Rows = list[tuple[str, str]]  # name, value
-DIGITS = 12  # significant digits of a number before it is printed
+DIGITS = 12  # significant digits to which a number is first rounded
 LADDERS = {  # unit: (smallest size, factor, unit as written), in descending order
     "mm": ((0.1, 1.0, "mm"), (1e-3, 1e3, "µm"), (1e-8, 1e6, "nm"), (0.0, 1e9, "pm")),
     "deg": ((0.01, 1.0, "°"), (0.0, 3600.0, "″")),
@@ -86,7 +86,7 @@ def duration(seconds: float) -> str:
 
 
 def bound(check: Check) -> str:
-    """Return the limit of a check with ≤ or ≥, which follows from value and outcome (passed below: an upper limit)."""
+    """Return the limit of a check with ≤ or ≥: if a value below the limit passes, the limit is an upper one."""
     value, limit, unit = check.value, check.limit, check.unit
     if limit is None:
         return ""
@@ -110,7 +110,7 @@ def exact(value: float) -> str:
 
 
 def mm(value: float) -> str:
-    """Return a length in mm, rounded to 0.001 mm; only an exact one has no zeros at its end: 4.379, 6.040, −0.5, 0."""
+    """Return a length in mm, rounded to 0.001 mm; zeros at the end only if it is not exact: 4.379, 6.040, −0.5, 0."""
     text = f"{value:.3f}" if abs(value) >= 5e-4 else "0"
     text = text.rstrip("0").rstrip(".") if "." in text and abs(value - float(text)) < 1e-6 else text
     return text.replace("-", "−")
@@ -173,7 +173,7 @@ def _plain_text() -> Environment:
 
 
 def prepare() -> None:
-    """Compile all templates; called in a thread that would wait for OCC to read a file."""
+    """Compile all templates; called in a thread that otherwise waits while OCC reads a file."""
     for templates in (environment(), _plain_text()):
         for name in templates.list_templates(extensions=["j2"]):
             templates.get_template(name)

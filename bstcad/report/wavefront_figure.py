@@ -21,7 +21,7 @@ REMOVED = "piston and tilt removed"
 
 @styled
 def wavefront_map(error: WavefrontError) -> Figure:
-    """Draw the OPD in waves on its plane z, without piston and tilt, and cuts through its centre."""
+    """Draw the OPD (waves) on the plane z of `error`, without piston and tilt, and cuts through its centre."""
     figure = new_figure(9.0, 4.3)
     face, cut = figure.subplots(1, 2, width_ratios=(1.15, 1.0))
     edge = round_up(float(np.nanmax(np.abs(error.opd))))

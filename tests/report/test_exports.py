@@ -133,7 +133,7 @@ def test_the_command_and_the_scene_write_every_kind_and_the_design_still_proves(
     [
         (["--as", "iges"], "'iges' cannot be exported; give one of sag, points"),
         ([], "--as: is missing; give the kinds of files"),
-        (["--as", "sag", "--points", "2"], "2 points per side are not possible; give 3 to 4097"),
+        (["--as", "sag", "--points", "2"], "points = 2 is not possible; give a number from 3 to 4097"),
         (["--as", "datasheet"], "report.json: cannot be read"),  # whose figures it quotes
     ],
 )
