@@ -107,7 +107,7 @@ def evaluate_plain(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tenso
 
 
 def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return `evaluate_plain`, by the fused kernel where it takes these tensors (same values to rounding)."""
+    """Return `evaluate_plain`, by the fused kernel if it supports these tensors (same values to rounding)."""
     if fast := ops.kernel("bspline.evaluate", heights, u, v):
         return fast(heights, *torch.broadcast_tensors(u, v))
     return evaluate_plain(heights, u, v)
@@ -440,7 +440,7 @@ def curvature_bounds(surface: BSplineSurface, sign: float) -> Tensor:
 
     Second derivatives are weighted means of second differences of the control points, in an end span of 1/4 to 2 times
     those differences.  A positive principal curvature is at most the larger eigenvalue of the Hessian, which grows with
-    both diagonal entries and with the magnitude of the mixed one.
+    the two diagonal entries and with the magnitude of the mixed entry.
     """
     d_x, d_y = _differences(surface)
     pitch_x, pitch_y = surface.pitch

@@ -1,8 +1,8 @@
-"""Channels: the light as a weighted sum of parts, each of which one trace follows.
+"""Channels: the light as a weighted sum of parts, each of which is traced separately.
 
-A channel is one sample of the source at one wavelength: rays of one origin, in media of one index each.  Irradiance,
-merit function and flux ledger are sums over channels, E = Σ_k w_k E_k with Σ_k w_k = 1.  A scene without an extended
-source and without a spectrum has one channel of weight 1.
+A channel is one sample point of the source at one wavelength, in media of one index each.  Irradiance, merit function
+and flux ledger are sums over channels, E = Σ_k w_k E_k with Σ_k w_k = 1.  A scene without an extended source and
+without a spectrum has one channel of weight 1.
 
 The sample points of an extended source are divided among its spectral lines: n points give n channels, whatever the
 number of lines (at least two points per line).  The points of a line come in pairs, symmetric about the centre.
@@ -23,7 +23,7 @@ from bstcad.optics.lens import Lens, LensLosses
 
 @dataclass(frozen=True)
 class Channel:
-    """One source in media of one index each."""
+    """Simple source at one wavelength, with the index and the losses of the lens at this wavelength."""
 
     source: Emitter  # simple source of flux 1
     index: float  # refractive index of the lens at the wavelength of the channel
@@ -44,7 +44,7 @@ def channels_of(source: Emitter, index: Callable[[float], float], points: int, d
     """Return the channels of a source; index(nm) is the refractive index of the lens.
 
     points: number of sample points of an extended source, at least two; draw: number of the point set.  A point or a
-    parallel beam of one wavelength is one channel, with the source itself.
+    parallel beam of one wavelength gives one channel, whose source is `source` itself.
     """
     extent = source.extent
     if extent is None:
@@ -59,7 +59,7 @@ def channels_of(source: Emitter, index: Callable[[float], float], points: int, d
 
 
 def drawn_channels(source: Emitter, index: Callable[[float], float], points: int, seed: int) -> tuple[Channel, ...]:
-    """Return channels at random points of an extended source; the mean of their images over seeds is exact.
+    """Return channels at random points of an extended source; the mean of their images over many seeds is unbiased.
 
     points: number of sample points of all lines together, at least one per line (sampling.shifted_lattice).
     """
@@ -83,7 +83,7 @@ def _sample_extent(source: Emitter, index: Callable[[float], float], points_of: 
 
 
 def merge_wavelengths(channels: Sequence[Channel]) -> tuple[Channel, ...]:
-    """Return the channels with those that differ only in wavelength merged, as a mirror without losses allows."""
+    """Merge channels that differ only in wavelength, which a mirror without losses reflects alike."""
     alike: dict[Channel, list[Channel]] = {}
     for channel in channels:
         key = replace(channel, source=replace(channel.source, wavelength=0.0), weight=0.0)
@@ -115,6 +115,6 @@ def _lines(channels: Sequence[Channel]) -> list[list[int]]:
 
 
 def weighted_sum(channels: Sequence[Channel], values: Iterable[Any]) -> Any:
-    """Return Σ_k w_k v_k, one value per channel, tensors or numbers; the value of a single channel keeps its bits."""
+    """Return Σ_k w_k v_k, one value per channel, tensors or numbers; one value of weight 1 keeps its bits."""
     first, *others = (channel.weight * value for channel, value in zip(channels, values, strict=True))
     return sum(others, first)

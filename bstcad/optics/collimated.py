@@ -19,7 +19,7 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, tilt_of
 
-WIDTHS_BEFORE_LENS = 4.0  # distance of the aperture from the lens, in its widths, for a tilted beam without a plane z
+WIDTHS_BEFORE_LENS = 4.0  # distance of the aperture from the lens / its width, for a tilted beam without a plane z
 MAX_INCLINATION = 89.0  # degrees, largest angle of parallel light to the axis of the lens
 
 
@@ -47,7 +47,7 @@ class Collimated(Emitter):
     tilt: TiltKey = None
     divergence: Annotated[float | None, Key("Full angle of the cone of directions.", "degrees", 0.0, 179.0)] = None
     real_divergence: Annotated[
-        float | None, Key("Full angle of the real lamp; estimates only.", "degrees", 0.0, 179.0)
+        float | None, Key("Full divergence angle of the real lamp, for estimates only.", "degrees", 0.0, 179.0)
     ] = None
     kind: Annotated[Literal["collimated"], Key("Parallel light.")] = "collimated"
 
@@ -61,11 +61,11 @@ class Collimated(Emitter):
         return self.z
 
     def complaints(self, z: float, optic: str) -> Iterator[str]:
-        """Yield the fault of directions that are inclined too far to the axis."""
+        """Yield a sentence if directions are inclined too far to the axis."""
         lean = math.degrees(math.acos(max(-1.0, min(1.0, self.axes[2][2]))))
         if not lean + (self.divergence or 0.0) / 2 < MAX_INCLINATION:
             key, light = ("divergence", "a part of the light") if self.divergence else ("tilt", "the light")
-            yield f"{key}: {light} is inclined to the lens's axis by {MAX_INCLINATION:g} degrees or more; reduce it"
+            yield f"{key}: {light} is inclined to the axis by {MAX_INCLINATION:g} degrees or more; reduce the {key}"
 
     def words(self, origin: float) -> str:
         """Return profile, divergence and aperture for a data sheet."""
@@ -85,8 +85,8 @@ class Collimated(Emitter):
     def moved(self, motion: Motion, entrance: float) -> Collimated:
         """Return the simple beam after a motion; entrance: z of the plane through the first vertex (mm).
 
-        The aperture stays in a plane z = const when the light is turned, and so is too wide by 1 / cos: 1.5e-6 of its
-        size at 0.1 degrees.
+        The aperture stays in a plane z = const when the light is rotated, and is too wide by the factor 1 / cos: by
+        1.5e-6 of its size at 0.1 degrees.
         """
         if not (motion.turns or self.tilted):  # light along z has the same irradiance on all planes
             x, y = (p + d for p, d in zip(self.centre or (0.0, 0.0), motion.shift, strict=False))
@@ -169,10 +169,10 @@ class Collimated(Emitter):
         return x + (z - self.z) * a, y + (z - self.z) * b
 
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
-        """Return the rectangle of the plane z that holds all the light: the bounding box of the aperture.
+        """Return the rectangle of the plane z that contains all the light: the bounding box of the aperture.
 
-        For light that is tilted or off the axis it holds only the part that can meet the first surface inside its
-        outline, between the sags (mm).
+        For light that is tilted or off the axis the rectangle contains only the part that can meet the first surface
+        inside its outline, between the sags (mm).
         """
         half = [a + abs(s) for a, s in zip(self.aperture.half_extent, self.shift(z), strict=True)]
         if self.tilted or self.centre is not None:

@@ -41,7 +41,7 @@ class Emitter(ABC):
     """A source of light.
 
     A subclass is a frozen dataclass that defines `irradiance`, `rays` and `window`.  The other methods follow from
-    these, or raise NotImplementedError with the method that is missing.
+    these, or raise NotImplementedError, which names the missing method.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
@@ -90,9 +90,9 @@ class Emitter(ABC):
 
     @abstractmethod
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
-        """Return the rectangle of the plane z (mm) that holds all rays that can meet the first surface in its outline.
+        """Return the rectangle of the plane z (mm) with all rays that can meet the first surface inside its outline.
 
-        The surface lies between that plane and those at `sags` (mm) from it.
+        The surface lies between the planes at `sags` (mm) above the plane z.
         """
 
     def spot(self, z: float) -> tuple[Outline | None, tuple[float, float]]:
@@ -142,7 +142,7 @@ class Emitter(ABC):
 
     @property
     def is_rotation_invariant(self) -> bool:
-        """True if a turn about its axis leaves the light unchanged; otherwise `moved` cannot apply such a turn."""
+        """True if a rotation about its axis leaves the light unchanged; if not, `moved` cannot apply such rotations."""
         return False
 
     @property
@@ -151,11 +151,11 @@ class Emitter(ABC):
         return self.parallel and not self.tilted
 
     def with_wider_cone(self, by: float) -> Emitter | None:
-        """Return the simple source with the tangent of its cone larger by the fraction `by`; None: it has no cone."""
+        """Return the simple source with the tangent of its cone larger by the fraction `by`; None: no cone."""
         return None
 
     def moved_away(self, by: float, about: Vector) -> Emitter | None:
-        """Return the simple source at a distance from a point larger by the fraction `by`; None: it has no position."""
+        """Return the simple source at a distance from a point larger by the fraction `by`; None: no position."""
         return None
 
     @property
@@ -169,7 +169,7 @@ class Emitter(ABC):
 
     @property
     def main_wavelength(self) -> float:
-        """Wavelength (nm) of the line with the largest weight; the middle one of several equal lines."""
+        """Wavelength (nm) of the line with the largest weight; the median of several equal lines."""
         if isinstance(self.wavelength, int | float):
             return self.wavelength
         largest = max(weight for _, weight in self.wavelength)

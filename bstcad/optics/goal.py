@@ -26,7 +26,7 @@ class Goal:
 
     @property
     def suffix(self) -> str:
-        """Suffix of the names of its checks, which names one of several goals."""
+        """Suffix of the names of the goal's checks; empty for a single goal."""
         return suffix_of(self.key)
 
     @property
@@ -42,7 +42,7 @@ class Goal:
 
 
 def restricted(picture: np.ndarray, part: np.ndarray | None) -> np.ndarray:
-    """Return a picture (rows, columns) of the same sum, zero outside the pixels where `part` is True; None: itself."""
+    """Return a picture (rows, columns) of the same sum, zero where `part` is False; part None: the picture itself."""
     if part is None:
         return picture
     masked = np.where(part, picture, 0.0)
@@ -60,6 +60,6 @@ def words_of(key: str) -> str:
 
 
 def worst(rrmsds: Iterable[float | None]) -> int:
-    """Return the number of the goal with the largest RRMSD; None or NaN counts as infinite: no light falls on it."""
+    """Return the number of the goal with the largest RRMSD; None or NaN (no light on the goal) counts as infinite."""
     known = [math.inf if each is None or math.isnan(each) else each for each in rrmsds]
     return known.index(max(known))

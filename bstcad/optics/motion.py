@@ -36,7 +36,7 @@ class Motion:
         return Motion(back, self.about, tuple((-back @ np.array(self.shift)).tolist()))
 
     def after(self, first: Motion | None) -> Motion:
-        """Return the composition of the motion `first` and then this one; `first` None: this one."""
+        """Return the motion that applies `first` and then this motion; first None: this motion."""
         if first is None:
             return self
         return Motion(self.rotation @ first.rotation, shift=self.point(first.point(ORIGIN)))

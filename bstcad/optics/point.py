@@ -56,7 +56,7 @@ class Point(Emitter):
         float | None, Key("Height of an emitting rectangle, along its y axis.", "mm", 0.0, 1e6, example=1.0)
     ] = None
     tilt: TiltKey = None
-    real_diameter: Annotated[float | None, Key("Diameter of the real lamp; estimates only.", "mm", 0.0, 1e6)] = None
+    real_diameter: Annotated[float | None, Key("Diameter of the real lamp, for estimates only.", "mm", 0.0, 1e6)] = None
     kind: Annotated[Literal["point"], Key("A point, or with a size a disc or rectangle of points.")] = "point"
 
     __pydantic_config__ = STRICT
@@ -75,12 +75,12 @@ class Point(Emitter):
         return self.position[2] + (reach if upwards else -reach)
 
     def complaints(self, z: float, optic: str) -> Iterator[str]:
-        """Yield faults: a disc or rectangle with missing sizes, or one larger than its distance from the lens."""
+        """Yield a sentence per missing or superfluous size, and for a size larger than the distance from the lens."""
         given = [name for name in ("width", "height") if getattr(self, name) is not None]
         if given and self.diameter is not None:
             yield f"diameter: the source also has a {given[0]}; give a diameter, or width and height"
         for other in {"width", "height"} - set(given) if given else ():
-            yield f"{other}: missing, and a source with a {given[0]} needs it; add it in mm"
+            yield f"{other}: the key is missing; add it in mm, since the source has a {given[0]}"
         sizes = {name: getattr(self, name) or 0.0 for name in SIZE_KEYS}
         name, distance = max(sizes, key=lambda key: sizes[key]), abs(z - self.position[2])
         if self.extent is not None and not sizes[name] <= distance:
@@ -117,7 +117,7 @@ class Point(Emitter):
         return replace(self, position=motion.point(self.position), tilt=tilt)
 
     def with_wider_cone(self, by: float) -> Point | None:
-        """Return the source with the tangent of its cone larger by the fraction `by`; None: it has no cone."""
+        """Return the source with the tangent of its cone larger by the fraction `by`; None: no cone."""
 
         def wider(angle: float) -> float:
             return math.degrees(math.atan((1 + by) * math.tan(math.radians(angle))))
@@ -160,7 +160,7 @@ class Point(Emitter):
 
         gaussian: 2 / (π w²) exp(-2 r² / w²).  lambertian: I = cos θ / (π sin² θ_max) and E = I cos θ / d², so
         E = D² / (π sin² θ_max d⁴) with D the distance of the plane and d that of the point.  uniform:
-        I = 1 / (2π (1 - cos θ_max)), E = I D / d³.  Outside θ_max both are zero.
+        I = 1 / (2π (1 - cos θ_max)), E = I D / d³.  Outside θ_max the last two are zero.
         """
         distance = abs(z - self.position[2])
         if self.tilted:
@@ -252,9 +252,9 @@ class Point(Emitter):
         return distance / (2 * math.pi * (1 - math.cos(self.edge))), 0.0, 3, min_cosine
 
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
-        """Return the rectangle of the plane z that holds all rays that can meet the first surface in its outline.
+        """Return the rectangle of the plane z with all rays that can meet the first surface inside its outline.
 
-        The surface lies between that plane and those at `sags` (mm) from it.  A surface that bends towards the source
+        The surface lies between the planes at `sags` (mm) above the plane z.  A surface that bends towards the source
         is seen at a wider angle; one that bends away may be seen shifted by a source off the axis.
         """
         distance = abs(z - self.position[2])

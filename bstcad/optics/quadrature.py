@@ -32,7 +32,7 @@ gauss_rule = functools.cache(np.polynomial.legendre.leggauss)  # points and weig
 
 @dataclass(frozen=True)
 class Border:
-    """Gauss points of the closed curves around a face, seen against z: outer ones counterclockwise, holes clockwise."""
+    """Gauss points of closed curves around a face, seen along -z: outer curves counterclockwise, holes clockwise."""
 
     x: np.ndarray  # coordinates of the points (n,), mm
     y: np.ndarray
@@ -60,7 +60,7 @@ class Sums:
 def of_face(face: Surface, border: Border, raised: float = 0.0) -> Sums:
     """Integrate over z = h(x, y) + raised inside a border, n dA = (-h_x, -h_y, 1) dx dy; float64 on the CPU.
 
-    ∫∫ g dx dy = -∮ G dx with G = ∫ g dy along a chord of constant x from y = 0 to the border, both by Gauss points.
+    ∫∫ g dx dy = -∮ G dx with G = ∫ g dy along a chord of constant x from y = 0 to the border; two Gauss quadratures.
     """
     total = Sums()
     counted = np.flatnonzero(np.abs(border.dx) > MIN_RELATIVE_DX * border.ds)

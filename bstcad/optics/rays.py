@@ -23,10 +23,10 @@ class Status(IntEnum):
 
     ALIVE = 0
     MISSED_FRONT = 1  # missed the clear aperture of the first surface
-    VIGNETTED = 2  # met a later face of the solid outside its clear aperture, or missed it
+    VIGNETTED = 2  # missed a later face of the solid, or met it outside its clear aperture
     TOTAL_REFLECTION = 3  # total internal reflection at a face
     TURNED_BACK = 4  # left the last surface, but not towards the receiver
-    BLOCKED = 5  # met a window or mirror behind the lens outside its outline, or missed it
+    BLOCKED = 5  # missed a window or mirror behind the lens, or met it outside its outline
 
 
 TENSORS = ("position", "direction", "flux", "status")  # names of the tensors of a bundle
@@ -42,7 +42,7 @@ class Rays:
     status: Tensor  # (…) uint8, Status of each ray
     axial: bool = False  # True if every direction is (0, 0, sense), so that intersections need no iteration
     z: float = 0.0  # mm, reference plane of the positions: sags keep their digits far from the origin
-    sense: int = 1  # +1 or -1, direction of the light along z; rays against it are lost at the next surface
+    sense: int = 1  # +1 or -1, direction of the light along z; rays of opposite sense are lost at the next surface
     taken: Mapping[str, Tensor] = field(default_factory=lambda: NO_LOSSES)  # (…) flux lost, by ledger line
 
     @property

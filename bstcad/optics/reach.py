@@ -27,7 +27,7 @@ from bstcad.optics.receivers import Receiver, dot
 from bstcad.optics.tubes import rays_to
 
 MAX_EXIT_ANGLE = math.radians(85)  # largest angle of refraction in air (rad), at 0.2° from the critical angle in PMMA
-MAX_SLOPE = math.tan(math.radians(70))  # largest slope: no tool machines a steeper one; lens as thick as wide
+MAX_SLOPE = math.tan(math.radians(70))  # largest slope: no tool machines steeper faces; lens as thick as wide
 
 
 def largest_deflection(index: float, grazing: float = MAX_EXIT_ANGLE) -> float:
@@ -122,7 +122,7 @@ def _at_angle(d: Tensor, towards: Tensor, along: Tensor, angle: float) -> Tensor
 
 
 def reach_margin(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing: float = MAX_EXIT_ANGLE) -> Tensor:
-    """Return the margin of each ray (a cosine) to the limits of what the face can do; negative: out of reach.
+    """Return the margin of each ray (a cosine) to the limits of the face; negative: the aim is out of reach.
 
     It is the minimum of three: d · d' minus the cosine of the largest deflection; n_z - |(n_x, n_y)| / MAX_SLOPE of the
     normal n = η d - d'; and the cosine between the light and the receiver's normal on the side of the lens.

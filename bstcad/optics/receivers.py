@@ -106,7 +106,7 @@ class Receiver(ABC):
         return torch.stack([x - rays.position[0], y - rays.position[1], z - rays.above(0.0)])
 
     def clearance(self, outline: Outline, z: float) -> float:
-        """Return the distance (mm) along +z from an outline on the plane z to it; -inf: a part does not face it."""
+        """Return the distance (mm) along +z from an outline on the plane z to the receiver; -inf: a part misses it."""
         x, y = (torch.as_tensor(p, dtype=torch.float64) for p in outline.rim_points())
         along = torch.stack([torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)])
         start = torch.stack([x, y, torch.zeros_like(x)])
@@ -143,7 +143,7 @@ class Receiver(ABC):
 
 
 def _by_component(rays: Rays, position: Any, direction: Any) -> Rays:
-    """Return rays with a tuple of components, which receivers index like one, in place of each tensor (3, …)."""
+    """Return rays with a tuple of three components, which receivers index like a tensor, in place of each tensor."""
     return replace(rays, position=position, direction=direction)
 
 
@@ -211,7 +211,7 @@ class PlaneReceiver(Receiver):
         return math.fsum(n * (p - c) for n, p, c in zip(self.frame[2], point, self.middle, strict=True))
 
     def clearance(self, outline: Outline, z: float) -> float:
-        """Return the distance (mm) from an outline on the plane z to it; negative: it cuts the outline."""
+        """Return the distance (mm) from an outline on the plane z to the receiver; negative: they intersect."""
         return -self.height((0.0, 0.0, z)) - outline.reach(*self.frame[2][:2])
 
     def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:

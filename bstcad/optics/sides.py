@@ -46,7 +46,7 @@ def in_proportion(net: Sides, of: Sides, to: Sides) -> Sides:
 
 
 def coarser(net: Sides, longer: int) -> Sides:
-    """Return a net of the same span shape with `longer` control points on its longer side; `net` if that is finer."""
+    """Return a net of the same span shape with `longer` control points on its longer side; `net` if it is not finer."""
     longest = max(as_pair(net))
     return net if longer >= longest else scaled(net, (longer - 1) / (longest - 1))
 

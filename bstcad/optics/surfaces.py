@@ -252,7 +252,7 @@ class Conic(_Revolved):
 class Toroid(Surface):
     """z = z0 + R - sqrt((R - f)² - y²), R = 1 / c_y, f = c_x x² / (1 + sqrt(1 - c_x² x²)); c_y = 0: z = z0 + f.
 
-    It is the circle of curvature c_x in the plane y = 0, turned about the line parallel to x at z = z0 + R (a toric
+    It is the circle of curvature c_x in the plane y = 0, rotated about the line parallel to x at z = z0 + R (a toric
     surface of ISO 10110-12).  With one curvature 0 it is a cylinder, with two equal ones a sphere.
     """
 
@@ -305,7 +305,7 @@ def _root(square: Tensor) -> Tensor:
 class Recess(Surface):
     """Surface of revolution inside a circle, continued outside by the plane z = const through its rim.
 
-    Examples are the dome over an LED in a flat underside, or a bulge of it.  Light is traced to the optical part alone.
+    Examples are a dome over an LED in a flat underside, or a bulge there.  Light is traced to the optical part alone.
     """
 
     face: Sphere | Conic  # optical part

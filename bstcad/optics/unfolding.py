@@ -63,7 +63,7 @@ class Image(PlaneReceiver):
         return replace(self, centre=centre, vectors=(e_x, e_y, (-n_x, -n_y, -n_z)))
 
     def plain(self) -> Receiver:
-        """Return a level plane with the axes of space as LevelPlane, else itself."""
+        """Return a level plane with the axes of space as LevelPlane, other images unchanged."""
         (c_x, c_y, z), (o_x, o_y) = self.centre, self.origin
         return LevelPlane(z) if self.frame == LevelPlane.axes and (c_x, c_y) == (o_x, o_y) else self
 

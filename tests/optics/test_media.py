@@ -104,7 +104,7 @@ class TestMetals:
     @pytest.mark.parametrize("metal", ["Al", "Gold"])
     def test_they_make_no_lens(self, metal):
         for question in (refractive_index, absorption_coefficient):
-            with pytest.raises(ValueError, match="is a metal, which light does not pass"):
+            with pytest.raises(ValueError, match="is a metal, which transmits no light"):
                 question(metal, 550.0)
         with pytest.raises(ValueError, match="is a metal"):
             density(metal)
@@ -133,7 +133,7 @@ class TestNames:
             ("PMNA", "did you mean 'PMMA'"),
             ("unobtainium", "known are PMMA, .* as 'shelf/book/page'; or give the index itself"),
             ("specs/SCHOTT-optical/N-LAK33", "did you mean .*'specs/SCHOTT-optical/N-LAK33A'"),
-            ("main/SiO2", "'main/SiO2' holds 16 pages .*'main/SiO2/Malitson', .* and others; give one of them"),
+            ("main/SiO2", "'main/SiO2' contains 16 pages .*'main/SiO2/Malitson', .* and others; give one of them"),
             ("main/AgGaSe2/Boyd-o", "cannot be read"),
             ("x" * 100_000, "is not a known material"),
         ],

@@ -133,7 +133,7 @@ WRONG = {
         ({"lens.outline": {"shape": "circle", "radius": 8.0}, "lens.back.control_points": 5},
          "lens.back.control_points: 5 is too few for a round lens, .*; give 6 or more"),
         ({"source.diameter": "15.1"}, "source.diameter: 15.1 mm is more than the 15 mm from the source to the lens"),
-        ({"source.width": "1"}, "source.height: missing, and a source with a width needs it; add it in mm"),
+        ({"source.width": "1"}, "source.height: the key is missing; add it in mm"),
         ({"source.diameter": "1", "source.width": "1"}, "source.diameter: the source also has a width; give a"),
         ({"source.tilt": "[180, 0]"}, "source.tilt: no light reaches the lens; turn"),
         ({"lens.front": '{ kind = "sphere", z = 15.0, curvature = -0.05 }',

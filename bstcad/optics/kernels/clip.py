@@ -1,4 +1,4 @@
-"""Fused CPU kernels (numba) behind `tubes.collect`: triangles of light, cut exactly at the pixel borders.
+"""Fused CPU kernels (numba) behind `tubes.collect`: triangles of light, clipped exactly at the pixel borders.
 
 A triangle of flux F and signed area A has the density F / A.  By Green's theorem its flux in pixel (i, j) is a line
 integral along its edges,
@@ -12,7 +12,7 @@ followed: one that lies in one pixel or has no area gives its flux to a pixel, a
 invalid corner gives none.  Their edges get the density 0, so that they do not affect their neighbours.
 
 With G = ∂L/∂I and H(x, y) = ∫_y^∞ G dy the adjoint needs for each edge Φ = ∫ H dx (for ∂L/∂A) and ∫ (1 - s) G ds,
-∫ s G ds (an edge that moves by δ sweeps the area δ · n ds, n its normal).  They are the same for both triangles.
+∫ s G ds (an edge that moves by δ sweeps the area δ · n ds, n its normal).  They are the same for the two triangles.
 
 All lengths are in pixels, x along columns, y down the rows.  Columns come first in the sums, as x does in a sheet of
 tubes: the rows of tubes that one part takes reach few of them.
@@ -33,7 +33,7 @@ from bstcad.optics.kernels.compiling import compiled
 
 MAX_DISTANCE = 1e15  # largest coordinate of a corner (pixels); farther away a pixel is below its rounding
 NO_BORDER = 1e300  # s of the next border of an edge that crosses no more borders along an axis
-MAX_WIDTH = 1e6  # largest width of a row of tubes (pixels) whose columns are known; rounding may reach any other
+MAX_WIDTH = 1e6  # width of a row of tubes (pixels) above which rounding may reach any column
 ROWS_PER_STRIP = 16  # rows of tubes whose gradient one thread computes at a time
 
 ON, OUT_OF_RANGE = 0, 16  # state of a corner: on the screen; outside MAX_DISTANCE or not a number
@@ -326,7 +326,7 @@ def _clear_columns(own, touched, x):
 
 @compiled(parallel=True)
 def _clip(corner, flux, thinnest, sums, touched, far):
-    """Add the flux of both triangles of each tube to `sums`, (parts, columns, rows + 1), and set `far`, (parts,).
+    """Add the flux of the two triangles of each tube to `sums`, (parts, columns, rows + 1), and set `far`, (parts,).
 
     corner (2, n + 1, m + 1): corners of the tubes (pixels).  flux (n, m): flux of the tubes.  thinnest: smallest area
     of a triangle that is followed (pixels²).  touched (parts, 2): range of the columns of `sums` that are in use.
@@ -376,7 +376,7 @@ def _triangle_adjoint(a, b, c, ab, bc, ca, flux):
 
 @inlined
 def _mean(g, a, b, c):
-    """Return G at the pixel that takes the flux of a triangle which is not followed."""
+    """Return G at the pixel that receives the flux of a triangle which is not followed."""
     columns, rows = g.shape
     if misses_screen(a, b, c):
         return 0.0

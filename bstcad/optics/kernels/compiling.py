@@ -1,7 +1,7 @@
 """Compilation of kernels with a cache that depends on all files of this folder.
 
 numba's own cache depends on a kernel's own file only: a change of a function imported from another file would not
-recompile the kernel.  So the caches lie in a folder named after the contents of all these files.
+recompile the kernel.  So the caches lie in a folder named after the contents of all files of this folder.
 """
 
 from __future__ import annotations

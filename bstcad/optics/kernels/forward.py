@@ -439,7 +439,7 @@ def _dim(faces, losses, count, work, lines):
 
 @compiled()
 def _rows(net, beam, faces, tilted, losses, cells, pixels, first, step, box, tent, lines):
-    """Simulate a part of the light: every step-th row of cells from `first` on, added to sums of its own."""
+    """Simulate a part of the light: every step-th row of cells from `first` on, added to the part's sums."""
     work, active, part = np.empty(WORK), np.empty(BLOCK, np.uint32), np.empty(LINES)
     for i in range(first, cells.n, step):
         for j in range(0, cells.n, BLOCK):

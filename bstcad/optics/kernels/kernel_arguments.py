@@ -29,9 +29,9 @@ TABLE_SIDES = 65, 129, 257, 513  # control points per side of a table of light, 
 IRRADIANCE_TOLERANCE = 1e-5  # largest RMS of a table's relative error in the irradiance, far below any picture's
 MIN_IRRADIANCE = 1e-4  # irradiance relative to its maximum, below which the error counts relative to this value
 SLOPE_TOLERANCE = 1e-8  # largest RMS of a table's error in the slopes of rays
-PEAK_TO_RMS = 100.0  # largest error of a table relative to these tolerances: the outermost spans are the least exact
+PEAK_TO_RMS = 100.0  # largest error of a table / these tolerances: the outermost spans are the least exact
 MAX_LIGHT_TABLES = 16  # tables of light in the cache
-MAX_TABLE_ERROR_RATIO = 0.5  # largest ratio of the error of a table to that of the coarser one; more: an edge
+MAX_TABLE_ERROR_RATIO = 0.5  # largest ratio of a table's error to the coarser table's; above: an edge
 
 
 def rules() -> Rules:

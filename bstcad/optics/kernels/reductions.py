@@ -93,7 +93,7 @@ def _dot(a, b, sums):
 
 @njit(inline="always")
 def clear(own, touched, first, last):
-    """Clear those of rows first … last - 1 of a part outside the range `touched` (2,), and extend the range."""
+    """Clear the rows first … last - 1 of a part that lie outside the range `touched` (2,), and extend the range."""
     if first < touched[0] or last > touched[1]:
         _widen(own, touched, first, last)
 
