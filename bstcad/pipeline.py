@@ -56,23 +56,23 @@ from bstcad.tailoring.source_image import ExtendedSource
 from bstcad.tailoring.stage2 import Comparison, compare_precisions
 from bstcad.transport.mapping import Mapping, TransportMap
 
-PROCEDURES: dict[str, tuple[str, Stage, Stage]] = {  # (name of stage 1, stage 1, stage 2) for each tailoring.method
+PROCEDURES: dict[str, tuple[str, Stage, Stage]] = {  # tailoring.method -> (name of stage 1, stage 1, stage 2)
     "least-squares": ("stage 1", stage1.steps, stage2.steps),
     "adam": ("stage 1", paper.stage1, paper.stage2),
     "integration": ("integration", integration.steps, stage2.steps),  # with no evaluations in stage 2
 }
 Stage1State = stage1.SlopeRound | paper.Level | two_faces.FrontRound
 Stage2State = stage2.TubeSearch | paper.RaySearch | stage2.Stage3State
-SOLUTION_SIGNS = {"convex": 1.0, "concave": -1.0}  # sign of each tailoring.solution
+SOLUTION_SIGNS = {"convex": 1.0, "concave": -1.0}  # sign σ (light_behind.py) for each tailoring.solution
 DEVICES = ("auto", "cpu", "cuda")
 COMPARISON_STAGE = "float32 beside float64"  # name of the stage that compares precisions
-# Seconds for writing, verification and report on two cores: in all, per net of 513 x 513 control points, per picture of
-# 512 x 512 pixels, and per target for the finer flux tubes that two nets need.
+# Seconds for writing, verification and report on two cores: constant part, per net of 513 x 513 control points, per
+# picture of 512 x 512 pixels, and per target for the finer flux tubes that two nets need.
 BASE_SECONDS, SECONDS_PER_NET, SECONDS_PER_PICTURE, SECONDS_PER_WITNESS = 4.0, 5.0, 3.0, 15.0
 REACH_NET = 33  # control points per side of the flat back with which the reach of light is computed
 MIN_REACHABLE = 1e-3  # smallest fraction of a target's light that must be reachable
 REACH_REMEDIES = {  # advice for a target that light cannot reach completely, for each optic
-    "lens": "move the target nearer to the axis or further away, take a higher lens.index, or reflect with a mirror",
+    "lens": "move the target nearer to the axis or further away, raise lens.index, or use a mirror",
     "mirror": "move the target nearer to where a flat mirror would send the light, or further away",
 }
 
@@ -81,24 +81,24 @@ REACH_REMEDIES = {  # advice for a target that light cannot reach completely, fo
 class Stage1Result:
     """The result of stage 1."""
 
-    lens: Parameters
+    lens: Parameters  # parameters of the lens after stage 1
     mapping: Mapping  # transport map of stage 1
     transport: TransportMap  # inverse map, from the pixels of the target
-    precision: Comparison | None  # comparison of float32 with float64; None if there was no time for it
+    precision: Comparison | None  # comparison of float32 with float64; None: not made
     rrmsd: float  # RRMSD of the lens for the centre of the source, without a mount
 
 
 @dataclass(frozen=True)
 class DesignState:
-    """The state of a design from which it can be continued; a checkpoint holds it by the names of its fields."""
+    """State from which a design can be continued; a checkpoint stores it under the names of its fields."""
 
-    record: DesignRecord
+    record: DesignRecord  # times and history so far
     first: Stage1State | None = None  # state of stage 1; None: it has ended
     followed: Stage1Result | None = None  # result of stage 1; None: it has not ended
     second: Stage2State | None = None  # state of stage 2 or 3; None: it has not begun, or it has ended
-    best: RatedLens | None = None  # best lens at the ends of the parts of stage 2 or 3 so far
-    lens: Parameters | None = None  # lens after stage 2 or 3
-    stopped: str = ""  # reason why tailoring ended
+    best: RatedLens | None = None  # best lens at the end of a part of stage 2 or 3 so far; None: no part has ended
+    lens: Parameters | None = None  # lens after stage 2 or 3; None: tailoring has not ended
+    stopped: str = ""  # reason why tailoring ended; "": it has not ended
 
 
 @dataclass(frozen=True)
@@ -106,8 +106,8 @@ class DesignOptions:
     """Options of a design that its scene does not state."""
 
     merit: PictureError | None = None  # function of a picture and the target that stages 2 and 3 minimise; None: RRMSD²
-    compare_later: bool = False  # compare float32 with float64 only when a report asks for it (`Made.with_report_data`)
-    preview: bool = False  # make a preview, see `Task.preview`; the scene itself states its size
+    compare_later: bool = False  # compare float32 with float64 only when a report needs it (`Made.with_report_data`)
+    preview: bool = False  # make a preview, see `Task.preview`
 
 
 def design(
@@ -121,14 +121,14 @@ def design(
 ) -> Made:
     """Design the lens of a scene: transport map, stage 1, and stage 2, or stage 3 for an extended source.
 
-    hooks: functions that are called while it runs.  Once `hooks.interrupted` returns True, tailoring ends with the best
-    lens so far, or with KeyboardInterrupt if there is no lens yet.
+    hooks: functions that are called during the design.  Once `hooks.interrupted` returns True, tailoring ends with the
+    best lens so far, or with KeyboardInterrupt if there is no lens yet.
     began: start of tailoring.max_time (time.perf_counter(), default now), which includes writing and verification.
-    start: state that `hooks.save` received; the design continues from it and ends the same.
+    start: state that `hooks.save` received; the design continues from this state and has the same result.
     """
     began, merit = time.perf_counter() if began is None else began, options.merit
     if merit is not None and (len(scene.targets) > 1 or scene.wavefront is not None):
-        raise SceneError("merit: needs a scene with one goal, but the scene has more; remove merit, or the other goals")
+        raise SceneError("merit: needs a scene with one goal, but this one has several; omit merit, or the other goals")
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
     goals, edge = within_reach(scene, hooks.progress)
@@ -153,7 +153,7 @@ def design(
     else:
         lens, stopped = _stage2(task, driver, lens, followed, state=start.second, best=start.best)
     lens = replace(lens.plain(), index=scene.index, losses=None)
-    if scene.lens.front.fixed:  # tailoring may have used it in float32
+    if scene.lens.front.fixed:  # tailoring may have converted the front to float32
         lens = replace(lens, front=scene.lens.front_surface)
     sent, source = followed.transport, task.heaviest.source
     at_back = sent.plane == "back"
@@ -166,9 +166,9 @@ def design(
 
 
 def within_reach(scene: Scene, progress: Progress) -> tuple[tuple[Goal, ...], Edge | None]:
-    """Return (goals, edge): the goals of a scene restricted to their reachable parts, and the edge of the reach.
+    """Return (goals, edge): the goals of a scene restricted to their reachable parts, and the light at the edge.
 
-    `progress` reports each target that light cannot reach completely.  SceneError as for `reachable_part`.
+    `progress` reports each target that light cannot reach completely.  SceneError as in `reachable_part`.
     """
     goals: list[Goal] = []
     edge = None
@@ -176,13 +176,13 @@ def within_reach(scene: Scene, progress: Progress) -> tuple[tuple[Goal, ...], Ed
         part, its_edge = reachable_part(alone, goal)
         if part is not None:
             key = f"{goal.key}: " if len(scene.targets) > 1 else ""
-            progress("reach", 0, 0, f"{key}{unreachable(alone, part, goal.picture)}; the design is for the other part")
+            progress("reach", 0, 0, f"{key}{unreachable(alone, part, goal.picture)}; the design omits this part")
         goals, edge = [*goals, goal.restricted(part)], edge or its_edge
     return tuple(goals), edge
 
 
 def task_of(scene: Scene, goals: Sequence[Goal], knobs: ResolvedTailoring, edge: Edge | None) -> Task:
-    """Return the task of a scene; goals, edge: see `within_reach`."""
+    """Return the task of a scene; goals, edge: results of `within_reach`."""
     light = scene.with_source_scaled(0.0).channels()
     sizes = stage2.SOURCE_SIZES if scene.source.extent and knobs.method != "integration" else ()
     scaled = [scene.with_source_scaled(share) for share, _ in sizes]
@@ -196,9 +196,9 @@ def task_of(scene: Scene, goals: Sequence[Goal], knobs: ResolvedTailoring, edge:
 
 
 def with_solution(scene: Scene, task: Task) -> Task:
-    """Return the task with the solution, convex or concave, that demands less of two freeform faces.
+    """Return the task with the solution, convex or concave, that requires less of two freeform faces.
 
-    `task.progress` reports their limits.  SceneError if the faces cannot make the pictures.
+    `task.progress` reports the angles and limits of the faces.  SceneError if the faces cannot make the pictures.
     """
     lens = scene.flat_lens(REACH_NET)
     if not lens.shapes_two_faces or not task.several:
@@ -213,7 +213,7 @@ def with_solution(scene: Scene, task: Task) -> Task:
 
 
 def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tuple[str, Steps]:
-    """Return name and steps of the stage after stage 1: stage 2, or for a source of finite size stage 3."""
+    """Return (name, steps) of the stage after stage 1: stage 2, or stage 3 for a source of finite size."""
     *_, stage = PROCEDURES[task.knobs.method]
     if not task.sampled_sources:
         return "stage 2", stage(task, lens, state)
@@ -222,9 +222,9 @@ def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tu
 
 
 def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | None]:
-    """Return (part, edge) for a scene with one goal: True in the pixels (rows, columns) that light can reach, and Edge.
+    """Return (part, edge) of a scene with one goal: True in the pixels (rows, columns) that light can reach, and Edge.
 
-    (None, None): light can reach the whole picture.  A mirror has no edge, as only its slope limits the reach.
+    (None, None): light can reach the whole picture.  edge is None for a mirror, whose reach is limited by slope alone.
     SceneError if light can reach no part, or not all of a target with target.unreachable = "refuse".
     """
     if scene.lens.front.is_tailored:  # with two tailored faces `with_solution` finds the limits
@@ -249,19 +249,19 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
 
 
 def unreachable(scene: Scene, part: np.ndarray, picture: np.ndarray) -> str:
-    """Return a sentence on the unreachable part of a target and the reason, without a full stop."""
+    """Return a sentence, without full stop, on the unreachable part of a target and the reason."""
     found = unreached(picture, part, scene.lens.passes.largest_turn(scene.index))
     area, light = (f"{100 * (found[key] or 0.0):.2g} %" for key in ("area", "light"))
     why = "no slope up to 70 degrees sends light there"
     if found["angle"] is not None:
-        why = f"a face of index {scene.index:.4g} turns light by less than {found['angle']:.3g} degrees, or reflects it"
+        why = f"a face of index {scene.index:.4g} deflects light by less than {found['angle']:.3g} degrees"
     return f"{area} of the target, with {light} of its light, cannot be lit: {why}"
 
 
 def resolved(scene: Scene, lens: Lens) -> Scene:
-    """Return the scene with the designed front as a fixed one, so that its design is the same.
+    """Return the scene with the designed front as a fixed front, so that a new design gives the same lens.
 
-    A scene with the paper's procedure or a freeform front, found together with the back, is returned as it is.
+    A scene with the paper's procedure, or with a front that is tailored together with the back, is returned unchanged.
     """
     if scene.tailoring.resolved(lens.back_net.shape).method == "adam":
         return scene
@@ -270,7 +270,7 @@ def resolved(scene: Scene, lens: Lens) -> Scene:
 
 
 def check_front(lens: Lens, scene: Scene) -> None:
-    """Raise SceneError if the designed front is impossible in the scene, as no command could read such a design."""
+    """Raise SceneError if the scene does not allow the designed front, since no command could read such a design."""
     if not scene.lens.front.free:
         return
     try:
@@ -280,7 +280,7 @@ def check_front(lens: Lens, scene: Scene) -> None:
 
 
 def _with_comparison(making: DesignCourse, task: Task, lens: Lens, before: int) -> DesignCourse:
-    """Return the record with the comparison of precisions for the lens of stage 1, after `before` stages."""
+    """Return the record with the comparison of precisions for the lens of stage 1, inserted after `before` stages."""
     began, cpu = time.perf_counter(), time.process_time()
     comparison = cast(PrecisionTest, asdict(compare_precisions(task, lens)))
     stage = StageRecord(COMPARISON_STAGE, time.perf_counter() - began, cpu_seconds=time.process_time() - cpu)
@@ -312,7 +312,7 @@ def _design_course(result: Stage1Result, record: DesignRecord, stopped: str, ste
 def _stage1(
     scene: Scene, task: Task, driver: Driver, lens: Lens, *, state: Stage1State | None, compare: bool
 ) -> Stage1Result:
-    """Run stage 1 from the blank or from a state, and compare precisions after it if `compare` is True."""
+    """Run stage 1 from the blank or from a state; if `compare`, then compare the precisions."""
     if driver.reason_to_interrupt and state is None:
         raise KeyboardInterrupt  # there is no lens yet
     name, stage, _ = PROCEDURES[task.knobs.method]
@@ -352,11 +352,11 @@ def _stage1(
 def _stage2(
     task: Task, driver: Driver, lens: Lens, followed: Stage1Result, *, state: Stage2State | None, best: RatedLens | None
 ) -> tuple[Lens, str]:
-    """Run stage 2, and 3 for an extended source, from the result of stage 1 or from a state.
+    """Run stage 2, or stage 3 for an extended source, from the result of stage 1 or from a state.
 
-    Return the lens and the reason why the stage ended.  The lens is no worse than that of stage 1 or of any part.
+    Return the lens and the reason why the stage ended.  No lens of stage 1 or of a part is better than this lens.
     """
-    if state is None and not driver.reason_to_interrupt:  # an interrupt leaves an incomplete stage 1: no state of it
+    if state is None and not driver.reason_to_interrupt:  # an interrupt leaves stage 1 incomplete: do not save it
         driver.hooks.save(DesignState(driver.record, followed=followed))
     name, steps = second_stage(task, lens, state)
     full = task.at_full_size
@@ -377,7 +377,7 @@ def _stage2(
 
 
 def _final_lens(task: Task, driver: Driver, last: StageStep, before: Sequence[RatedLens]) -> Lens:
-    """Return the corrected lens of the last step of a stage, or a corrected earlier lens if that is better.
+    """Return the corrected lens of the last step of a stage, or a corrected earlier lens if it is better.
 
     before: earlier lenses, the best first.  The paper's procedure always returns its last lens.
     """
@@ -404,7 +404,7 @@ def _final_lens(task: Task, driver: Driver, last: StageStep, before: Sequence[Ra
 
 
 def _corrected(task: Task, lens: Lens) -> Lens:
-    """Return the lens without total reflection at the edge of its reach, with separate faces, within its bounds."""
+    """Return the lens corrected for total reflection at the edge of the reach, crossing faces, and bounds."""
     if task.edge is not None:
         lens = without_reflection(lens, task.edge)
     bounds = active_bounds(lens, task.bounds, task.min_thickness)
@@ -414,7 +414,7 @@ def _corrected(task: Task, lens: Lens) -> Lens:
 
 
 def _is_changed(lens: Lens, other: Lens) -> bool:
-    """Return True if the other lens has other heights, or its back at another z."""
+    """Return True if two lenses differ in heights or in the z of the back."""
     nets = zip(lens.nets, other.nets, strict=True)
     return lens.back.z != other.back.z or any(a.heights is not b.heights for a, b in nets)
 
@@ -422,18 +422,18 @@ def _is_changed(lens: Lens, other: Lens) -> bool:
 def device_for(asked: str) -> str:
     """Return the device of tailoring, "cpu" or "cuda"; SceneError for an unknown or missing device.
 
-    "auto" is the CPU, for which the kernels are compiled.  A GPU runs the plain form in torch, only on request: its
-    results and its speed there have not been measured.
+    "auto" is the CPU, for which the kernels are compiled.  On a GPU the plain form in torch runs; its accuracy and
+    speed have not been measured.
     """
     if asked not in DEVICES:
         raise SceneError(f"device: {asked!r} is not possible; give one of {', '.join(DEVICES)}")
     if asked == "cuda" and not torch.cuda.is_available():
-        raise SceneError("device: this machine has no CUDA device that torch can use; give cpu")
+        raise SceneError("device: torch finds no CUDA device on this machine; give cpu")
     return "cuda" if asked == "cuda" else "cpu"
 
 
 def reserve(scene: Scene) -> float:
-    """Return an estimate of the seconds for writing, verification and report on two cores."""
+    """Return the estimated seconds for writing, verification and report on two cores."""
     pixels = sum(math.prod(target.columns_rows) for target in scene.targets) / 512**2
     nets = scene.lens.nets()
     points = sum(math.prod(as_pair(net)) for net in nets) / 513**2
@@ -442,7 +442,7 @@ def reserve(scene: Scene) -> float:
 
 
 def purpose(scene: Scene, device: str) -> dict[str, Any]:
-    """Return everything that the result of `design` depends on, by which a checkpoint is recognised."""
+    """Return all data that determine the result of `design`; a checkpoint with equal data is of the same design."""
     keys = scene.model_dump(mode="json", exclude={"name", "title", "output", "accept"})
     return {
         "version": bstcad.__version__,
@@ -453,16 +453,16 @@ def purpose(scene: Scene, device: str) -> dict[str, Any]:
 
 
 def require_light(lens: Lens, rrmsd: float) -> float:
-    """Return the RRMSD after stage 1; SceneError if no light reaches the target, which later stages cannot change."""
+    """Return the RRMSD after stage 1; SceneError if no light reaches the target, as no later stage can correct this."""
     angle = lens.passes.largest_turn(lens.index)
     if not math.isfinite(rrmsd) and angle is None:
         raise SceneError(
-            "target: no light from the mirror reaches the target; move it nearer to where a flat mirror would send the "
-            "light, or further from the mirror along +z"
+            "target: no light from the mirror reaches the target; move the target nearer to where a flat mirror would "
+            "send the light, or further from the mirror along +z"
         )
     if not math.isfinite(rrmsd):
         raise SceneError(
-            f"target: no light reaches the target, as a face of index {lens.index:.4g} turns light by at most "
+            f"target: no light reaches the target, as a face of index {lens.index:.4g} deflects light by at most "
             f"{angle:.3g} degrees; move the target nearer to where the light falls without the lens"
         )
     return rrmsd
@@ -474,20 +474,20 @@ def require_bounded_light(scene: Scene, rrmsd: float) -> float:
         return rrmsd
     keys = scene.lens.bounded_by or ("min_thickness",)
     bounds = " and ".join(f"lens.{key} = {getattr(scene.lens, key):g}" for key in keys)
-    raise SceneError(f"{bounds}: no back that meets this bound sends light to the target; loosen the bound")
+    raise SceneError(f"{bounds}: no lens within these bounds sends light to the target; relax a bound")
 
 
 def check_thickness(lens: Lens, scene: Scene) -> None:
-    """Raise SceneError if front and back cross, or the back reaches the next part, before the long stage 2."""
+    """Raise SceneError, before the long stage 2, if front and back cross or the back reaches the next part."""
     thinnest, thickest = thickness_range(lens.plain())
     if not thinnest > 0:
         raise SceneError(
             f"lens.front.z: the back that this target needs would cross the front by {-thinnest:.3g} mm; "
-            f"lower the front by more than that, widen the target or make the lens smaller"
+            f"lower lens.front.z by more than this, widen the target, or make the lens smaller"
         )
     room, key = scene.clearance(reach := lens.front.z + thickest)
     if not room > 0:
         raise SceneError(
-            f"{key}: the back that this target needs would reach this part, at z = {reach:.4g}; move the part further "
-            f"along +z, or lower the front"
+            f"{key}: the back that this target needs would reach this part, since it extends to z = {reach:.4g} mm; "
+            f"move the part further along +z, or lower lens.front.z"
         )

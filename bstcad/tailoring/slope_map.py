@@ -1,23 +1,23 @@
 """The transport map of stage 1: optimal transport from points of a face to its slopes, a map that a surface can follow.
 
-The map of Wang et al. 2023 leads from source points to target points.  It is a gradient in the paraxial limit only; off
-axis, the part of it that no surface can follow is lost in stage 1.  Here the same transport problem is solved in
-coordinates in which a surface is a gradient.  A ray that meets the last freeform face at b and shall reach the target
-point t needs the slope p(b, t), which follows from Snell's law or the law of reflection in closed form.  With m the
-centroid of the light on the target,
+The map of Wang et al. 2023 leads from source points to target points.  It is a gradient only in the paraxial limit;
+off axis, stage 1 loses the part that no surface can follow.  Here the transport problem is solved between points of the
+face and slopes, where the map is the gradient of the surface.  A ray that meets the last freeform face at b and shall
+reach the target point t needs the slope p(b, t), which follows from Snell's law or the law of reflection in closed
+form.  With the centroid m of the light on the target, the coordinate
 
     y = σ (p(b, t) - ∇g(b)),    ∇g(b) ≈ p(b, m)
 
 hardly depends on b for a fixed t; g is nearly the surface that focuses all light on m.  The optimal transport map
 b -> y is ∇φ of a convex φ, so that σ y + ∇g are the slopes of a surface.  σ = 1 where light leaves the glass.  Mirrors,
-and faces where light enters the glass, turn light against their slope: there σ = -1, so that rays of neighbouring
+and faces where light enters the glass, deflect light against their slope: there σ = -1, so that rays of neighbouring
 points do not cross.  If there are surfaces behind the net, light is aimed at the image of the target through them
 (optics/unfolding.py).  The remaining dependence on b, of the order of t - m, enters through the b that the previous
-round assigned to each t.  At the fixed point the surface solves the Monge-Ampère problem of the system, off axis, in
-the near field and behind a curved front alike, for any g.
+round assigned to each t.  At the fixed point the surface solves the Monge-Ampère problem of the system for any g, also
+off axis, in the near field and behind a curved front.
 
 `map_to_target` and `aim_points` are the map of the paper, from the vertex plane of the front to the target, and the aim
-of each ray.  Stage 1 falls back on them, and the baselines follow them.
+of each ray.  Stage 1 falls back on this map, and the baselines use it.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ from bstcad.transport.density import Density, resample_flux
 from bstcad.transport.mapping import Frame, Mapping, Points, TransportMap, nodes, solve
 from bstcad.transport.mapping import Solver as Solver  # exported to rooms that may not import transport
 
-SUBCELLS = 2  # samples of the light in a transport cell along each axis: a rim may cross the cell
-SUBPIXELS = 8  # parts of a pixel per transport cell along each axis; at least one part per pixel
-SLOPE_FLOOR = 1e-3  # floor under the slope density, relative to its mean, that the solver needs in black parts
+SUBCELLS = 2  # samples of the light per axis in a transport cell, since a rim may cross the cell
+SUBPIXELS = 8  # parts of pixels per axis in a transport cell; a pixel has at least one part
+SLOPE_FLOOR = 1e-3  # smallest slope density, relative to its mean: the solver needs some density in black parts
 GATHERING_NET, GATHERING_SAMPLES = 33, 96  # control points per side of g, and samples per side for its fit
-GATHERING_WIDTH = (GATHERING_NET - 1) / (GATHERING_NET - 5)  # width of g relative to the window: end spans lie outside
+GATHERING_WIDTH = (GATHERING_NET - 1) / (GATHERING_NET - 5)  # width of g / width of the window: end spans lie outside
 GATHERING_FIT = Fit(bending=1e-3, steps=40, degree=5)  # fit of g
-PARABOLOID_FIT = Fit(steps=0, degree=2)  # fit of g by a paraboloid, where no face focuses the light
-PREVIEW_FIT, PREVIEW_SAMPLES = Fit(steps=0, degree=5), 32  # fit and samples of g in a preview, in a fifth of the time
-TARGET_FLOOR = 1e-3  # floor under the irradiance of the target, relative to its mean
+PARABOLOID_FIT = Fit(steps=0, degree=2)  # fit of g by a paraboloid, if no face can focus the light
+PREVIEW_FIT, PREVIEW_SAMPLES = Fit(steps=0, degree=5), 32  # fit and samples of g in a preview, a fifth of the time
+TARGET_FLOOR = 1e-3  # smallest irradiance of the target in the map of the paper, relative to its mean
 
 Slopes = tuple[Tensor, Tensor]  # ∂z/∂x and ∂z/∂y, of one shape
 
@@ -73,12 +73,12 @@ class FaceGrid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Cells along x and along y."""
+        """Number of cells along x and along y."""
         m, n = self.density.shape
         return m, n
 
     def thinned(self, samples: int) -> FaceGrid:
-        """Return the grid with every k-th of its cells along each axis, about `samples` of them."""
+        """Return the grid with every k-th cell along each axis, about `samples` cells per axis."""
         thin = tuple(slice(step // 2, None, step) for step in (max(1, n // samples) for n in self.shape))
         position, direction = (v[:, *thin] for v in (self.at_face.position, self.at_face.direction))
         return FaceGrid(self.window, replace(self.at_face, position=position, direction=direction), self.density[thin])
@@ -88,8 +88,8 @@ class FaceGrid:
 def face_grid(source: Emitter, lens: Lens, window: Rectangle, cells: Sides) -> FaceGrid:
     """Return the rays that meet the last freeform face at the centres of `cells` cells of a window.
 
-    The flux density is that of the source on the vertex plane of the first surface, times |∂q/∂b|, where the ray
-    through b crosses that plane at q; less the losses at the faces and in the glass, with the present back.
+    The flux density is the irradiance from the source on the vertex plane of the first surface times |∂q/∂b|, where
+    the ray through b crosses this plane at q, minus the losses at the faces and in the glass.
     """
     x, y = (t.to(lens.like.device) for t in sampling.grid(window, cells))
     number = lens.freeform[-1]
@@ -112,7 +112,7 @@ def lit_window(source: Emitter, lens: Lens, n: int = 128) -> Rectangle:
     lit = grid.density > 0
     if not bool(lit.any()):
         raise SceneError(
-            "source: no ray of it reaches the back; move the source away from the front, or the back nearer to it"
+            "source: none of its rays reaches the back; move the source away from the front, or lower lens.back.z"
         )
     x, y, _ = grid.at_face.position
     x_max, y_max = (float(p.abs()[lit].max()) + 2.5 * 2 * half / n for p, half in ((x, half_x), (y, half_y)))
@@ -127,7 +127,7 @@ class SlopeMap:
     gathering: BSplineSurface  # surface g
     sign: float  # sign σ, 1 or -1
     face_points: Points  # b (mm) for the corners of the target's pixels, (columns + 1, rows + 1)
-    moved: float  # RMS change of b since the last round, at corners of lit pixels, in half windows; NaN: first round
+    moved: float  # RMS change of b since the last round at corners of lit pixels / half window width; NaN: first round
 
     def slopes(self, x: Tensor, y: Tensor) -> Slopes:
         """Return the slopes (∂z/∂x, ∂z/∂y) needed at points x, y (n,) of the last freeform face (mm)."""
@@ -141,10 +141,10 @@ class SlopeMap:
 def slope_map(
     lens: Lens, grid: FaceGrid, goal: Goal, previous: SlopeMap | None, solver: Solver, preview: bool = False
 ) -> SlopeMap:
-    """Return the map of one round, for the sag of `lens`.
+    """Return the slope map of one round, for the sag of `lens`.
 
     grid: `square_grid` of the lit window.  previous: map of the last round, which gives b(t); None: b = 0.
-    preview: fit g in a fifth of the time; the fixed point is the same.
+    preview: use a coarser fit of g, which does not change the fixed point.
     """
     picture, screen, law = goal.picture, image_screen(lens, goal.receiver), lens.last_freeform.law
     t = pixel_corners(screen)
@@ -157,7 +157,7 @@ def slope_map(
 
 
 def square_grid(source: Emitter, lens: Lens, window: Rectangle, n: int) -> FaceGrid:
-    """Return the `face_grid` of a square around a window, with SUBCELLS x SUBCELLS cells per cell of the transport."""
+    """Return the `face_grid` of a square around a window, with SUBCELLS² cells in each of n x n transport cells."""
     side = max(window.width, window.height)
     return face_grid(source, lens, Rectangle(side, side), n * SUBCELLS)
 
@@ -167,7 +167,7 @@ def transport_slopes(
 ) -> SlopeMap:
     """Return the map from the light of a `square_grid` to a picture, given the slopes needed for its pixel corners.
 
-    needed: slopes p(b, t) for the corners t of the pixels.  points: their b (mm) in the last round.
+    needed: slopes p(b, t) for the corners t of the pixels.  points: b (mm) of these corners in the last round.
     """
     side, n = grid.window.width, grid.shape[0] // SUBCELLS
     rho = grid.density.cpu().double().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
@@ -186,10 +186,10 @@ def fit_to_map(
 ) -> Lens:
     """Return the lens whose last net is fitted to the slopes of a map by least squares; its vertex stays.
 
-    A map may send a little light further than the face can, into the black around a picture; that light leaves at the
-    angle `grazing` (rad).  A point with light has the weight 1, bright or faint.  A point without light has the weight
-    `fit.unlit` and its present slopes; with 0 the bending energy alone shapes its surroundings.  parts: points per cell
-    of the grid along each axis.
+    A map may send a little light further than the face can, into the black around a picture; the slopes are limited so
+    that this light leaves at the angle `grazing` (rad).  Points with light have the weight 1.  Points without light
+    have the weight `fit.unlit` and their present slopes; with 0 only the bending energy shapes their surroundings.
+    parts: points per axis in each cell of the grid.
     """
     m, n = grid.shape
     centres = sampling.grid(grid.window, (parts * m, parts * n))
@@ -210,7 +210,7 @@ def fit_to_map(
 
 
 def centroid(picture: np.ndarray, screen: Screen) -> tuple[float, float]:
-    """Return the centroid (mm) of the light of a picture, row 0 = y max."""
+    """Return the centroid (x, y) (mm) of a picture on its screen, row 0 = y max."""
     sums = picture.sum(0), picture.sum(1)[::-1]
     share_x, share_y = (float(((np.arange(len(s)) + 0.5) * s).sum() / s.sum()) / len(s) for s in sums)
     (left, right), (low, high) = screen.x, screen.y
@@ -222,13 +222,13 @@ def gathering(
 ) -> BSplineSurface:
     """Return g, the net of GATHERING_NET points per side whose slopes fit p(b, m) best over the lit part of a grid.
 
-    With the sag fixed, p(b, m) is a gradient except for a curl of the order ∂p/∂z x y.
+    For a fixed sag, p(b, m) is a gradient except for a curl of the order of ∂p/∂z x y.
     """
     count, fit = (PREVIEW_SAMPLES, PREVIEW_FIT) if preview else (GATHERING_SAMPLES, GATHERING_FIT)
     few, law = grid.thinned(count), lens.last_freeform.law
     x, y, _ = few.at_face.position
     aim = torch.stack([torch.full_like(x, m) for m in middle])
-    reaches = reach_margin(few.at_face, aim, plane, law=law) >= 0  # elsewhere the slope is a placeholder
+    reaches = reach_margin(few.at_face, aim, plane, law=law) >= 0  # False: the slope is a placeholder
     fit = fit if bool(reaches[few.density > 0].all()) else PARABOLOID_FIT
     return fit_gathering(few, wanted_slopes(few.at_face, aim, plane, law), fit)
 
@@ -255,7 +255,7 @@ def interpolate(grid: FaceGrid, values: Tensor, b: Points) -> Tensor:
 
 
 def rays_at(grid: FaceGrid, b: Points) -> Rays:
-    """Return the rays that meet the face at points b (mm), with sag and direction interpolated in the grid."""
+    """Return the rays that meet the face at points b (mm), with sag and direction interpolated from the grid."""
     sag, d_x, d_y, d_z = interpolate(grid, torch.cat([grid.at_face.position[2:], grid.at_face.direction]), b)
     position = torch.stack([torch.from_numpy(b[0]), torch.from_numpy(b[1]), sag])
     direction = torch.stack([d_x, d_y, d_z]) / torch.sqrt(d_x * d_x + d_y * d_y + d_z * d_z)
@@ -263,9 +263,9 @@ def rays_at(grid: FaceGrid, b: Points) -> Rays:
 
 
 def map_from_face(points: Points, screen: Screen) -> TransportMap:
-    """Return the map of the points of the last tailored face whose light meets the target's pixel corners.
+    """Return the inverse map, from the target's pixel corners to the points (mm) of the last tailored face.
 
-    points: each (columns + 1, rows + 1).  The plane of the map is named "back" even if the face is the front.
+    points: x and y, each (columns + 1, rows + 1).  The plane of the map is named "back" even if the face is the front.
     """
     x, y = (np.linspace(*ends, n + 1) for ends, n in ((screen.x, screen.columns), (screen.y, screen.rows)))
     i, j = nodes(screen.columns), nodes(screen.rows)
@@ -281,7 +281,7 @@ def pixel_corners(screen: Screen) -> Points:
 
 
 def resample_picture(picture: np.ndarray, corners: Points, n: int) -> tuple[Density, Frame]:
-    """Resample a picture with the given pixel corners on n x n cells of the smallest square around its lit part."""
+    """Return the density of a picture on n x n cells of the smallest square around its lit corners, and the square."""
     lit = corners_of(picture)
     low, high = (np.array([f(c[lit]) for c in corners]) for f in (np.min, np.max))
     x_mean, y_mean = (low + high) / 2
@@ -293,11 +293,11 @@ def resample_picture(picture: np.ndarray, corners: Points, n: int) -> tuple[Dens
 
 
 def light_density(values: np.ndarray, side: float) -> Density:
-    """Return the density of light in cells of a square of `side` mm; SceneError if it falls between the samples."""
+    """Return the density of light in the cells of a square of `side` mm; SceneError if no sample has light."""
     if not values.any():
         raise SceneError(
             "source: its light at the lens is narrower than a cell of the transport grid "
-            f"({side / len(values):.3g} mm); make the sides of lens.outline more alike, or raise "
+            f"({side / len(values):.3g} mm); make width and height of lens.outline less different, or raise "
             "tailoring.transport_grid"
         )
     return Density.from_values(values)
@@ -313,8 +313,9 @@ def corners_of(picture: np.ndarray) -> np.ndarray:
 def map_to_target(source: Emitter, lens: Lens, goal: Goal, n: int, solver: Solver) -> Mapping:
     """Return the transport map of the paper, from the vertex plane of the front (mm) to the target (mm).
 
-    It is solved on n x n cells, for the light that passes all faces.  A tilted target is projected from the vertex of
-    the front onto the level plane through its centre: in its own coordinates the map would be far from a gradient.
+    The map is solved on n x n cells, for the light that passes all faces.  A tilted target is projected from the vertex
+    of the front onto the plane z = const through its centre: in the coordinates of the target the map would not be
+    close to a gradient.
     """
     picture, screen = goal.picture, image_screen(lens, goal.receiver)
     area = clear_window(source, lens)

@@ -1,19 +1,19 @@
-"""The picture of a source of finite size: the picture of its centre, blurred by a slowly varying image of the source.
+"""The picture made by a source of finite size: the picture of its centre, blurred by a slowly varying source image.
 
-All rays through one point of the back are refracted by the same slope.  If the light of the centre of the source lands
-at t through this point, the light of its point s lands at t + δ(t, s), and δ varies slowly over the target, however
-rough the face is.  So with the picture E_0 of the centre
+All rays through one point of the back are refracted by the same slope.  If light from the centre of the source lands
+at t through this point, light from the point s of the source lands at t + δ(t, s), and δ varies slowly over the target,
+even for a rough face.  So with the picture E_0 of the centre
 
     E(t) = ∫ K(t', t - t') E_0(t') dt',     K(t', ·) the density of δ(t', s) over the points s of the source,
 
-which takes one sheet of tubes instead of one for each of many points.  K is interpolated between nodes t_n over the
-screen by hat functions a_n, K(t', ·) = Σ_n a_n(t') K_n.  Then E = Σ_n K_n * (a_n E_0), a few Fourier transforms; this
-operator is B.  K_n is the image of the source through the point of the back whose light lands nearest to t_n.  There δ
-and the flux are biquadratic in s through 3 x 3 points of the source, evaluated at as many points as a smooth image
-needs.
+which needs one sheet of flux tubes instead of a sheet for each of many source points.  K is interpolated between nodes
+t_n over the screen by hat functions a_n, K(t', ·) = Σ_n a_n(t') K_n.  Then E = B E_0 = Σ_n K_n * (a_n E_0), computed
+with a few Fourier transforms.  K_n is the image of the source through the point of the back whose light lands nearest
+to t_n.  There δ and the flux are biquadratic in s through 3 x 3 points of the source, evaluated at as many points as a
+smooth image needs.
 
-The error of this model is small and varies slowly during tailoring.  Rays from points of the source measure it at the
-start of a round, and it is added as a constant picture: E = B E_0 + (E_rays - B E_0 at the start).
+The error of this model is small and varies slowly during tailoring.  It is measured with rays from points of the source
+at the start of a round, and added as a constant picture: E = B E_0 + (E_rays - B E_0 at the start).
 """
 
 from __future__ import annotations
@@ -39,25 +39,25 @@ from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import point_pairs
 
 IMAGE_NODES = 5  # nodes per side, from border to border of the screen
-IMAGE_GRID = 32  # points per side of the back, through which the images of the source are traced
+IMAGE_GRID = 32  # points per side on the back through which the images of the source are traced
 POINT_DISTANCE = 0.7  # distance of the 3 x 3 points of the source from its centre, in half widths
-IMAGE_PAIRS = 256  # pairs of points of the source in an image
-PIXEL_PARTS = 5  # parts of a pixel per side in the images; odd
+IMAGE_PAIRS = 256  # pairs of source points that represent an image
+PIXEL_PARTS = 5  # parts of a pixel per axis in the images; odd
 ERROR_RAYS = 1448  # rays per side in each of the two sets that measure the error of the blur
-ERROR_POINTS = 256  # points of the source in each set
-ERROR_SMOOTHING = 0.15  # standard deviation of the smoothing of this error, in radii of the image
-MAX_TRANSFORM_BYTES, VALUE_BYTES = 2 << 30, 8  # limit for the transforms of all images, and size of one value (bytes)
-MIN_BORDER = 16  # smallest border (pixels)
-ERROR_SEED_OFFSET = 500_009  # offset of the seed, so that these rays differ from those that verify the lens
+ERROR_POINTS = 256  # source points in each of the two sets
+ERROR_SMOOTHING = 0.15  # standard deviation of the smoothing of the blur error, in radii of the image
+MAX_TRANSFORM_BYTES, VALUE_BYTES = 2 << 30, 8  # largest size of the transforms of all images, size of one value (bytes)
+MIN_BORDER = 16  # smallest border around the screen (pixels)
+ERROR_SEED_OFFSET = 500_009  # offset of the seed, so that these rays are independent of the rays of the verification
 
 
 @dataclass(frozen=True)
 class ExtendedSource:
     """Source of finite size, with the light of its centre."""
 
-    source: Emitter
+    source: Emitter  # source of finite size
     centre: tuple[Channel, ...]  # light of the centre of the source, one channel per spectral line
-    draw: Draw  # function that draws points of the source
+    draw: Draw  # function that samples points of the source
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class BlurOperator:
     border: int  # width of the border whose light is blurred onto the screen (pixels)
     hats: tuple[np.ndarray, np.ndarray]  # hat functions, (nodes, rows + 2 border) and (nodes, columns + 2 border)
     spectra: np.ndarray  # Fourier transforms of the images K_n, (nodes, nodes, …)
-    size: tuple[int, int]  # size of the transforms
+    size: tuple[int, int]  # rows and columns of the transformed arrays
 
     def forward(self, light: np.ndarray) -> np.ndarray:
         """Apply B to light (rows + 2 border, columns + 2 border); return a picture (rows, columns)."""
@@ -120,11 +120,11 @@ class LocalImages:
 
     at: Tensor  # (2, points) landing points of the centre's light (column, row) in pixels
     offset: Tensor  # (2, 9, points) displacement δ of 3 x 3 points of the source, in pixels
-    flux: Tensor  # (9, points) flux of each of these, relative to the centre
+    flux: Tensor  # (9, points) flux from each of the 3 x 3 points, relative to the centre
 
     @classmethod
     def of(cls, source: Emitter, channel: Channel, lens: Lens, screen: Screen) -> LocalImages:
-        """Trace the images through the points of the back that the light of all ten source points passes."""
+        """Trace the images through the points of the back that transmit light from the centre and all 3 x 3 points."""
         assert source.extent is not None, "a point source has no image"
         a, b = source.extent.half_extent
         points = [(i * POINT_DISTANCE, j * POINT_DISTANCE) for j in (-1, 0, 1) for i in (-1, 0, 1)]
@@ -136,7 +136,7 @@ class LocalImages:
         return cls(pixel[:, 0], pixel[:, 1:] - pixel[:, :1], flux[1:] / flux[0])
 
     def nearest(self, column: float, row: float) -> tuple[Tensor, Tensor]:
-        """Return offset (2, 9) and flux (9,) of the image nearest to a pixel; those of a point source if none."""
+        """Return offset (2, 9) and flux (9,) of the image nearest to a pixel; without images, a point's."""
         if not self.at.shape[1]:
             return torch.zeros(2, 9, dtype=torch.float64), torch.ones(9, dtype=torch.float64)
         point = int(torch.argmin((self.at[0] - column) ** 2 + (self.at[1] - row) ** 2))
@@ -144,7 +144,7 @@ class LocalImages:
 
 
 def _biquadratic(points: Sequence[tuple[float, float]]) -> Tensor:
-    """Return the weights (9, points) of the 3 x 3 values: Lagrange polynomials in both coordinates."""
+    """Return the weights (9, points) that interpolate 3 x 3 values at points, by Lagrange polynomials in x and y."""
     d = POINT_DISTANCE
     axes = [
         (u * (u - d) / (2 * d**2), 1 - (u / d) ** 2, u * (u + d) / (2 * d**2))
@@ -170,18 +170,18 @@ def blurs(extended: ExtendedSource, lens: Lens, screen: Screen) -> tuple[BlurOpe
 
 
 def widest(screen: Screen, lines: int) -> int:
-    """Return the largest border (pixels): at most the screen's width, and within MAX_TRANSFORM_BYTES for all lines.
+    """Return the largest border (pixels): at most the screen's width, within MAX_TRANSFORM_BYTES for all `lines`.
 
-    At a tilted target that some light grazes, the images have no bound of their own.
+    Without this limit images on a tilted target that some light grazes would be arbitrarily large.
     """
     side = math.sqrt(MAX_TRANSFORM_BYTES / (lines * IMAGE_NODES**2 * VALUE_BYTES))
     return max(min(max(screen.shape), int((side - max(screen.shape)) / 4)), MIN_BORDER)
 
 
 def _operator(images: Sequence[tuple[Tensor, Tensor]], screen: Screen, border: int) -> BlurOperator:
-    """Make B from the image at each node: offset (2, dots) in pixels, flux (dots,) relative to that of the centre.
+    """Make B from the image at each node, as dots: offset (2, dots) in pixels, flux (dots,) relative to the centre.
 
-    A tent function distributes each dot over parts of a pixel, PIXEL_PARTS per side, whose blur is negligible.
+    A hat function distributes each dot over parts of a pixel, PIXEL_PARTS per axis, a negligible blur.
     """
     down, across = (_hats(side, border) for side in screen.shape)
     side = 2 * border + 1
@@ -189,7 +189,7 @@ def _operator(images: Sequence[tuple[Tensor, Tensor]], screen: Screen, border: i
     fine = Screen(0.0, (-side / 2, side / 2), (-side / 2, side / 2), PIXEL_PARTS * side)
     spectra, k = np.zeros((len(images), rows, columns // 2 + 1), dtype=complex), np.arange(rows)
     for spectrum, (offset, flux) in zip(spectra, images, strict=True):
-        position = (offset * torch.tensor([[1.0], [-1.0]])).contiguous()  # rows count downwards
+        position = (offset * torch.tensor([[1.0], [-1.0]])).contiguous()  # rows increase downwards, y upwards
         dots = Landed(position, flux / flux.numel(), torch.zeros(flux.shape, dtype=torch.uint8))
         waves = scipy.fft.rfft(_about_zero(tent(dots, fine).numpy(), PIXEL_PARTS * columns, axis=1))
         waves = scipy.fft.fft(_about_zero(waves[:, : spectrum.shape[1]], PIXEL_PARTS * rows, axis=0), axis=0)
@@ -199,24 +199,24 @@ def _operator(images: Sequence[tuple[Tensor, Tensor]], screen: Screen, border: i
 
 
 def _about_zero(values: np.ndarray, n: int, axis: int) -> np.ndarray:
-    """Pad an odd number of values along an axis with zeros to n, and roll them so that the middle one is first."""
+    """Pad an odd number of values along an axis with zeros to n, and roll them so that the centre value is first."""
     odd = values.shape[axis]
     return np.roll(np.pad(values, [(0, n - odd if k == axis else 0) for k in (0, 1)]), -(odd // 2), axis)
 
 
 def _hats(side: int, border: int) -> np.ndarray:
-    """Return the hat functions (IMAGE_NODES, side + 2 border) of IMAGE_NODES nodes, constant outside the outer ones."""
+    """Return the hat functions (IMAGE_NODES, side + 2 border) along an axis, constant beyond the outer nodes."""
     position = np.clip((np.arange(-border, side + border) + 0.5) / side, 0, 1) * (IMAGE_NODES - 1)
     return np.maximum(0, 1 - np.abs(position - np.arange(IMAGE_NODES)[:, None]))
 
 
 @torch.no_grad()
 def blur_error(by_images: Tensor, draw: Draw, lens: Lens, screen: Screen, *, border: int, seed: int) -> Tensor:
-    """Return the error of B in a picture, (rows, columns), measured by two sets of rays; 0 if noise hides it.
+    """Return the error of B in a picture, (rows, columns), measured with two sets of rays; 0 if noise hides it.
 
-    by_images: the picture B E_0, relative to the transmitted light; border: the border of B.
+    by_images: the picture B E_0, divided by the transmitted flux.  border: border of B (pixels).
 
-    The differences d_i = E_i - B E_0 of both sets contain the same error and independent noise.  Their smoothed mean is
+    The differences d_i = E_i - B E_0 of the two sets have an equal error and independent noise.  Their smoothed mean is
     therefore scaled by d_1 · d_2 / |(d_1 + d_2) / 2|².
     """
     picture, errors = by_images.cpu(), []

@@ -1,13 +1,13 @@
-"""Stage 1: fit the last freeform face to an optimal transport map, which gives stage 2 a smooth first surface.
+"""Stage 1: fit the last freeform face to an optimal transport map, as a smooth initial surface for stage 2.
 
 In Wang et al. 2023 the optimal transport map φ carries points S_i of the source plane to points P_i^t = φ(S_i) of the
-target, and the surface minimises Σ |P_i^t - P_i|² (Eq. 14), P_i the traced landing points of rays through S_i.  Here
-each round solves the transport problem from points of the face to the slopes that send their light to the target
-(slope_map.py), and fits the surface to these slopes by linear least squares (slope_fit.py).  The next round starts
-from the sag and the map of this one, on finer grids and nets at the end.  If the result is poor, the map and the merit
-of the paper are tried too (`follow_aims`).
+target, and the surface minimises Σ |P_i^t - P_i|² (Eq. 14), where rays through S_i land at P_i.  Here each round solves
+the transport problem from points of the face to the slopes that send their light to the target (slope_map.py), and fits
+the surface to these slopes by linear least squares (slope_fit.py).  The next round starts from the sag and the map of
+this round; the last rounds use finer grids and nets.  If the result is poor, the map and the merit of the paper are
+tried too (`follow_aims`).
 
-Free parameters of the front (curvature, conic constant) are optimised before, each candidate with its best back.
+Free parameters of the front (curvature, conic constant) are optimised first, each candidate with its best back.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ from bstcad.tailoring.slope_map import SlopeMap
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Mapping, Points, Solver
 
-COARSE_FACE_FIT = Fit(bending=1e-2, steps=40, degree=3)  # stiff, extrapolates to points without light
-FINE_FACE_FIT = Fit(unlit=1e-2)  # points without light keep the slopes of the coarse face
-FINE_ROUNDS = 2  # number of rounds at the end: the first uses half of the transport's grid, the last all of it
+COARSE_FACE_FIT = Fit(bending=1e-2, steps=40, degree=3)  # fit of coarse rounds: stiff, extrapolates into the dark
+FINE_FACE_FIT = Fit(unlit=1e-2)  # fit of fine rounds: points without light keep the coarse slopes
+FINE_ROUNDS = 2  # number of fine rounds: the first has half the cells per side of the last
 # RRMSD, and RMS change of the map in the last round in half widths of the face, above which `follow_aims` is tried.
-# The change is at most 0.016 where more rounds gain nothing.
+# Where more rounds gain nothing, the change is at most 0.016.
 RETRY_RRMSD, RETRY_CHANGE = 0.25, 0.025
-SETTLED_CHANGE = 0.01  # RMS change of the map, in the same unit, below which the coarse rounds end
-MAX_RAY_CELLS = 1026  # largest number of cells per side with a ray each: cells of a finer grid share their rays
-MIN_FLUX_RATIO = 0.9  # smallest flux on the target of a lens of `follow_aims`, relative to that of the rounds
-AIM_ROUNDS = 5  # rounds of `follow_aims`
+SETTLED_CHANGE = 0.01  # RMS change of the map, in half widths of the face, below which the coarse rounds end
+MAX_RAY_CELLS = 1026  # largest number of grid cells per side in the slope fit; larger grids fit several points per cell
+MIN_FLUX_RATIO = 0.9  # smallest accepted flux on the target after `follow_aims`, relative to the flux after the rounds
+AIM_ROUNDS = 5  # number of rounds of `follow_aims`
 SCALAR_EVALUATIONS = 8  # evaluations of the merit in the search for one parameter of the front
 SIMPLEX_EVALUATIONS = 40  # evaluations of the merit in the search for curvature and conic constant together
 MAX_RIM_SINE = 0.5  # sine of the largest slope angle of the front at the rim
-MAX_ELLIPSE, MAX_HYPERBOLA = 0.8, 6.0  # largest (1 + k) c² r² and -(1 + k) c² r² at the rim; scenes allow a little more
+MAX_ELLIPSE, MAX_HYPERBOLA = 0.8, 6.0  # largest (1 + k) c² r² and -(1 + k) c² r² at the rim, below limits of scenes
 UNBOUNDED = (-math.inf, math.inf)
 
 Range = tuple[float, float]
@@ -77,14 +77,14 @@ class FrontSearch:
 
     cells: int = COARSEST_GRID  # cells per side of the transport map
     iterations: int = 100  # iterations of the map
-    repeats: int = 3  # fits of the slopes for each front
+    repeats: int = 3  # slope fits of the back for each front
 
 
 PREVIEW_NET, PREVIEW_SEARCH = 17, FrontSearch(cells=32, iterations=40, repeats=1)  # `shaped_front` in a preview
 
 
 def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
-    """Yield the steps of stage 1 for a blank, or from a saved state on.
+    """Yield the steps of stage 1 from a blank, or from a saved state.
 
     The rounds come first (`follow_slopes`), then `follow_aims` if their result is poor (`is_poor_result`).
     """
@@ -112,9 +112,9 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
 
 
 def is_poor_result(task: Task, lens: Lens, by_rays: float, state: SlopeRound) -> bool:
-    """Return True if the result of the rounds is poor: a large RRMSD, or a map that still moves.
+    """Return True if the result of the rounds is poor: a large RRMSD, or a map that still changes.
 
-    The RRMSD counts at no more pixels than the net has control points: no method shows finer detail.
+    The RRMSD is computed on at most as many pixels as the net has control points: no method resolves finer detail.
     """
     goal = task.goals[0]
     few = resample(goal, pixels=max(as_pair(task.knobs.levels[-1])))
@@ -124,10 +124,10 @@ def is_poor_result(task: Task, lens: Lens, by_rays: float, state: SlopeRound) ->
 
 
 def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
-    """Yield a step per round of transport map and slope fit, each from the sag and the map of the round before.
+    """Yield a step per round of transport map and slope fit, each from the sag and the map of the previous round.
 
-    All rounds except the last FINE_ROUNDS use coarse grids and nets, where they are cheap.  Once the map has settled,
-    the remaining coarse rounds are left out.
+    All rounds except the last FINE_ROUNDS use coarse grids and nets, which are fast.  Once the map has settled, the
+    remaining coarse rounds are skipped.
     """
     knobs, z = task.knobs, lens.back.z  # z: plane of the back in the blank (mm)
     slopes, done = (None, 0) if state is None else (state.slopes, state.round)
@@ -136,14 +136,14 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> St
     while turn < knobs.rounds:
         if slopes is None or turn >= done:
             lens, slopes = _round(task, lens, slopes, turn)
-            lens = place_back(lens, z, task.min_thickness, task.bounds)  # the next round takes the move into account
+            lens = place_back(lens, z, task.min_thickness, task.bounds)  # the next round starts from the shifted back
             task.tidy()
         turn = next_round(turn, knobs.rounds, fine=FINE_ROUNDS, settled=slopes.moved <= SETTLED_CHANGE)
         yield round_step(task, lens, SlopeRound(turn, Parameters.of(lens), slopes), slopes.face_points)
 
 
 def next_round(number: int, rounds: int, fine: int, settled: bool) -> int:
-    """Return the number of the round after `number`: the first of the last `fine` rounds if the map has settled."""
+    """Return the number of the round after `number`; if the map has settled, at least that of the first fine round."""
     return max(number + 1, rounds - fine) if settled else number + 1
 
 
@@ -154,7 +154,7 @@ def round_step(task: Task, lens: Lens, state: SlopeRound, face_points: Points) -
 
 
 def _round(task: Task, lens: Lens, previous: SlopeMap | None, turn: int) -> tuple[Lens, SlopeMap]:
-    """Run one round; return the lens and the map that it follows."""
+    """Run round number `turn`; return the lens and the map to which it is fitted."""
     knobs, source, goal, left = task.knobs, task.heaviest.source, task.goals[0], task.knobs.rounds - turn
     cells = max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left - 1, 2))
     m = knobs.levels[max(-left, -len(knobs.levels))] if left <= FINE_ROUNDS else knobs.levels[0]
@@ -176,11 +176,11 @@ def _round(task: Task, lens: Lens, previous: SlopeMap | None, turn: int) -> tupl
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
-    """Return the lens of the paper's method, and its map: from the front to target points, then fits of the slopes.
+    """Return the lens fitted to the map of the paper, from the front to target points, and this map.
 
-    A ray keeps its aim while the sag changes.  So this converges even where the slopes needed at fixed points of the
-    back change much with the sag: in strong lenses near the source, and in glass of low index.  The part of the map
-    that is not a gradient is lost.
+    A ray keeps its aim while the sag changes.  So these slope fits converge even if the slopes needed at fixed points
+    of the back depend strongly on the sag: in strong lenses near the source, and in glass of low index.  The part of
+    the map that is not a gradient is lost.
     """
     knobs, goal, z = task.knobs, task.goals[0], lens.back.z
     for turn in range(AIM_ROUNDS):
@@ -196,7 +196,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
 def aimed_rays(
     source: Emitter, lens: Lens, goal: Goal, n: int, side: int, iterations: int
 ) -> tuple[Rays, Tensor, Mapping]:
-    """Return side x side rays over the front, the aim of each on the target (mm), and the map on n x n cells."""
+    """Return side x side rays over the front, their aims on the target (mm), and the map on n x n cells."""
     mapping = slope_map.map_to_target(source, lens, goal, n, solver=Solver(iterations))
     area = clear_window(source, lens)
     x, y = (t.to(lens.like) for t in sampling.grid(area, side))
@@ -223,10 +223,10 @@ def shaped_front(
 
 
 def best_front(merit: FrontMerit, lens: Lens, free: tuple[str, ...], rim_sags: Range = UNBOUNDED) -> Lens:
-    """Return the lens whose front minimises `merit` in its free parameters; the merit refits the back each time.
+    """Return the lens whose front minimises `merit` in its free parameters; each evaluation refits the back.
 
-    Bounds: at the rim the slope of the front is at most 30°, half of the blank's thickness is left, and the sag (mm)
-    is in `rim_sags`.
+    Bounds: at the rim the slope angle of the front is at most 30°, half of the blank's thickness remains, and the sag
+    (mm) lies in `rim_sags`.
     """
     if "curvature" in free:
         bounds = _curvatures(lens, rim_sags, float(lens.front.curvature))
@@ -245,7 +245,7 @@ def _with_front(lens: Lens, **values: float) -> Lens:
 
 
 def _optimise_one(name: str, merit: FrontMerit, lens: Lens, bounds: Range, tolerance: float) -> Lens:
-    """Return the lens with the best value of one parameter by Brent's bounded search, or its present value."""
+    """Return the lens with the best value of one parameter by Brent's bounded search, or the present value."""
 
     def at(value: float) -> float:
         return merit(_with_front(lens, **{name: float(value)}))
@@ -258,7 +258,7 @@ def _optimise_one(name: str, merit: FrontMerit, lens: Lens, bounds: Range, toler
 
 
 def _optimise_two(merit: FrontMerit, lens: Lens, rim_sags: Range) -> Lens:
-    """Return the lens with the best curvature and conic constant by Nelder and Mead's simplex from the present ones."""
+    """Return the lens with the best curvature and conic constant, by a Nelder-Mead simplex from the present values."""
     c, k = (float(value) for value in (lens.front.curvature, lens.front.conic_constant))
 
     def at(tried: np.ndarray) -> float:
@@ -279,7 +279,7 @@ def _optimise_two(merit: FrontMerit, lens: Lens, rim_sags: Range) -> Lens:
 
 
 def _rim_radius(lens: Lens) -> float:
-    """Return the distance of the bounding box's corners from the axis (mm)."""
+    """Return the distance (mm) of the corners of the outline's bounding box from the axis."""
     return sum(half**2 for half in lens.outline.half_extent) ** 0.5
 
 
@@ -299,7 +299,7 @@ def _curvatures(lens: Lens, rim_sags: Range, *included: float) -> Range:
 
 
 def _curvature_of_sag(h: float, r: float, k: float) -> float:
-    """Return the curvature c = 2 h / (r² + (1 + k) h²) of a conic of sag h at r, short of a vertical slope there."""
+    """Return the curvature c = 2 h / (r² + (1 + k) h²) of a conic of sag h at r, short of a vertical slope."""
     p = 1 + k
     if p == 0:
         return 2 * h / (r * r)

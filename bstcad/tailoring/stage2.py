@@ -1,4 +1,4 @@
-"""Stage 2 and stage 3: minimise the error of the traced irradiance, starting from the surface of stage 1.
+"""Stages 2 and 3: minimise the error of the traced irradiance, starting from the surface of stage 1.
 
 As in Wang et al. 2023, the merit function of stage 2 is the relative root mean square difference between the target
 irradiance E and the traced irradiance E^s, pixel by pixel (squared, with penalties; merit.py):
@@ -7,12 +7,12 @@ irradiance E and the traced irradiance E^s, pixel by pixel (squared, with penalt
 
 The paper traces random rays.  Here each evaluation traces the corners of a fixed sheet of flux tubes and integrates
 their flux over the pixels exactly, so that the merit is smooth and without noise.  The variables are the heights of
-the control points of all nets, in a Sobolev variable (merit.py) in which L-BFGS needs some hundred evaluations where
-Adam on the heights needs thousands.  A stage consists of rounds with more and more tubes.
+the control points of all nets, in a Sobolev variable (merit.py), so that L-BFGS needs some hundred evaluations, while
+Adam on the heights needs thousands.  A stage consists of rounds with an increasing number of tubes.
 
-For a source of finite size stage 3 replaces stage 2, and starts from the surface of stage 1 too.  It traces the light
+For a source of finite size, stage 3 replaces stage 2 and also starts from the surface of stage 1.  It traces the light
 of the centre of the source and blurs the picture by the image of the source (source_image.py), in rounds of increasing
-source size.  Only the paper's procedure (baselines/paper.py) runs its stage 2 for the centre of the source before it.
+source size.  Only the paper's procedure (baselines/paper.py) first runs its stage 2 for the centre of the source.
 """
 
 from __future__ import annotations
@@ -43,35 +43,35 @@ from bstcad.tailoring.run import TUBES_PER_SECOND, Parameters, Stage, StageStep,
 from bstcad.tailoring.source_image import ExtendedSource
 
 RoundFractions = tuple[tuple[float, float], ...]  # (tubes per side, evaluations) of rounds, relative to the settings
-DENSE_ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))
-# Rounds where even the last one has fewer than DENSE_TUBES tubes per control cell along each axis.  The first rounds
-# then bend the net between the tubes, which the last one has to correct.  (1025 control points, two tubes per cell: the
-# portrait ends at an RRMSD of 0.018, and at 0.020 with the rounds above in the same time.)
+DENSE_ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # rounds if the last has at least DENSE_TUBES tubes
+# Rounds if the last one has fewer than DENSE_TUBES tubes per control cell along each axis.  The first rounds then
+# distort the net between the tubes, and the last one has to correct this.  (1025 control points, two tubes per cell:
+# the portrait ends at an RRMSD of 0.018, and at 0.020 with DENSE_ROUNDS in the same time.)
 SPARSE_ROUNDS, DENSE_TUBES = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
-# Rounds for a picture and a wavefront: two nets have twice the freedom to bend between the tubes.
+# Rounds for a picture and a wavefront: two nets can distort between the tubes, and so need more of them.
 WAVEFRONT_ROUNDS = ((2 / 3, 0.45), (1.0, 0.35), (4 / 3, 0.2))
-# Rounds for several pictures, and the control points per side above which their evaluations grow in proportion to the
-# side: the Hessian in the Sobolev variable is then still a power of the Laplacian.  (Letters before a portrait, 769
+# Rounds for several pictures, and the number of control points per side above which the evaluations are proportional to
+# it: the Hessian in the Sobolev variable then still contains a power of the Laplacian.  (Letters before a portrait, 769
 # points per side: RRMSD 0.057 and 0.062 after 196 evaluations in three rounds, 0.047 and 0.057 after 309 in these two.)
 PICTURES_ROUNDS, PICTURES_SIDE = ((2 / 3, 1.4), (4 / 3, 0.7)), 513
-# Coarse rounds: (pixels along the longer side, tubes per side, evaluations).  They come before the fine rounds where
-# light has to move far, which shows in an RRMSD above FAR_OFF_RRMSD on LARGE_PIXELS pixels along the longer side: any
-# net resolves so few pixels.  The second one is repeated after the first fine round, if others follow.
+# Coarse rounds: (pixels along the longer side, tubes per side, evaluations).  They precede the fine rounds if
+# light has to move far: if the RRMSD exceeds FAR_OFF_RRMSD on LARGE_PIXELS pixels along the longer side, which any net
+# resolves.  The second coarse round is repeated after the first fine round, if other fine rounds follow.
 COARSE_ROUNDS = ((32, 256, 60), (64, 384, 60))
 LARGE_PIXELS, FAR_OFF_RRMSD = 16, 0.04
-# Factor of the evaluations of the fine rounds after coarse rounds, and this factor for a single fine round.  That one
-# comes last, since a stage must not end with few pixels.  (A draft of a plate bound to 2 mm: RRMSD 0.264 with a factor
-# of 1.5, 0.236 with 3, but 0.408 if 60 evaluations on 64 pixels come last.)
+# Factor of the evaluations of the fine rounds after coarse rounds, and this factor if there is a single fine round.  It
+# comes last, since a stage must not end with few pixels.  (Draft of a plate with at most 2 mm of glass: RRMSD 0.264
+# with a factor of 1.5, 0.236 with 3, but 0.408 if 60 evaluations on 64 pixels come last.)
 EVALUATION_FACTOR, SINGLE_ROUND_FACTOR = 1.5, 3.0
-IMAGE_POSITIONS, SECOND_MOMENT_POINTS = 16, 8  # positions per side on the lens, and points of the source, for its image
-MIN_EVALUATIONS = 30  # evaluations below which a stage has one round: each round costs a start
+IMAGE_POSITIONS, SECOND_MOMENT_POINTS = 16, 8  # rays per side and source points that give the source image's width
+MIN_EVALUATIONS = 30  # evaluations below which a stage has a single round: each round has to start anew
 COMPARED_NET = 65  # largest number of control points per side in `compare_precisions`, for speed
 COMPARED_TUBES = 128  # tubes per side in `compare_precisions`
 COMPARED_EVALUATIONS = 6  # evaluations in each precision in `compare_precisions`
-# Rounds of stage 3, (size of the source, evaluations), as fractions of the whole.  Each measures the residual of the
-# image of the source again (source_image.py).
+# Rounds of stage 3: (size of the source, evaluations), as fractions of the full size and of all evaluations.  Each
+# round measures the error of the blur anew (source_image.py).
 SOURCE_SIZES = ((1 / 3, 1 / 8), (2 / 3, 1 / 8), (1.0, 1 / 4), (1.0, 1 / 4), (1.0, 1 / 4))
-TUBES_PER_CELL, TUBES_PER_PIXEL = 2.0, 1.1  # smallest tubes per side in stage 3: the blur hides finer detail
+TUBES_PER_CELL, TUBES_PER_PIXEL = 2.0, 1.1  # tubes of stage 3 per control cell and pixel: the blur hides detail
 
 
 @dataclass(frozen=True)
@@ -80,15 +80,15 @@ class TubeRound:
 
     task: Task  # task whose channels are the light of this round
     tubes: int  # tubes per side in the sheet of each channel
-    evaluations: int
+    evaluations: int  # largest number of evaluations
     stage: str = "stage 2"  # name of the stage
-    pixels: int | None = None  # pixels along the longer side of a coarse target; None: those of the target
-    source: ExtendedSource | None = None  # source of finite size, sampled by the channels of `task`; None: a point
+    pixels: int | None = None  # pixels along the longer side of a coarse target; None: the pixels of the target
+    source: ExtendedSource | None = None  # source of finite size; None: point source
     source_size: float = 1.0  # size of the source in this round, as a fraction of its full size
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """Light that the tubes carry: that of the centre of a source of finite size."""
+        """Light that the tubes carry; for a source of finite size, the light of its centre."""
         return self.task.channels if self.source is None else self.source.centre
 
     @property
@@ -111,7 +111,7 @@ class TubeRound:
     def search(
         self, problem: Problem, variables: NetVariables, position: SearchPosition, total: int, state: TubeSearch | None
     ) -> Iterator[tuple[Iterate, StageStep]]:
-        """Yield one run of the minimiser from the lens of a problem, or from a saved state on; at the goal it ends.
+        """Yield the steps of one run of the minimiser, from the lens of a problem or a saved state, up to the goal.
 
         total: evaluations of all rounds.
         """
@@ -142,7 +142,7 @@ class SearchPosition:
     round: int  # number of the round, from 0
     done: int  # evaluations of the stage before this search
     round_end: int  # evaluations of the stage at the end of this round
-    goal_by_tubes: float  # RRMSD by the tubes of the round at which rays check whether the accuracy is reached
+    goal_by_tubes: float  # RRMSD by tubes below which rays check whether the accuracy is reached
     sheet_from: Parameters  # lens for which the tubes were launched
     search_from: Parameters  # lens from which this search started
 
@@ -157,9 +157,9 @@ class TubeSearch:
 
 
 def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Steps:
-    """Yield the steps of stage 2: rounds of few tubes first, if the evaluations allow, and all tubes in the last.
+    """Yield the steps of stage 2: if the evaluations suffice, rounds with few tubes come first; the last has all tubes.
 
-    The error is large at first, and few tubes resolve it as well as many.  The last round corrects the finer errors.
+    Few tubes resolve the large errors at first as well as many.  The last round corrects the finer errors.
     """
     coarse, fine = coarse_rounds(task, lens), tuple(sheet_sizes(task.knobs, round_shares(task)))
     factor = 1.0 if not coarse else EVALUATION_FACTOR if len(fine) > 1 else SINGLE_ROUND_FACTOR
@@ -169,15 +169,15 @@ def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Steps:
 
 
 def coarse_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
-    """Return the rounds with few pixels, tubes and control points for a lens after stage 1, or () if it is close.
+    """Return rounds with few pixels, tubes and control points, or () if the lens after stage 1 is close to its target.
 
-    If the map has not settled, as for a lamp or a wall close by, light has to move far.  This takes many evaluations,
-    but each costs a thirtieth, and the tubes need not resolve the cells of the lens's own net.
+    If the map has not settled, as for a lamp or a wall close to the lens, light has to move far.  This needs many
+    evaluations, but each takes a thirtieth of the time, and the tubes need not resolve the cells of the full net.
     """
     limit = min(max(task.goals[0].receiver.shape) - 1, task.knobs.side // 2)  # pixels that the net can resolve
     rounds = [TubeRound(task, tubes, count, pixels=pixels) for pixels, tubes, count in COARSE_ROUNDS if pixels <= limit]
     if not rounds or task.merit is not None or task.several or task.preview or not task.knobs.stage2_iterations:
-        return ()  # several goals: two nets would bend between so few tubes
+        return ()  # several goals: two nets would distort between so few tubes
     coarse, tubes = with_pixels(task, LARGE_PIXELS), COARSE_ROUNDS[0][1]
     [goal] = coarse.goals
     far_off = rrmsd_by_tubes(lens.plain(), coarse.channels, goal, n=tubes) > FAR_OFF_RRMSD
@@ -190,7 +190,7 @@ def with_pixels(task: Task, pixels: int) -> Task:
 
 
 def round_shares(task: Task) -> RoundFractions | None:
-    """Return the rounds for several goals or a preview; None: the default for one goal."""
+    """Return the rounds for several goals or a preview; None: one goal, with the rounds of `sheet_sizes`."""
     if task.preview:
         return ((1.0, 1.0),)
     if len(task.goals) == 1:
@@ -200,7 +200,7 @@ def round_shares(task: Task) -> RoundFractions | None:
 
 
 def sheet_sizes(knobs: ResolvedTailoring, shares: RoundFractions | None = None) -> Iterator[tuple[int, int]]:
-    """Yield (tubes per side, evaluations) of each round; fewer tubes than control points could not determine these."""
+    """Yield (tubes per side, evaluations) of each round; a net needs at least as many tubes as control points."""
     shares = shares or (DENSE_ROUNDS if knobs.rays >= DENSE_TUBES * knobs.side else SPARSE_ROUNDS)
     if knobs.stage2_iterations < MIN_EVALUATIONS:
         shares = ((1.0, 1.0),)
@@ -209,12 +209,12 @@ def sheet_sizes(knobs: ResolvedTailoring, shares: RoundFractions | None = None) 
 
 
 def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None = None) -> Steps:
-    """Yield the steps of a stage, round by round, from its start or from a saved state on.
+    """Yield the steps of a stage, round by round, from its start or from a saved state.
 
     The stage ends when its evaluations are used up, on a plateau of the last round, or when the RRMSD by rays
     (`Task.rrmsd`) reaches tailoring.accuracy with the light of the last round.
     """
-    accuracy, given = rounds[0].task.knobs.accuracy or 0.0, Parameters.of(lens)  # 0: no accuracy is asked for
+    accuracy, given = rounds[0].task.knobs.accuracy or 0.0, Parameters.of(lens)  # 0: no accuracy is required
     first = SearchPosition(0, 0, 0, accuracy, sheet_from=given, search_from=given)
     position = first if state is None else state.position
     total = sum(each.evaluations for each in rounds)
@@ -235,7 +235,7 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
                 position = replace(position, search_from=Parameters.of(lens))
             start = position.search_from.apply_to(lens)
             task.tidy()
-            variables = variables_of(task, start, this_round.pixels)  # before the sheet: needs much memory
+            variables = variables_of(task, start, this_round.pixels)  # before the sheet, since it needs much memory
             if merit is None:
                 merit = this_round.merit(sheet_lens)
                 task.tidy()
@@ -248,16 +248,16 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
             lens, state, measured = step.lens, None, 0.0  # 0: not measured
             position, reason = replace(position, done=position.done + iterate.best.evaluations), iterate.reason
             if reason == "accuracy" and (measured := task.rrmsd(lens)) > accuracy:
-                # tubes underestimate the RRMSD a little: lower their goal
+                # tubes slightly underestimate the RRMSD: lower the goal by tubes
                 position = replace(position, goal_by_tubes=position.goal_by_tubes * accuracy / measured)
-                reason = "evaluations"  # the reason if none are left
+                reason = "evaluations"  # final reason if no evaluations are left
             elif reason != "evaluations":
                 break
         del merit, problem  # free the sheet before the next one is made
         by_rays = None if task.preview else measured or task.rrmsd(lens)
         full = task.channels == rounds[-1].task.channels  # True: the light of the source at full size
         if by_rays is not None and by_rays <= accuracy:
-            reason = "accuracy"  # reached by rays, though perhaps not by tubes
+            reason = "accuracy"  # reached according to rays, perhaps not according to tubes
         reason = reason if number == len(rounds) - 1 or (reason == "accuracy" and full) else ""
         yield StageStep(maker(lens), rays_rrmsd=by_rays, at_full_size=full, part=part, ends=True, reason=reason)
         if reason:
@@ -265,9 +265,9 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
 
 
 def _overshoot_weight(task: Task, lens: Lens) -> float:
-    """Return the weight of light outside the target (1 / pixel²), smaller if the image of the source is w pixels wide.
+    """Return the weight of light outside the target (1 / pixel²), smaller for a source whose image is w pixels wide.
 
-    Within w of the border some light falls outside for any lens, and pulling it in would blur the edge.
+    Within w of the border some light falls outside with any lens, and pulling it inside would blur the edge.
     """
     overshoot = task.knobs.overshoot
     if points_per_line(task.channels) == 1:
@@ -283,8 +283,8 @@ def _overshoot_weight(task: Task, lens: Lens) -> float:
 class Problem:
     """Merit of stage 2 and its gradients in the heights of all nets, for a fixed sheet of tubes per channel.
 
-    The fused kernels store the landing point of each corner, not its path.  Memory is some 100 bytes per corner and
-    does not grow with the number of control points.
+    The fused kernels store the landing point of each tube corner, not its path.  They need some 100 bytes of memory per
+    corner, whatever the number of control points.
     """
 
     lens: Lens
@@ -294,7 +294,7 @@ class Problem:
     grazing: Grazing | None = None  # penalty against total internal reflection
 
     def __call__(self, heights: Sequence[Tensor]) -> tuple[float, list[Tensor], float]:
-        """Return the merit, ∂merit/∂heights of each net (1/mm) and the RRMSD at the heights of the nets (mm)."""
+        """Return the merit, its gradient in the heights of each net (1/mm), and the RRMSD; heights: by net (mm)."""
         leaves = [h.detach().requires_grad_() for h in heights]
         lens = self.lens.with_heights(leaves)
         merit, rrmsd = self.merit(self.merit.landing(lens))
@@ -313,7 +313,7 @@ class Problem:
 
 
 def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariables:
-    """Return the variables of stage 2 for the nets of a lens; pixels: for coarser nets of about as many cells."""
+    """Return the variables of stage 2 for the nets of a lens; pixels: variables of nets with so few cells per side."""
     nets = lens.nets
     if pixels is not None:
         lens = lens.with_nets(net.refined(coarser(net.shape, pixels + 1)) for net in nets)
@@ -342,7 +342,7 @@ def _geometric_mean(weights: Iterable[Tensor]) -> Tensor:
 def search(
     lens: Lens, problem: Problem, variables: NetVariables, evaluations: int, state: TubeSearch | None = None
 ) -> Iterator[Iterate]:
-    """Run L-BFGS on the heights of all nets from those of `lens` on, in one block of variables c per net."""
+    """Run L-BFGS on the heights of all nets, starting from `lens`, in one block of variables c per net."""
     start = [net.heights for net in lens.nets]
 
     def in_c(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
@@ -373,9 +373,9 @@ class Stage3State:
 
 
 def with_stage3(before: Stage | None, task: Task, lens: Lens, state: Any = None) -> Steps:
-    """Yield the steps of stage 3, from its start or a saved state on; `before`: stage that runs first, None: none.
+    """Yield the steps of stage 3, from its start or from a saved state.
 
-    `before` tailors for the centre of the source; its lens is rated with the light of the whole source.
+    before: stage that runs first, for the centre of the source; its lens is rated with the whole source.  None: none.
     """
     if before is not None and not isinstance(state, Stage3State):
         for last in before(task, lens, state):
@@ -413,7 +413,7 @@ def stage3_sheet_sizes(knobs: ResolvedTailoring, pixels: tuple[int, int]) -> Ite
     A sheet of n tubes per side has n √(m_x / m_y) along x and n √(m_y / m_x) along y over a net of m_x x m_y points.
     """
     few = knobs.stage2_iterations < MIN_EVALUATIONS
-    total = knobs.stage2_iterations * (2 if few else 1)  # each round costs a start
+    total = knobs.stage2_iterations * (2 if few else 1)  # each round has to start anew
     (m_x, m_y), (columns, rows) = as_pair(knobs.levels[-1]), pixels
     oblong = math.sqrt(m_x / m_y)
     for_pixels = TUBES_PER_PIXEL * max(columns / oblong, rows * oblong)
@@ -428,17 +428,17 @@ class Comparison:
 
     control_points: int  # control points along the longer side
     merit: float  # relative difference of the merit at the start
-    gradient: float  # relative difference of the gradient at the start, by norms
-    evaluations: int  # evaluations of each
-    rrmsd_float64: float  # RRMSD at the end, by the same tubes in float64 for both
-    rrmsd_float32: float
-    heights: float  # largest difference of a control point (mm)
+    gradient: float  # norm of the difference of the gradients at the start, relative to the norm of the gradient
+    evaluations: int  # number of evaluations in each precision
+    rrmsd_float64: float  # RRMSD at the end of the tailoring in float64; both by the same tubes, in float64
+    rrmsd_float32: float  # RRMSD at the end of the tailoring in float32
+    heights: float  # largest difference between the heights of a control point (mm)
 
 
 def compare_precisions(task: Task, lens: Lens) -> Comparison:
     """Run a short stage 2 from `lens` in both precisions, with the same tubes and the same number of evaluations.
 
-    Rounding decides where a line search ends, so the results may differ by more than rounding and be equally good.
+    Rounding can change where a line search ends, so the lenses may differ by more than rounding and be equally good.
     """
     lens = lens.with_nets(net.refined(coarser(net.shape, COMPARED_NET)) for net in lens.nets)
     (merit, gradient, single), (exact_merit, exact_gradient, double) = (
@@ -459,7 +459,7 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
 
 
 def _tailor_briefly(task: Task, lens: Lens) -> tuple[float, Tensor, Lens]:
-    """Return merit and gradient at the start, and the lens after COMPARED_EVALUATIONS in its precision, in float64."""
+    """Return merit and gradient at the start, and the lens after COMPARED_EVALUATIONS, in its own precision."""
     n = min(COMPARED_TUBES, task.knobs.rays)
     merit = Merit.of(task.channels, lens, n, task.goals[:1], overshoot=task.knobs.overshoot)
     merit = replace(merit, picture_error=task.merit)

@@ -1,17 +1,17 @@
-"""Stage 1 of a lens with two freeform faces: the front sends the light to its points on the back, which turns it.
+"""Stage 1 of a lens with two freeform faces: the front sends the light to points of the back, which deflects it.
 
-The rays behind the lens are known (light_behind.py): one through each point t of a target, which traced backwards meets
-the back at b(t).  The front has to send the light of t to b(t).  This is a transport problem in slope coordinates as in
+The rays behind the lens are known (light_behind.py): the ray through a point t of a target, traced backwards, meets the
+back at b(t).  The front has to send the light of t to b(t).  This is a transport problem in slope coordinates as in
 slope_map.py, from points q of the front to the slopes p(q, b) that follow from Snell's law,
 
     y = -(p(q, b) - ∇g(q)),    ∇g(q) ≈ p(q, r(q)) - r(q) ∂p/∂b,
 
-with r the affine map that stretches the light on the front onto that on the back, so that y hardly depends on q for a
-fixed b.  (The minus sign: light that enters glass turns against the slope of the face.)  Then the back is fitted to the
-slopes that turn each arriving ray into its direction behind the lens.  Such a face exists.  Let Φ and Φ' be the optical
-paths along the rays in the glass and behind the lens, with |∇Φ| = n and |∇Φ'| = 1.  By Snell's law a face turns the one
-rays into the others where its normal is along ∇(Φ - Φ'), so each surface Φ - Φ' = const is a solution.  A new back
-changes b(t), and so the rounds repeat, each from the faces and the points of the last round.
+where r is the affine map from the light on the front to the light on the back, so that y hardly depends on q for a
+fixed b.  (The minus sign: light that enters glass is deflected against the slope of the face.)  Then the back is fitted
+to the slopes that deflect each ray into its direction behind the lens.  Such a face exists.  Let Φ and Φ' be the
+optical paths along the rays in the glass and behind the lens, with |∇Φ| = n and |∇Φ'| = 1.  By Snell's law a face with
+normals along ∇(Φ - Φ') deflects these rays as required, so each surface Φ - Φ' = const is a solution.  A new back
+changes b(t), and so there are several rounds, each from the faces and the points of the last round.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Points, Solver
 
 POINT_SHIFT = 1e-4  # shift of a point for difference quotients of slopes, relative to the thickness
-# Number of fine rounds: the last one on the full grid and nets, the others on half of the grid and the second finest
-# nets, until both faces fit each other.  (With two, two photographs have 1.5 times the error by blocks of 4 to 32
-# pixels.)
+# Number of fine rounds: the last one has the full grid and nets, the others have half as many cells per side and the
+# second finest nets, until the faces fit each other.  (With two fine rounds, the errors of two photographs averaged
+# over blocks of 4 to 32 pixels are 1.5 times larger.)
 FINE_PAIR_ROUNDS = 4
 SETTLED_FRONT = 0.003  # RMS change of q(t), in half widths of the front, below which the coarse rounds end
 
@@ -51,16 +51,17 @@ SETTLED_FRONT = 0.003  # RMS change of q(t), in half widths of the front, below 
 class FrontRound(stage1.SlopeRound):
     """State of stage 1 with two freeform faces between two rounds.
 
-    `slopes` is the map of the front; its points are q(t) (mm) for the rays behind the lens.
+    `slopes` is the map of the front; its face points are q(t) (mm), where the rays through t meet the front.
     """
 
     back: Points  # points b(t) (mm) of the back for the pixel corners of the first target
 
 
 def steps(task: Task, lens: Lens, state: stage1.SlopeRound | None = None) -> Steps:
-    """Yield the steps of stage 1 for a lens with a freeform front, from its start or from a saved state on.
+    """Yield the steps of stage 1 for a lens with a freeform front, from its start or from a saved state.
 
-    With one goal, or if light does not cross both faces in succession, stage 1 tailors the last net alone (stage1.py).
+    With one goal, or if light does not cross front and back in succession, stage 1 tailors only the last net
+    (stage1.py).
     """
     lens = task.heaviest.through(lens)
     if not (lens.shapes_two_faces and task.several):
@@ -74,7 +75,7 @@ def steps(task: Task, lens: Lens, state: stage1.SlopeRound | None = None) -> Ste
 
 
 def follow_rays(task: Task, lens: Lens, state: FrontRound | None) -> Steps:
-    """Yield a step per round; all except FINE_PAIR_ROUNDS use coarse grids and nets, and end once the map settles."""
+    """Yield a step per round; all except the last FINE_PAIR_ROUNDS are coarse, and end once the map has settled."""
     task = task.with_imaged_receivers(lens)
     knobs, z = task.knobs, lens.back.z
     near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
@@ -103,7 +104,7 @@ def follow_rays(task: Task, lens: Lens, state: FrontRound | None) -> Steps:
 def _round(
     task: Task, lens: Lens, light: LightBehind, q: Points | None, *, turn: int, cells: int, fit: Fit
 ) -> tuple[Lens, SlopeMap, Points]:
-    """Run one round; return the lens, the map of its front, and b(t) for the pixel corners of the first target."""
+    """Run round `turn`; return the lens, the map of its front, and b(t) for the pixel corners of the first target."""
     source, front = task.heaviest.source, lens.shaping("front")
     window, met = slope_map.lit_window(source, front), light.intersect(lens.back)
     b_x, b_y = light.sampled_at(task.goals[0].receiver, met[:2])
@@ -135,9 +136,9 @@ def front_map(
 ) -> SlopeMap:
     """Return the map of the front that sends the light to its points on the back, by optimal transport.
 
-    lens: the lens with only its front free; grid: `square_grid` of its lit window.  picture: (r, c) flux between each
-    four rays, row 0 = y max.  b: (3, c + 1, r + 1) points of the back on the rays (mm).  q: points of the front on them
-    (mm), as found in the last round; None: r inverted.  The points of the result are the new q.
+    lens: lens with only its front free.  grid: `square_grid` of its lit `window`.  picture: (r, c) flux of the tube
+    between each four rays, row 0 = y max.  b: (3, c + 1, r + 1) points where these rays meet the back (mm).  q: points
+    where they meet the front (mm) in the last round; None: from the inverse of r.  The result contains the new q.
     """
     lit = slope_map.corners_of(picture)
     low, high = (np.array([f(p[lit]) for p in b[:2]]) for f in (np.min, np.max))
@@ -163,7 +164,7 @@ def _in_space(rays: Rays) -> Tensor:
 
 
 def _gathering(grid: FaceGrid, lens: Lens, back: Tensor, stretch: np.ndarray, shift: np.ndarray) -> BSplineSurface:
-    """Return g of the module's docstring, fitted over the lit part of a grid."""
+    """Return the surface g of the module's docstring, fitted over the lit part of a grid."""
     few = grid.thinned(slope_map.GATHERING_SAMPLES)
     x, y, z = _in_space(few.at_face).cpu().double()
     height = float(total(back[2]) / back[2].numel())
@@ -171,7 +172,7 @@ def _gathering(grid: FaceGrid, lens: Lens, back: Tensor, stretch: np.ndarray, sh
     p, lit = _slopes_at(few.at_face, r, lens), few.density > 0
     step = POINT_SHIFT * (height - float(total(z) / z.numel()))
     quotient = 0.0
-    for axis in (0, 1):  # ∂p/∂b, one number: its mean over the light
+    for axis in (0, 1):  # ∂p/∂b as one number, the mean over the light
         nudge = torch.zeros((3, 1, 1), dtype=r.dtype)
         nudge[axis] = step
         shifted = _slopes_at(few.at_face, r + nudge, lens)[axis]

@@ -5,23 +5,23 @@ Source rho on x, target nu on y, potentials psi(x) and phi(y):
 
     J(phi) = ∫ phi dnu + ∫ phi^c drho,   T = id - ∇phi^c,   H1 gradient  (-Δ)^-1 (nu - T_# rho)
 
-and likewise for psi.  Gradient ascent on phi and psi alternates; a c-transform converts one into the other.  The grid
-limits the accuracy: c-transforms map cell centres to cell centres, so the mass error levels off at a few per cent,
+and likewise for psi.  Gradient ascent alternates between phi and psi; a c-transform converts one into the other.  The
+grid limits the accuracy: c-transforms map cell centres to cell centres, so the mass error levels off at a few per cent,
 which the flux tubes of monge_ampere.py then reduce.
 
 The c-transform is exact and linear in the number of cells: phi^c(x) = min_y |x - y|²/2 - phi(y) = |x|²/2 - v*(x) with
 v(y) = |y|²/2 - phi(y) is a Legendre transform, which separates: v*(x1, x2) = max_y2 [x2 y2 + max_y1 (x1 y1 -
 v(y1, y2))].  Each line needs the lower convex hull of its n values and one monotone pass (Lucet 1997, Numerical
-Algorithms 16).  The slope of the hull edge before a vertex gives the x from which that vertex is the maximiser, so the
+Algorithms 16).  The slope of the hull edge before a vertex is the x from which this vertex is the maximiser, so the
 pass has no branch that depends on the data.
 
 Poisson's equation (Hockney 1965, "A fast direct solution of Poisson's equation using Fourier analysis", Journal of the
 ACM 12): -Δ is the five-point Laplacian on n x n cells with zero normal derivative.  For the k-th term of the cosine
-series along the second axis it is the tridiagonal matrix D + s_k, with D the second difference along the first axis and
-s_k = 4 sin²(πk/2n).  The transforms run along contiguous lines of n cells, and the elimination treats neighbouring
-columns together, so that memory is never read across lines.
+series along the second axis, -Δ is the tridiagonal matrix D + s_k, where D is the negative second difference along the
+first axis and s_k = 4 sin²(πk/2n).  The transforms run along contiguous lines of n cells, and the elimination treats
+neighbouring columns together, so that memory is never read across lines.
 
-Cell units throughout: cell centres at i + 1/2, i = 0 … n-1, and potentials in units of the squared cell side.
+All quantities are in cell units: cell centres at i + 1/2, i = 0 … n-1, and potentials in squared cell sides.
 """
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ from bstcad.transport.density import BLOCKS, Density, inner, pushforward, thread
 
 LINES_PER_BLOCK = 8  # lines transformed together: eight doubles fill a cache line of the transposed output
 MIN_CELLS = 32  # cells per side of the coarsest grid
-FIRST_STEP = 1.0  # sigma on the coarsest grid; 1 is the Newton step between two uniform densities
-MIN_FIRST_STEP = 0.25  # smallest initial sigma on a finer grid: the noise of a coarse grid rejects its last steps
+FIRST_STEP = 1.0  # step length sigma on the coarsest grid; for uniform densities 1 is Newton's step
+MIN_FIRST_STEP = 0.25  # smallest initial sigma on a finer grid: noise lowers sigma at the end of a coarse grid
 STEP_INCREASE, STEP_DECREASE, REFUSED_STEP_FACTOR = 1.25, 0.8, 0.5  # factors of sigma after short, long, rejected steps
 MIN_GAIN_RATIO, MAX_GAIN_RATIO = 0.25, 0.75  # Armijo-Goldstein bounds of (gain of J) / (sigma |∇J|²)
 PLATEAU_TOLERANCE = 0.005  # relative decrease of the mass error below which the solve is on a plateau
-PLATEAU_ITERATIONS = 5  # number of iterations over which that decrease is measured
+PLATEAU_ITERATIONS = 5  # number of iterations over which the decrease of the mass error is measured
 STEP_HALVINGS = 1  # halvings of sigma before a plateau stops the solve: the final mass error depends on sigma
 
 
 def half_square(n: int) -> np.ndarray:
-    """Return |x|²/2 at the cell centres, cell units, (n, n)."""
+    """Return |x|²/2 at the cell centres, (n, n), in cell units."""
     q = 0.5 * (np.arange(n) + 0.5) ** 2
     return q[:, None] + q[None, :]
 
 
 def legendre(v: np.ndarray) -> np.ndarray:
-    """Return v*(x) = max_y x·y - v(y) over the cell centres, (n, n) -> (n, n), cell units; exact on the grid."""
+    """Return v*(x) = max_y x·y - v(y) over the cell centres y, at the cell centres x; v and v*: (n, n), cell units."""
     partial, conjugate = np.empty_like(v), np.empty_like(v)
     _transform_lines(v, partial, -1.0, BLOCKS)  # maximise over y2: [x2, y1]
     _transform_lines(partial, conjugate, 1.0, BLOCKS)  # maximise over y1: [x1, x2]
@@ -64,8 +64,8 @@ def legendre(v: np.ndarray) -> np.ndarray:
 def _line(v, out, hull, slope, first):
     """Compute out[i] = max_j (i + 1/2)(j + 1/2) - v[j]; hull, slope (n) and first (n + 1) are scratch.
 
-    hull: vertices of the lower hull; slope: of the edge before each; first[i]: the last vertex that is optimal from i
-    on.
+    hull: vertices of the lower hull; slope: slope of the edge before each vertex; first[i]: last vertex that becomes
+    the maximiser at i.
     """
     n = v.size
     top = 0
@@ -88,7 +88,7 @@ def _line(v, out, hull, slope, first):
 
 @njit(cache=True, nogil=True, parallel=True)
 def _transform_lines(v, out, sign, blocks):
-    """Compute out, the transposed transforms of the rows of v, times `sign`."""
+    """Compute out = `sign` times the transposed matrix of the transforms of the rows of v."""
     n = v.shape[0]
     for block in prange(blocks):
         hull, slope, first = np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64)
@@ -122,9 +122,10 @@ class Poisson:
 
 
 class PoissonWithoutCheckerboard(Poisson):
-    """Inverse (-Δ)^-1 (1 - D_x D_y / 16), D the second differences; the checkerboard, where both are 4, maps to zero.
+    """Inverse (-Δ)^-1 (1 - D_x D_y / 16); it maps the checkerboard, for which D_x and D_y are 4, to zero.
 
-    With s_y for D_y it is ((1 + s_y²/16) / (D_x + s_y)) - s_y/16, again one elimination.
+    D_x and D_y are negative second differences.  For D_y = s_y this is ((1 + s_y²/16) / (D_x + s_y)) - s_y/16, again
+    one elimination.
     """
 
     def __init__(self, n: int):
@@ -135,8 +136,8 @@ class PoissonWithoutCheckerboard(Poisson):
 def _pivots(s: np.ndarray) -> np.ndarray:
     """Return the inverse pivots (n, n) of D + s_k: row i for the i-th cell of the line, column k for the k-th term.
 
-    A pivot is 1 + e with e_i = s + e_(i-1) / (1 + e_(i-1)), positive terms only; the last one, at the boundary, is e.
-    For k = 0 it is zero: the end of the line is set to zero, and the mean is subtracted afterwards.
+    A pivot is 1 + e with e_i = s + e_(i-1) / (1 + e_(i-1)), without cancellation; the last pivot, at the boundary, is
+    e. For k = 0 it is zero: the end of the line is set to zero, and the mean is subtracted afterwards.
     """
     n = s.size
     pivots, e = np.empty((n, n)), s.copy()
@@ -149,7 +150,7 @@ def _pivots(s: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True, parallel=True)
 def _eliminate(r, g, pivots, keep, share, blocks):
-    """Replace r by keep (D + s)^-1 r - share r, each column a line; g: scratch."""
+    """Replace each column of r by keep (D + s)^-1 r - share r; g: scratch."""
     n = r.shape[0]
     for block in prange(blocks):
         lo, hi = block * n // blocks, (block + 1) * n // blocks
@@ -172,7 +173,7 @@ class TransportStep:
 
     grid: int  # cells per side of the current grid
     iteration: int  # number of the iteration on this grid, from 1
-    mass_error: float  # mean |pushforward - target|, both densities of mean 1
+    mass_error: float  # mean |pushforward - target| of densities of mean 1
     stage: str  # method: "back-and-forth" | "tubes"
 
 
@@ -183,13 +184,13 @@ Listener = Callable[[TransportStep], None] | None  # called after each iteration
 class Transport:
     """A pair of potentials on the unit square, (n, n) at cell centres, and the history of the solve.
 
-    x - ∇psi(x) maps source to target, y - ∇phi(y) target to source; the solver stores phi, and psi = phi^c exactly.
+    x - ∇psi(x) maps source to target, y - ∇phi(y) maps target to source; psi = phi^c exactly.
     """
 
     phi: np.ndarray  # potential on the target side, (n, n)
     psi: np.ndarray  # potential on the source side, phi^c, (n, n)
-    mass_error: tuple[float, ...]  # mean |pushforward - target| before each iteration and at the end, finest grid
-    dual: tuple[float, ...]  # Kantorovich value after each iteration on the finest grid; rises to W2²/2
+    mass_error: tuple[float, ...]  # mean |pushforward - target| before each iteration on the finest grid and at the end
+    dual: tuple[float, ...]  # Kantorovich dual J after each iteration on the finest grid; it rises to W2²/2
     iterations: int  # number of iterations on the finest grid
     reason: str  # reason of the end of the solve: "converged" | "plateau" | "iterations"
 
@@ -197,12 +198,12 @@ class Transport:
 def back_and_forth(
     source: Density, target: Density, *, iterations: int = 40, tolerance: float = 1e-3, progress: Listener = None
 ) -> Transport:
-    """Return potentials between two densities on one grid, solved on coarser grids first; neither needs to be positive.
+    """Return the potentials between two densities on one grid, solved on coarser grids first; densities may be zero.
 
-    iterations: maximum on each grid.  tolerance: mass error at which the solve has converged.
+    iterations: largest number of iterations on each grid.  tolerance: mass error at which the solve has converged.
     """
     if source.n != target.n:
-        raise ValueError(f"source and target must lie on one grid, got {source.n} and {target.n} cells per side")
+        raise ValueError(f"source, target: have {source.n} and {target.n} cells per side; give equal numbers")
     sigma = FIRST_STEP
     grids = ladder(source, target, MIN_CELLS)
     phi = np.zeros((grids[0][0].n, grids[0][0].n))
@@ -217,7 +218,7 @@ def back_and_forth(
 
 
 def prolong(phi: np.ndarray) -> np.ndarray:
-    """Interpolate bilinearly, (m, m) -> (2m, 2m) in cell units, with zero normal derivative at the boundary."""
+    """Interpolate a potential bilinearly, (m, m) -> (2m, 2m) in cell units, with zero normal derivative at the rim."""
     for axis in (0, 1):
         p = np.moveaxis(phi, axis, 0)
         before, after = np.concatenate([p[:1], p[:-1]]), np.concatenate([p[1:], p[-1:]])
@@ -227,7 +228,7 @@ def prolong(phi: np.ndarray) -> np.ndarray:
 
 
 def ladder(source: Density, target: Density, coarsest: int) -> list[tuple[Density, Density]]:
-    """Return the pair on a sequence of grids, coarsest first, halved while n is even and above `coarsest`."""
+    """Return the pair on a sequence of grids, coarsest first; n is halved while it is even and above `coarsest`."""
     rungs = [(source, target)]
     while rungs[0][0].n % 2 == 0 and rungs[0][0].n > coarsest:
         rungs.insert(0, (rungs[0][0].halved(), rungs[0][1].halved()))
@@ -235,14 +236,14 @@ def ladder(source: Density, target: Density, coarsest: int) -> list[tuple[Densit
 
 
 def _ascend(source, target, phi, sigma, *, iterations, tolerance, progress):
-    """Solve on one grid.  For v = |y|²/2 - phi and u = |x|²/2 - psi, a c-transform is `legendre`; T = ∇u, S = ∇v."""
+    """Solve on one grid, in v = |y|²/2 - phi and u = |x|²/2 - psi: the c-transform becomes `legendre`, and T = ∇u."""
     n, rho, nu = source.n, source.values, target.values
     half, poisson = half_square(n), Poisson(n)
     u = legendre(half - phi)
     v = legendre(u)
     dual = _dual(u, v, rho, nu)
     errors, duals, reason = [], [], "iterations"
-    forth = back = sigma  # one step size per side: the sharper density allows only the smaller
+    forth = back = sigma  # one step length per density: a sharper density allows only shorter steps
     ceiling, since, halvings = np.inf, 0, 0
     for iteration in range(1, iterations + 1):
         v, u, forth, dual, error = _half_step(v, u, rho, nu, poisson=poisson, sigma=min(forth, ceiling), dual=dual)
@@ -266,7 +267,7 @@ def _ascend(source, target, phi, sigma, *, iterations, tolerance, progress):
 
 
 def _half_step(a, b, rho, nu, *, poisson, sigma, dual):
-    """Raise the potential of `a` (b = a*, whose gradient maps rho towards nu); reject a step that lowers J."""
+    """Ascend along the gradient in the potential of `a`, unless J decreases.  b = a*; ∇b maps rho towards nu."""
     r = nu - pushforward(rho, b)
     error = float(np.abs(r).mean())
     g = poisson.solve(r)
@@ -285,7 +286,7 @@ def _half_step(a, b, rho, nu, *, poisson, sigma, dual):
 
 @njit(cache=True, nogil=True, fastmath={"reassoc"})
 def _dual(u, v, rho, nu):
-    """Return ∫ psi drho + ∫ phi dnu, cell units."""
+    """Return J = ∫ psi drho + ∫ phi dnu in cell units."""
     n = u.shape[0]
     total = 0.0
     for i in range(n):  # sum each row first, for accuracy

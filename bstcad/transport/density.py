@@ -1,4 +1,4 @@
-"""Densities on the unit square, source and target of a transport, and their pushforward by the gradient of a potential.
+"""Densities on the unit square, source and target of a transport, and their pushforward under a gradient map.
 
 Compiled loops over a grid are divided into BLOCKS, and a compiled sum replaces BLAS, so that results do not depend on
 the number of threads.
@@ -32,14 +32,14 @@ class Density:
 
     @classmethod
     def from_values(cls, values: np.ndarray, *, floor: float = 0.0) -> Density:
-        """Return the density of cell averages (n, n), [ix, iy]; `floor` as in `from_picture`, over the whole square."""
+        """Return the density with these cell averages (n, n), [ix, iy]; floor: smallest value, relative to the mean."""
         return _normalised(np.asarray(values, dtype=float), np.ones(np.shape(values)), floor, "density")
 
     @classmethod
     def from_function(
         cls, function: Callable[[np.ndarray, np.ndarray], np.ndarray], n: int, *, samples: int = 4, floor: float = 0.0
     ) -> Density:
-        """Return the density of function(x, y) on [0, 1]², averaged over samples x samples midpoints per cell."""
+        """Return the density of function(x, y) on [0, 1]², averaged over samples x samples points per cell."""
         q = (np.arange(n * samples) + 0.5) / (n * samples)
         fine = np.broadcast_to(function(q[:, None], q[None, :]), (q.size, q.size)).astype(float)
         return cls.from_values(fine.reshape(n, samples, n, samples).mean(axis=(1, 3)), floor=floor)
@@ -51,14 +51,14 @@ class Density:
         """Resample a grey picture by exact overlap areas of pixels and cells.
 
         picture: (rows, columns), row 0 = y max, column 0 = x min.  Its pixels span width x height (any unit), centred
-        in the square of the longer side, so that both axes have one scale; the rest of the square is zero.
-        floor: smallest value inside the picture relative to its mean, such as 1e-3; darker cells are raised to it.
+        in the square of the longer side, so that x and y have equal scales; the rest of the square is zero.
+        floor: smallest value inside the picture, relative to its mean, such as 1e-3; darker cells are raised to this.
         """
         grey = np.asarray(picture, dtype=float)
         if grey.ndim != 2 or grey.size == 0:
-            raise ValueError(f"picture: expected rows x columns of grey values, got shape {grey.shape}")
+            raise ValueError(f"picture: has the shape {grey.shape}; give rows x columns of grey values")
         if not (width > 0 and height > 0):
-            raise ValueError(f"picture: its rectangle must have a positive width and height, got {width} x {height}")
+            raise ValueError(f"picture: its rectangle is {width} x {height}; give a positive width and height")
         _check_values(grey, "picture")
         side = max(width, height)
         along_x = _overlaps(n, grey.shape[1], width / side)
@@ -67,19 +67,19 @@ class Density:
         return _normalised(values, np.outer(along_x.sum(axis=1), along_y.sum(axis=1)), floor, "picture")
 
     def halved(self) -> Density:
-        """Return the density on n/2 x n/2 cells (means of 2 x 2; n even)."""
+        """Return the density on n/2 x n/2 cells, as means of 2 x 2 cells; n must be even."""
         m = self.n // 2
         return Density(self.values.reshape(m, 2, m, 2).mean(axis=(1, 3)))
 
     def lifted(self, floor: float) -> Density:
-        """Return the density raised to at least floor x mean everywhere on the square."""
+        """Return the density raised to at least floor times its mean everywhere on the square."""
         if self.values.min() >= floor:
             return self
         return _normalised(self.values, np.ones(self.values.shape), floor, "density")
 
 
 def _overlaps(n: int, pixels: int, extent: float) -> csr_array:
-    """Return the fractions (n, pixels) of n cells of [0, 1] covered by each pixel of the centred interval `extent`.
+    """Return the fractions (n, pixels) of n cells of [0, 1] that the pixels of a centred interval `extent` long cover.
 
     The matrix is sparse, since the rounding of a product of dense matrices depends on the number of threads.
     """
@@ -89,9 +89,9 @@ def _overlaps(n: int, pixels: int, extent: float) -> csr_array:
 
 
 def _normalised(values: np.ndarray, cover: np.ndarray, floor: float, name: str) -> Density:
-    """Raise to floor x (mean over the support) and scale to mean 1; cover: fraction of each cell inside the support."""
+    """Raise values to floor x (mean in the picture) and scale to mean 1; cover: fraction of cells in the picture."""
     if values.ndim != 2 or values.shape[0] != values.shape[1] or values.shape[0] < 4:
-        raise ValueError(f"{name}: expected an n x n grid with n >= 4, got shape {values.shape}")
+        raise ValueError(f"{name}: has the shape {values.shape}; give an n x n grid with n >= 4")
     _check_values(values, name)
     scaled = values / values.max()  # avoids overflow in the sums below
     raised = np.maximum(scaled, floor * scaled.mean() / cover.mean() * cover)
@@ -101,13 +101,13 @@ def _normalised(values: np.ndarray, cover: np.ndarray, floor: float, name: str) 
 def _check_values(values: np.ndarray, name: str) -> None:
     """Raise ValueError unless the values are finite, not negative and not all zero."""
     if not np.isfinite(values).all() or values.min() < 0:
-        raise ValueError(f"{name}: every value must be finite and not negative")
+        raise ValueError(f"{name}: has values that are negative or not finite; give finite values of at least 0")
     if values.max() == 0:
-        raise ValueError(f"{name}: it is black everywhere, so no light can be sent; give it a bright part")
+        raise ValueError(f"{name}: is black everywhere, so no light can be sent; give it a bright part")
 
 
 def pushforward(density: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return (∇u)_# density on the same n x n grid; u at cell centres in cell units.  The sum is conserved to rounding.
+    """Return (∇u)_# density on its n x n grid; u: (n, n), cell units.  The sum is conserved to rounding.
 
     The map is evaluated at the corners of each cell and is bilinear inside.  The image of a cell is divided into pieces
     of at most half a cell along each axis, and each piece is added as a box of its own extent, by exact overlap areas.
@@ -124,7 +124,7 @@ def pushforward(density: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def gradient_at_corners(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ∇u at the (n + 1)² cell corners from u at the n² centres, cell units; clipped at the rim."""
+    """Return ∇u at the (n + 1)² cell corners from u at the n² cell centres, in cell units, clipped to the square."""
     n = u.shape[0]
     x, y = np.empty((n + 1, n + 1)), np.empty((n + 1, n + 1))
     _gradient(u, x, y)
@@ -140,8 +140,8 @@ def gradient_at_corners(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def resample_flux(flux: np.ndarray, x: np.ndarray, y: np.ndarray, n: int, parts: tuple[int, int]) -> np.ndarray:
     """Return the flux (n, n) in the cells of a square from pixels with corners x, y (k + 1, l + 1), in cells.
 
-    The flux (k, l) of each pixel is divided into parts[0] x parts[1] equal parts at bilinear points; the four cells
-    with the nearest centres receive each part.  Flux outside the square is added to the cell at the rim.
+    The flux (k, l) of each pixel is divided into parts[0] x parts[1] equal parts at bilinear points; each part is
+    divided among the four cells with the nearest centres.  Flux outside the square is added to the cell at the rim.
     """
     out = np.zeros((n, n))
     _resample(flux, x, y, *parts, out)
@@ -187,7 +187,7 @@ def _gradient(u, x, y):
 
 @njit(cache=True, nogil=True)
 def _rows_reached(x):
-    """Return the first and last + 1 of the rows of pixels that boxes centred between these corners can touch."""
+    """Return the range (first, last + 1) of the rows of pixels that boxes centred between the corners x can touch."""
     n = x.shape[1] - 1
     least, most = float(n), 0.0
     for i in range(x.shape[0]):
@@ -198,7 +198,7 @@ def _rows_reached(x):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
 def _splat(rho, x, y, parts, reach):
-    """Add the images of the cells of one block of rows to parts[block], between the two rows of reach[block]."""
+    """Add the images of the cells of each block of rows to parts[block], and store the rows reached in reach[block]."""
     n, blocks = rho.shape[0], parts.shape[0]
     for turn in prange(blocks):
         block = 2 * turn % blocks + 2 * turn // blocks  # even, then odd blocks: every region for each thread
@@ -223,7 +223,7 @@ def _splat(rho, x, y, parts, reach):
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _lay_cell(out, n, mass, x, y, i, j):
     """Add the pieces of the image of cell (i, j) to out (n + 1, n + 1)."""
-    # edge vectors of the image (e: along i, f: along j) and its twist (t)
+    # edge vectors of the image of the cell (e: along i, f: along j) and its twist (t)
     x0, y0 = x[i, j], y[i, j]
     ex, ey = x[i + 1, j] - x0, y[i + 1, j] - y0
     fx, fy = x[i, j + 1] - x0, y[i, j + 1] - y0
@@ -254,7 +254,7 @@ def _lay_cell(out, n, mass, x, y, i, j):
             g = max(0.0, (py - column) * per_y + least_y)
             far = m * f
             near = m - far
-            r, c = np.uint64(np.int64(row)), np.uint64(np.int64(column))  # unsigned: no wrap-around check of indices
+            r, c = np.uint64(np.int64(row)), np.uint64(np.int64(column))  # unsigned: no check for negative indices
             out[r, c] += near - near * g
             out[r, c + one] += near * g
             out[r + one, c] += far - far * g
@@ -262,7 +262,7 @@ def _lay_cell(out, n, mass, x, y, i, j):
 
 
 def threads_for(n: int) -> int:
-    """Return the number of threads for n x n cells; on a small grid a second thread starts too late to help."""
+    """Return the number of threads for n x n cells: one on a small grid, which a second thread does not speed up."""
     return 1 if n <= MAX_SINGLE_THREAD_CELLS else min(2, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
 
 
@@ -278,7 +278,7 @@ def threads(n: int) -> Iterator[None]:
 
 
 def inner(a: np.ndarray, b: np.ndarray) -> float:
-    """Return Σ a b over the cells, a and b (n, m); compiled, since waiting BLAS threads block a busy core."""
+    """Return Σ a b over the cells of a and b (n, m); compiled, since waiting BLAS threads would keep a core busy."""
     return float(_inner(a, b))
 
 

@@ -1,4 +1,4 @@
-"""The optimal map as a callable: source point (mm) -> target point (mm), and its inverse."""
+"""The optimal transport map as a function, source point (mm) -> target point (mm), and its inverse."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from bstcad.transport.bfm import Listener, Transport, back_and_forth, half_squar
 from bstcad.transport.density import Density, gradient_at_corners
 from bstcad.transport.monge_ampere import ROUGH_MASS_ERROR, MongeAmpere, corners, newton_on_grids
 
-FLOOR = 1e-3  # smallest density of a target, relative to its mean: the gradient of a convex function fills any hole
-FALLING_FLOORS = (0.03, 0.01, 0.003)  # floors solved before FLOOR, relative to the mean, where Newton needs them
+FLOOR = 1e-3  # smallest density of a target, relative to its mean: maps of tubes need a positive target
+FALLING_FLOORS = (0.03, 0.01, 0.003)  # floors, relative to the mean, solved before FLOOR if Newton's method needs them
 BACK_AND_FORTH_CELLS = 64  # cells per side of the largest grid of the back-and-forth method, before Newton's method
-STEPS_PER_GRID = 8  # maximum number of Newton steps on each grid
+STEPS_PER_GRID = 8  # largest number of steps of Newton's method on each grid
 MAX_MAP_NODES = 257  # largest number of points per side of a TransportMap: 0.5 MB
-INVERTED_TOGETHER = 4096  # points inverted by a thread at a time
+INVERTED_TOGETHER = 4096  # number of points that a thread inverts at a time
 
 Points = tuple[np.ndarray, np.ndarray]  # x and y of points, of one shape
 
@@ -28,8 +28,8 @@ Points = tuple[np.ndarray, np.ndarray]  # x and y of points, of one shape
 class Frame:
     """Position of the unit square in a plane; its sides lie along x and y."""
 
-    centre: tuple[float, float] = (0.5, 0.5)  # position of the centre, mm
-    side: float = 1.0  # length of a side, mm
+    centre: tuple[float, float] = (0.5, 0.5)  # centre of the square in the plane (mm)
+    side: float = 1.0  # length of a side (mm)
 
     def to_unit(self, x: ArrayLike, y: ArrayLike) -> Points:
         """Return points (mm) in coordinates of the unit square."""
@@ -45,8 +45,8 @@ class Mapping:
     """The optimal map T and its inverse S = ∇v, stored as S at the pixel corners of the target.
 
     S is bilinear inside a pixel, and T(x) solves S(y) = x by Newton's method.  T therefore sends exactly the flux of
-    each tube into its pixel, and T and S are inverse to each other to rounding.  Points outside a frame are moved to
-    its rim.
+    each tube into its pixel, and T and S are inverse to each other to rounding.  Points outside a frame are clipped to
+    its boundary.
     """
 
     x: np.ndarray  # (n + 1, n + 1), x of S at pixel corners, cell units of the source frame
@@ -54,10 +54,10 @@ class Mapping:
     guess_x: np.ndarray  # (n + 1, n + 1), x of T at source cell corners to about a cell, cell units of the target frame
     guess_y: np.ndarray  # (n + 1, n + 1), y of T at source cell corners
     source: Density
-    target: Density  # target raised to the floor of the solve
+    target: Density  # target, raised to the floor
     source_frame: Frame
     target_frame: Frame
-    transport: Transport
+    transport: Transport  # potentials and history of the solve
 
     def __call__(self, x: ArrayLike, y: ArrayLike) -> Points:
         """Return the target points (mm) of source points (mm), of any shape."""
@@ -80,17 +80,17 @@ class Mapping:
 class TransportMap:
     """Origin of the light of each point of a target: the inverse of the transport map of stage 1.
 
-    The points are corners of the target's pixels: all, or MAX_MAP_NODES per side at about even spacing.  The
-    quadrilateral of four neighbours in `source` sends the target's flux into the same four in `target`, except for the
-    floor (mapping.FLOOR) in dark parts of the target.  Stages 2 and 3 change the lens afterwards, but not the map.
+    The points are corners of the target's pixels: all, or at most MAX_MAP_NODES per side at about even spacing.  The
+    light between four neighbours in `source` is the flux of the target between the same four in `target`, except for
+    the floor (mapping.FLOOR) in dark parts.  Stages 2 and 3 change the lens afterwards, but not the map.
     """
 
     x: np.ndarray  # (c,) x on the target plane, mm, ascending, float64
     y: np.ndarray  # (r,) y on the target plane, mm, ascending, float64
     source: np.ndarray  # (c, r, 2) float32, x and y (mm) in the scene's frame where the light for (x, y) passes `plane`
-    # "back": the last tailored face in the order of the light, which is the front of a lens with a tailored front alone
-    # and of a mirror behind glass.  "entrance": the plane z = const through the vertex of the first face, where
-    # the map of Wang et al. begins (tailoring.method "adam" and "integration", strong lenses near the source)
+    # "back": the last tailored face along the light, which is the front if only the front is tailored, or for a mirror
+    # behind glass.  "entrance": the plane z = const through the vertex of the first face, where the map of Wang et al.
+    # begins (tailoring.method "adam" and "integration", and strong lenses near the source)
     plane: str
 
     @property
@@ -100,7 +100,7 @@ class TransportMap:
 
 
 def nodes(pixels: int) -> np.ndarray:
-    """Return the numbers of the corners 0, …, pixels of a row of pixels that a TransportMap stores."""
+    """Return the indices, from 0 to `pixels`, of the pixel corners along an axis that a TransportMap stores."""
     return np.unique(np.linspace(0, pixels, min(pixels + 1, MAX_MAP_NODES)).round().astype(int))
 
 
@@ -108,10 +108,10 @@ def nodes(pixels: int) -> np.ndarray:
 class Solver:
     """Settings of `solve`."""
 
-    iterations: int = 40  # maximum of the back-and-forth method on each of its grids
+    iterations: int = 40  # largest number of iterations of the back-and-forth method on each grid
     tolerance: float = 2e-3  # mass error (mean |F - nu|, both of mean 1) at which the solve has converged
     floors: tuple[float, ...] = FALLING_FLOORS  # floors solved before FLOOR, relative to the mean of the target
-    progress: Listener = None
+    progress: Listener = None  # called after each iteration; None: not called
 
 
 def solve(
@@ -124,11 +124,11 @@ def solve(
 ) -> Mapping:
     """Return the optimal map: back-and-forth on a coarse grid, then Newton's method on flux tubes up to the finest.
 
-    If the grid does not allow the tolerance, `transport.reason` is "plateau".  A target with zeros is raised to FLOOR
-    of its mean; `mapping.target` is the raised one.  Where a bright rim borders on black, Newton's first step on a grid
-    would fold the map; the target then has the floors of the solver, one after another, on the last grid.
-    sharper: sources of increasing detail, for which Newton's method continues on the last grid while the mass error
-    stays below ROUGH_MASS_ERROR; `mapping.source` is the last source for which it does.
+    If the grid does not allow the tolerance, `transport.reason` is "plateau".  The target is raised to FLOOR times its
+    mean, and so stored in `mapping.target`.  If a bright rim borders on black, Newton's first step on a grid would fold
+    the map; the target is then solved with the floors of the solver, one after another, on the last grid.
+    sharper: sources of increasing detail, with which Newton's method continues on the last grid as long as the mass
+    error stays below ROUGH_MASS_ERROR; `mapping.source` is the last of them that succeeded.
     """
     first = partial(back_and_forth, iterations=solver.iterations, tolerance=solver.tolerance, progress=solver.progress)
     newton = partial(newton_on_grids, steps=STEPS_PER_GRID, tolerance=solver.tolerance, progress=solver.progress)
@@ -159,14 +159,14 @@ def solve(
 
 
 def mass_error(mapping: Mapping) -> float:
-    """Return mean |F - nu| over the target's pixels, F the source flux through each pixel's tube; both have mean 1."""
+    """Return mean |F - nu| over the target's pixels; F: source flux through each pixel's tube; means are 1."""
     flux = MongeAmpere(mapping.source, mapping.target).flux(mapping.transport.phi * mapping.source.n**2)
     return float(np.abs(flux - mapping.target.values).mean())
 
 
 @njit(cache=True, nogil=True)
 def _bilinear(s, i, j, a, b):
-    """Return s at (i + a, j + b)."""
+    """Return s, interpolated bilinearly, at (i + a, j + b)."""
     return (1 - a) * ((1 - b) * s[i, j] + b * s[i, j + 1]) + a * ((1 - b) * s[i + 1, j] + b * s[i + 1, j + 1])
 
 
@@ -185,7 +185,7 @@ def _forward(sx, sy, points, out):
 
 @njit(cache=True, nogil=True)
 def _residual(sx, sy, x, y, p, q):
-    """Return x - S(p, q) and the four derivatives of S there."""
+    """Return the residual (x, y) - S(p, q) and the four derivatives of S at (p, q)."""
     i, j = min(int(p), sx.shape[0] - 2), min(int(q), sx.shape[1] - 2)
     a, b = p - i, q - j
     ex, ey = sx[i + 1, j] - sx[i, j], sy[i + 1, j] - sy[i, j]
@@ -199,7 +199,7 @@ def _residual(sx, sy, x, y, p, q):
 
 @njit(cache=True, nogil=True)
 def solve_point(sx, sy, x, y, p, q):
-    """Return (p, q) with S(p, q) = (x, y), and success: Levenberg-Marquardt, ascent on x·y - v(y) where S folds."""
+    """Return (p, q) with S(p, q) = (x, y), and True if found: by Levenberg-Marquardt, from the start (p, q)."""
     rows, columns = sx.shape[0] - 1.0, sx.shape[1] - 1.0
     rx, ry, a, b, c, d = _residual(sx, sy, x, y, p, q)
     residual2 = rx * rx + ry * ry
@@ -216,7 +216,7 @@ def solve_point(sx, sy, x, y, p, q):
             continue
         dp, dq = (bb * g - ab * h) / det, (aa * h - ab * g) / det
         reach = max(abs(dp), abs(dq))
-        if reach > 4.0:  # pixels; the linear model does not hold further away
+        if reach > 4.0:  # pixels; further away the linear model fails
             dp, dq = 4.0 * dp / reach, 4.0 * dq / reach
         tp, tq = min(max(p + dp, 0.0), rows), min(max(q + dq, 0.0), columns)
         tx, ty, ta, tb, tc, td = _residual(sx, sy, x, y, tp, tq)
@@ -262,7 +262,7 @@ def _invert(phi, sx, sy, gx, gy, points, out):
             a, b = px[k] - i, py[k] - j
             p, q = _bilinear(gx, i, j, a, b), _bilinear(gy, i, j, a, b)
             tp, tq, regular = solve_point(sx, sy, px[k], py[k], p, q)
-            if not regular:  # a fold of S: use the potential, whose best pixel is never in a fold
+            if not regular:  # a fold of S: start from the best pixel of the potential, which is never in a fold
                 cp, cq = _best_pixel(phi, px[k], py[k], p, q)
                 tp, tq, regular = solve_point(sx, sy, px[k], py[k], cp, cq)
                 if not regular:
@@ -271,7 +271,7 @@ def _invert(phi, sx, sy, gx, gy, points, out):
 
 
 def grid_coordinates(grid_x: np.ndarray, grid_y: np.ndarray, x: np.ndarray, y: np.ndarray) -> Points:
-    """Return the real (row, column) of points x, y (m, n) in a grid of points (mm); outside points at its rim."""
+    """Return the fractional (row, column) of points x, y (m, n) in a grid of points (mm), clipped to the grid."""
     per_mm = (max(grid_x.shape) - 1) / max(np.ptp(grid_x), np.ptp(grid_y))
     out = np.empty((2, *x.shape))
     grid_x, grid_y, x, y = (np.ascontiguousarray(per_mm * p) for p in (grid_x, grid_y, x, y))
@@ -281,7 +281,7 @@ def grid_coordinates(grid_x: np.ndarray, grid_y: np.ndarray, x: np.ndarray, y: n
 
 @njit(cache=True, nogil=True, parallel=True)
 def _search(grid_x, grid_y, x, y, out):
-    """Solve row by row, from the solution of the neighbour or from the position in an even grid."""
+    """Solve row by row; start from the neighbour's solution or from the position in an evenly spaced grid."""
     rows, columns = grid_x.shape[0] - 1.0, grid_x.shape[1] - 1.0
     left, low = grid_x.min(), grid_y.min()
     wide, high = grid_x.max() - left, grid_y.max() - low

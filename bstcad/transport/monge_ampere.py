@@ -1,9 +1,9 @@
 """Newton's method on the Monge-Ampère equation of flux tubes, which removes the grid error of a coarse map.
 
-With S = ∇v = y - ∇phi the map from target to source, the flux into target pixel p is the flux that the source sends
-through the pixel's tube, F_p = ∫_{S(p)} rho, and the equation is F_p = nu_p.  S is stored at pixel corners (averaged
-differences of phi, zero normal derivative, so that the rim of the square maps to itself) and is bilinear inside.  The
-linearisation
+S = ∇v = y - ∇phi is the map from target to source.  The flux into target pixel p is the flux that the source sends
+through the tube of the pixel, F_p = ∫_{S(p)} rho, and the equation is F_p = nu_p.  S is stored at pixel corners (mean
+differences of phi, zero normal derivative, so that the rim of the square maps to itself) and is bilinear in pixels.
+The linearisation
 
     -div(rho cof(D²v) ∇eta) = nu - F
 
@@ -23,16 +23,16 @@ from scipy.ndimage import gaussian_filter
 from bstcad.transport.bfm import Listener, PoissonWithoutCheckerboard, TransportStep, prolong
 from bstcad.transport.density import Density, inner, threads
 
-SOFTENING = 0.2  # added to both eigenvalues of rho cof(D²v), to limit Newton steps in dark, nearly folded regions
+SOFTENING = 0.2  # added to the eigenvalues of rho cof(D²v), to limit Newton's steps in dark, nearly folded regions
 BLUR = 1.0  # width of the Gaussian blur of phi that removes the noise of the coarser grid (cells)
 CG_ITERATIONS, CG_TOLERANCE = 15, 0.1  # conjugate gradients: maximum number of iterations, relative tolerance
-MIN_STEP = 0.05  # smallest fraction of a Newton step in the line search
-MAX_ERROR_RATIO = 0.9  # ratio of the mass errors after and before a step above which the solve stops
-ROUGH_MASS_ERROR = 0.005  # mass error above which a map is rough, so that the next two constants hold
-MAX_ROUGH_ERROR_RATIO = 0.98  # MAX_ERROR_RATIO while the map is rough
-MAX_STEPS_FACTOR = 3  # factor of the maximum number of steps while the map is rough
+MIN_STEP = 0.05  # smallest fraction of Newton's step in the line search
+MAX_ERROR_RATIO = 0.9  # ratio of mass errors, after to before a step, above which the solve stops
+ROUGH_MASS_ERROR = 0.005  # mass error above which a map is rough, so that the next two constants apply
+MAX_ROUGH_ERROR_RATIO = 0.98  # value of MAX_ERROR_RATIO while the map is rough
+MAX_STEPS_FACTOR = 3  # factor of the largest number of steps while the map is rough
 
-Grids = Sequence[tuple[Density, Density]]  # (source, target) on a sequence of grids
+Grids = Sequence[tuple[Density, Density]]  # (source, target) for each of a sequence of grids
 
 
 class MongeAmpere:
@@ -40,18 +40,18 @@ class MongeAmpere:
 
     def __init__(self, source: Density, target: Density):
         self.rho, self.nu = source.values, target.values
-        # differences averaged to corners do not see the checkerboard, so the steps must not contain it
+        # mean differences at corners are zero for the checkerboard, so the steps must not contain it
         self.poisson = PoissonWithoutCheckerboard(source.n)
 
     def flux(self, phi: np.ndarray) -> np.ndarray:
-        """Return F (n, n), the source flux through the tube of each target pixel; folded tubes count negative."""
+        """Return F (n, n), the source flux through the tube of each target pixel; folded tubes have negative flux."""
         x, y = corners(phi)
         out = np.empty_like(phi)
         _flux(self.rho, x, y, out)
         return out
 
     def newton(self, phi: np.ndarray, r: np.ndarray, smoothed: np.ndarray | None = None) -> np.ndarray:
-        """Return eta with -div((rho cof(D²v) + softening) ∇eta) ≈ r; smoothed: preconditioned r."""
+        """Return eta with -div((rho cof(D²v) + softening) ∇eta) ≈ r; smoothed: preconditioned r; None: compute it."""
         n = phi.shape[0]
         metric, p, q = np.empty((n + 1, n + 1, 3)), np.empty((n + 1, n + 1)), np.empty((n + 1, n + 1))
         _metric(self.rho, *corners(phi), metric, SOFTENING)
@@ -73,7 +73,7 @@ class MongeAmpere:
 
 
 def corners(phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return S = y - ∇phi at the (n + 1)² pixel corners from phi (n, n), both in cell units."""
+    """Return S = y - ∇phi at the (n + 1)² pixel corners from phi (n, n), in cell units."""
     n = phi.shape[0]
     x, y = np.empty((n + 1, n + 1)), np.empty((n + 1, n + 1))
     _corners(phi, x, y)
@@ -83,10 +83,10 @@ def corners(phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def newton_on_grids(
     grids: Grids, phi: np.ndarray, *, steps: int, tolerance: float, progress: Listener = None, blur: float = BLUR
 ) -> tuple[np.ndarray, list[float], str]:
-    """Apply Newton's method on each grid of (source, target), from phi (cell units) on the first.
+    """Apply Newton's method on each grid; phi: start on the first grid (cell units).
 
     blur: width (cells) of the Gaussian blur of phi before each grid.  Returns phi (cell units), the mass errors on the
-    last grid and the reason why it stopped there.
+    last grid, and the reason why the solve stopped there.
     """
     for k, (source, target) in enumerate(grids):
         if k:
@@ -123,7 +123,7 @@ def _newton_steps(tubes, phi, *, steps, tolerance, progress):
 def _line_search(tubes, phi, r, *, smoothed, eta):
     """Return (phi, its residual, preconditioned residual) after the longest accepted of 1, 1/2, 1/4 … of a step.
 
-    A step is accepted if it lowers the residual in H^-1 and does not raise it in L2; None: no step is.
+    A step is accepted if it lowers the residual in H^-1 and does not raise it in L2.  None: no step is accepted.
     """
     norm, square = _dual_norm(r, smoothed), inner(r, r)
     step = 1.0
@@ -144,12 +144,12 @@ def _dual_norm(r: np.ndarray, smoothed: np.ndarray) -> float:
 
 @njit(cache=True, nogil=True, inline="always")
 def _interpolate(rho, x, y, last):
-    """Interpolate bilinearly between cell centres, constant outside them; cell units.  last: the float below n - 1."""
+    """Interpolate rho bilinearly between cell centres, constant outside, in cell units; last: the float below n - 1."""
     x = min(max(x - 0.5, 0.0), last)
     y = min(max(y - 0.5, 0.0), last)
     row, column = np.floor(x), np.floor(y)
     a, b = x - row, y - column
-    i, j, one = np.uint64(np.int64(row)), np.uint64(np.int64(column)), np.uint64(1)  # no wrap-around check of indices
+    i, j, one = np.uint64(np.int64(row)), np.uint64(np.int64(column)), np.uint64(1)  # no check for negative indices
     density = rho[i, j] + b * (rho[i, j + one] - rho[i, j])
     below = rho[i + one, j] + b * (rho[i + one, j + one] - rho[i + one, j])
     return density + a * (below - density)
@@ -197,7 +197,7 @@ def _flux(rho, x, y, out):
 
 @njit(cache=True, nogil=True, parallel=True)
 def _metric(rho, x, y, metric, softening):
-    """Compute rho cof(D²v) + softening at pixel corners, kept positive: (xx, xy, yy) in the last axis."""
+    """Compute rho cof(D²v) + softening, made positive, at pixel corners: (xx, xy, yy) along the last axis."""
     n = x.shape[0] - 1
     last = np.nextafter(n - 1.0, 0.0)
     for k in prange(n + 1):
@@ -218,7 +218,7 @@ def _metric(rho, x, y, metric, softening):
 
 @njit(cache=True, nogil=True)
 def _update(eta, r, d, image, step):
-    """Update solution and residual by a step of conjugate gradients along d."""
+    """Update the solution eta and the residual r with a step of conjugate gradients along d."""
     n = eta.shape[0]
     for i in range(n):
         for j in range(n):
