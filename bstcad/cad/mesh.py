@@ -161,8 +161,8 @@ def _has_plane_front(lens: Lens) -> bool:
 def fit_mesh(lens: Lens, tolerance: float, max_triangles: int | None = None) -> tuple[int, Mesh]:
     """Return nearly the smallest number of cells per side that meets a chordal tolerance (mm), and the mesh.
 
-    If `max_triangles` (default DEFAULT_MAX_TRIANGLES) do not suffice, the finest mesh of DEFAULT_MAX_TRIANGLES is
-    returned, or of `max_triangles` if that is smaller.
+    If `max_triangles` (default DEFAULT_MAX_TRIANGLES) do not suffice, the finest mesh of at most DEFAULT_MAX_TRIANGLES
+    is returned, or of at most `max_triangles` if this number is smaller.
     """
     allowed = DEFAULT_MAX_TRIANGLES if max_triangles is None else max_triangles
     cells, last, goal = MIN_MESH_CELLS, max_cells(lens, allowed), chordal_error_goal(lens, tolerance)
@@ -271,7 +271,7 @@ class FaceNumbers(NamedTuple):
     """A face as plain numbers: z = z0 + Σ B_i(u) B_j(v) h_ij over a net, or a surface of revolution."""
 
     z: float  # z0 (mm)
-    curvature: float  # 1/mm
+    curvature: float  # curvature c at the vertex (1/mm)
     bend: float  # (1 + k) c² (1/mm²), k the conic constant
     equator: float  # smallest 1 - (1 + k) c² r²: surfaces.MIN_COS2
     ends2: float  # r² (mm²) of Surface.outline, outside of which the face is a plane
@@ -285,7 +285,7 @@ class FaceNumbers(NamedTuple):
 
 @njit(inline="always")
 def _basis(u, m):
-    """Return the span and weights of its control points, as bspline.basis; numba's cache misses changes elsewhere."""
+    """Return the span of u and its control points' weights; a copy of bspline.basis, since numba caches per file."""
     if u < 1.5:
         k, s = 0, 2.0 - math.sqrt(4.0 - 2.0 * u)
     elif u > m - 2.5:
@@ -316,7 +316,7 @@ def _sag(face, x, y):
 
 @njit(cache=True, nogil=True)
 def _distance_from_face(a, b, c, parts, face):
-    """Return the largest distance along z (mm) of a face from a triangle: at its centre, 2 `parts` steps per edge."""
+    """Return the largest distance along z (mm) of a face from a triangle, with 2 `parts` steps per edge."""
     n = 2 * parts
     worst = abs(_sag(face, (a[0] + b[0] + c[0]) / 3, (a[1] + b[1] + c[1]) / 3) - (a[2] + b[2] + c[2]) / 3)
     for i in range(n):

@@ -69,7 +69,7 @@ def net_parameters(face: BSplineSurface) -> ParameterMap:
 
 
 def _check_round(surface: BSplineSurface, radius: float) -> None:
-    """Raise ValueError unless x(u) and y(v) are linear with equal pitch up to the rim, then a circle in (u, v), too."""
+    """Raise ValueError unless the rim is a circle in (u, v): x(u) and y(v) must be linear there, with equal pitch."""
     (x0, x1), (y0, y1) = surface.x, surface.y
     dx, dy = surface.pitch
     if abs(dx - dy) > 1e-12 * dx:
@@ -122,11 +122,11 @@ def _sphere_patch(front: Sphere, outline: Outline) -> Patch:
 
 
 def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return poles (3, 3, 3) in mm and weights (3, 3) of a conic over |u| <= a, |v| <= b (mm).
+    """Return poles (3, 3, 3) in mm and weights (3, 3) of a conic for |u| <= a, |v| <= b (mm).
 
     With K = (1 + k) c², w = 1 + K (u² + v²) / 4: x = u / w, y = v / w, z = z0 + c/2 (u² + v²) / w.  In homogeneous
-    coordinates these are quadratic, so that a rational patch of degree 2 x 2 is exactly the conic; (u, v) is its
-    projection from its far vertex.  The blossom of u² on [-a, a] is a² (1, -1, 1).
+    coordinates these are quadratic, so that a rational patch of degree 2 x 2 is exactly the conic; (u, v) is the
+    projection of (x, y, z) from the conic's far vertex.  The blossom of u² on [-a, a] is a² (1, -1, 1).
     """
     ends, blossom = np.array([-1.0, 0.0, 1.0]), np.array([1.0, -1.0, 1.0])
     square = a * a * blossom[:, None] + b * b * blossom[None, :]
@@ -259,8 +259,8 @@ SMALL_NET = 4096  # largest number of control points that are passed to OCC one 
 # Kind of a surface (9: B-spline), four flags (rational and periodic in u and v), degrees, numbers of poles and of
 # distinct knots in u and v.  The poles follow, v changing fastest, then each knot with its multiplicity.
 SURFACE_HEADER = struct.Struct("<B4B2H4i")
-BSPLINE_KIND = 9
-KNOT_RECORD = np.dtype([("value", "<f8"), ("count", "<i4")])
+BSPLINE_KIND = 9  # number of the kind of B-spline surfaces in OCC's binary files
+KNOT_RECORD = np.dtype([("value", "<f8"), ("count", "<i4")])  # a knot and its multiplicity
 
 
 def to_bytes(shape: TopoDS_Shape) -> bytes:
@@ -301,4 +301,4 @@ def _surface_of(own: bytes) -> Geom_BSplineSurface:
 
 _PLACEHOLDER_NET = (np.zeros((2, 2, 3)), *[np.array([0.0, 0.0, 1.0, 1.0])] * 2)  # control net and knot vectors
 _PLACEHOLDER_FILE = to_bytes(_face_on(bspline_surface(*_PLACEHOLDER_NET)))
-SURFACE_OFFSET = _PLACEHOLDER_FILE.index(surface_bytes(*_PLACEHOLDER_NET))  # bytes before it in a file
+SURFACE_OFFSET = _PLACEHOLDER_FILE.index(surface_bytes(*_PLACEHOLDER_NET))  # offset (bytes) of a surface in its file

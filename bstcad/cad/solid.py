@@ -56,7 +56,7 @@ def lens_solid(
     """Return the lens inside `trim` (None: its outline) without `holes` as a cadquery solid, faces oriented outwards.
 
     trim: a closed plane wire, of which x and y are used; holes: such wires, or (x, y, diameter) in mm.  Walls are
-    parallel to z.  With `draft`, the outer walls lean inwards below a plane scene.mount.LAND under the back's rim.
+    parallel to z.  With `draft`, the outer walls lean inwards below a plane at scene.mount.LAND under the back's rim.
     Raises ValueError in one sentence if a wire is open, crosses itself or another, or leaves the lens, if walls would
     meet, or if no valid solid exists.
     """

@@ -45,7 +45,7 @@ ARC_PARTS, ARC_POINTS = 8, 12  # intervals, and Gauss points in each, of a line 
 
 @dataclass(frozen=True)
 class WholePart:
-    """A part whose walls are not those over the lens's outline: with a flange, draft, a bevel or a cut."""
+    """A part with walls other than those over the lens's outline: with a flange, draft, a bevel or a cut."""
 
     edge: np.ndarray  # points along the edge of the back, (n, 2), mm
     low: Coordinates  # smallest x, y and z (mm) of all faces except freeform ones, whose edges other faces share

@@ -25,7 +25,7 @@ from bstcad.cad import patches
 from bstcad.cad.step_reading import parts_of
 
 FIXED_FORMAT, SCIENTIFIC_FORMAT = "%.14f", "%.16E"  # formats of numbers in [FIXED_MIN, FIXED_MAX), and of all others
-FIXED_MIN, FIXED_MAX = 0.1, 1e3
+FIXED_MIN, FIXED_MAX = 0.1, 1e3  # limits of the absolute values that are written in FIXED_FORMAT
 PLACEHOLDER_X = 1e60  # mm; placeholder k has its first control point at x = (k + 1) PLACEHOLDER_X, far from any lens
 REFERENCES_PER_LINE = 16  # entries per line of a list
 OTHER_FORM = "UNSPECIFIED"  # name in Part 21 of any other form of a knot vector

@@ -91,7 +91,7 @@ def wire_loop(given: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list
 
 
 def shape_in(given: Any) -> tuple[Any, str]:
-    """Return the given shape, or the only object of a Workplane (None: not one), and its type or number in words."""
+    """Return the given shape, or the only object of a Workplane (None: not one), and its type or their number."""
     values = given.vals() if hasattr(given, "vals") else [given]
     if len(values) != 1:
         return None, f"a Workplane of {len(values)} objects"

@@ -22,7 +22,7 @@ ENTITY = r"[1-9]\d{0,17}"  # pattern of an entity's number, which fits into 64 b
 REAL = r"[-+]?\d+\.\d*(?:E[-+]?\d+)?"
 COORDINATE = rf"[-+]?\d{{1,{MAX_NUMBER_LENGTH}}}+\.\d{{0,{MAX_NUMBER_LENGTH}}}+(?:E[-+]?\d{{1,4}}+)?"
 BLANKS = bytes(code for code in range(256) if chr(code).isspace())
-STRING = re.compile(  # text with empty strings, then a string or comment; long matches need few calls of `numbered`
+STRING = re.compile(  # text with empty strings, then a string or comment; few calls of `numbered`
     r"((?:[^'/]++|''(?!')|/(?!\*))*+)('[^']*(?:''[^']*)*'|/\*.*?(?:\*/|\Z)|'|\Z)", re.DOTALL
 )
 POINT_TEXT = re.compile(rf"(?<=;)#({ENTITY})=CARTESIAN_POINT\('\d*',\(({COORDINATE},{COORDINATE},{COORDINATE})\)\);")
