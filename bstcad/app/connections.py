@@ -18,8 +18,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from bstcad.scene.errors import SceneError
 
-SHUTDOWN_TIMEOUT = 1  # seconds that open requests have to finish when the server ends
-HEADERS_TIMEOUT = 10.0  # seconds from the start of a connection, or of its next request, to the end of the headers
+SHUTDOWN_TIMEOUT = 1  # time (s) in which open requests have to finish when the server ends
+HEADERS_TIMEOUT = 10.0  # time (s) from the start of a connection, or of its next request, to the headers' end
 
 
 class HeadersInTime(H11Protocol):

@@ -26,7 +26,7 @@ from bstcad.runs.files import SentenceError, note
 JOB, SCENE = "job.json", "scene.toml"  # input files of a run
 CLOUD = "cloud"  # stem of the file with the measured points; the suffix states the format
 PROGRESS, LIGHT, STATE = "progress.jsonl", "light.png", "state.json"
-MAX_JOB_SIZE = 1_000_000  # bytes of job.json
+MAX_JOB_SIZE = 1_000_000  # largest size of job.json (bytes)
 MAX_PICTURE_SIDE = 512  # longer side of the picture of the light (pixels)
 TUBES_PER_SIDE = 521  # flux tubes per side for that picture
 MIN_INTERVAL = 2.0  # shortest time between two pictures (s)

@@ -29,7 +29,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 
 DESIGN = "design"  # kind of a run that designs a lens; the other kinds work on a finished design
-MAX_PROGRESS_SIZE = 50_000_000  # bytes of a run's largest file
+MAX_PROGRESS_SIZE = 50_000_000  # largest size of a run's file (bytes)
 SCENE_TEXT = "written.toml"  # file of a run: the text of the scene on the page, with its comments
 ENDING_TIMEOUT = 1.0  # time (s) that an ending server waits for runs to write checkpoints; slower runs still do
 START_TIMEOUT = 30.0  # time (s) in which the process of a run has to start

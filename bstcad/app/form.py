@@ -70,15 +70,15 @@ class Field:
 
     key: str  # dotted key; tables of a list have numbers: target[1].z
     label: str
-    unit: str  # "" without a unit
+    unit: str  # unit of the value; "" without a unit
     minimum: float | None  # smallest value; None without a limit
     maximum: float | None  # largest value; None without a limit
     meaning: str  # meaning of the key, a sentence
-    default: str  # "" without a default
+    default: str  # default value; "" without a default
     example: str
     control: Control
     choices: tuple[str, ...]  # values of a choice, or of the items of a text
-    value: str  # "" if the key is not set
+    value: str  # value in the scene; "" if the key is not set
     is_set: bool
     required: bool
     page: str  # address in the documentation, relative to its first page
@@ -104,7 +104,7 @@ class Group:
     fields: tuple[Field, ...]
     groups: tuple[Group, ...]  # inner tables
     additions: tuple[Addition, ...]
-    removable: bool  # True if the scene is complete without the table
+    removable: bool  # True if a button may remove the table
 
     def walk(self) -> Iterator[Group]:
         """Iterate over this group and all inner groups."""

@@ -14,7 +14,7 @@ KEY_PART = re.compile(r"([^.\[\]]+)(?:\[(\d+)\])?")  # part of a dotted key: nam
 TABLE_NUMBER = re.compile(r"\[\d*\]")
 SOURCE_DISTANCE = 100.0  # distance of a new source from the lens (mm)
 DISTANCE_RATIO = 1.5  # distance of an added target from the back, relative to the last target
-SIZE_MODELS = {  # new outline: (table from which it takes its size, factor)
+SIZE_MODELS = {  # new outline: (table whose size it gets, factor on this size)
     "source.aperture": ("lens.outline", 1.0), "mount.rim": ("lens.outline", 1.0), "wavefront": ("lens.outline", 1.0),
     "mount.flange.outline": ("lens.outline", 2.0), "lens.front.outline": ("lens.outline", 0.5),
     "target.outline": ("target", 1.0), "target.profile": ("target", 1.0),

@@ -30,7 +30,7 @@ from bstcad.scene import scene_file
 from bstcad.scene.errors import SceneError
 from bstcad.scene.schema import TAGS, schema
 
-MIN_COMMENT_GAP = 2  # spaces before a comment; wider gaps align comments in a column, which is preserved
+MIN_COMMENT_GAP = 2  # usual number of spaces before a comment; wider gaps align comments in a column, which is kept
 
 KeyPath = tuple[str | int, ...]  # path of a table or a key: names, and numbers of tables in lists
 

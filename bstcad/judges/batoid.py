@@ -27,9 +27,9 @@ from bstcad.optics.rays import Rays, axes
 from bstcad.optics.tilted import TiltedSurface
 from bstcad.optics.trace import launch_strips
 
-GRID_MARGIN = 0.125  # margin of a grid outside the rim, relative to the face's width: ray searches may begin there
-POLYGON_CORNERS = 4096  # corners of the polygon of an outline with round corners
-COMPARISON_POINTS = 100_000  # points at which batoid's faces are compared with the lens's
+GRID_MARGIN = 0.125  # margin of a grid outside the rim, relative to the face's width; ray searches may begin there
+POLYGON_CORNERS = 4096  # number of corners of the polygon that represents an outline with round corners
+COMPARISON_POINTS = 100_000  # number of points at which batoid's faces are compared with the lens's
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
 
 
 def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int) -> Traced:
-    """Trace about `rays` stratified rays; return two pictures on a screen, each by half of the rays."""
+    """Trace about `rays` stratified rays; return two pictures on a screen, each from half of the rays."""
     n = max(1, round(side_factor(channels) * math.sqrt(rays / 2)))
     known = surfaces(lens)
     halves, count = np.zeros((2, *screen.shape)), 0

@@ -1,7 +1,7 @@
 """Comparison of bstcad's picture of a lens with pictures by independent programs, called judges.
 
-A judge traces the lens of a STEP file and returns a picture in two halves.  It is compared with bstcad's own picture of
-the same light, by many more rays, on pixels coarse enough for the noise of the judge's rays.
+A judge traces the lens of a STEP file and returns a picture in two halves.  It is compared with bstcad's picture of the
+same light, which has many more rays, on pixels coarse enough for the noise of the judge's rays.
 
 The module of a judge has three functions.  `cannot(lens, channels)` returns why the judge cannot trace this light, in a
 sentence, or "".  `light(lens, channels)` returns the channels with the losses that the judge simulates.  `trace(lens,
@@ -32,7 +32,7 @@ from bstcad.scene.target import overlap
 from bstcad.verify.verdict import Check
 
 JUDGES = {"batoid": "bstcad.judges.batoid", "mitsuba": "bstcad.judges.mitsuba"}
-JUDGE_RAYS = 1 << 24  # rays of a judge, in both halves
+JUDGE_RAYS = 1 << 24  # total number of a judge's rays
 MAX_COMPARED_PIXELS = 128  # largest number of pixels along the longer side of the compared pictures
 OWN_EFFORT = Effort(accuracy=0.0, witness=False)  # effort of bstcad: all rays, no second picture by flux tubes
 OWN_SEED_OFFSET = 500_009  # difference between the seeds of bstcad's and the judge's rays
@@ -47,36 +47,36 @@ class Judge:
 
     name: str  # name of the program
     version: str  # version of the program
-    declined: str = ""  # reason why it cannot trace this light
+    declined: str = ""  # reason why the judge cannot trace this light; "" if it can
     target: str = ""  # key of the target, if there are several: target[0], target[1], …
     by: str | None = None  # variant of the program, if it has several; None here and below: the judge declined
-    rays: int | None = None  # number of rays in both halves
+    rays: int | None = None  # total number of rays
     pixels: tuple[int, int] | None = None  # number of columns and rows
     losses: str | None = None  # losses of light in both pictures: "none" or "Fresnel"
-    rrmsd: float | None = None  # RRMSD of the judge's picture from the target
-    rrmsd_ours: float | None = None  # RRMSD of bstcad's picture of this light on these pixels
+    rrmsd: float | None = None  # RRMSD between the judge's picture and the target
+    rrmsd_ours: float | None = None  # RRMSD between bstcad's picture, with the same pixels, and the target
     difference: float | None = None  # RMS difference of the two pictures
-    noise: float | None = None  # RMS noise of the difference, by the rays of both programs
+    noise: float | None = None  # RMS noise of the difference, from the rays of both programs
     over_noise: float | None = None  # ratio of difference to noise: about 1 if both programs are right
     limit: float | None = None  # limit of over_noise
     agrees: bool | None = None  # True if all checks of the judge pass
-    on_target: float | None = None  # fraction of the source's light on the target, by the judge
-    on_target_ours: float | None = None  # fraction of the source's light on the target, by bstcad's ledger
+    on_target: float | None = None  # fraction of the source's light on the target, as traced by the judge
+    on_target_ours: float | None = None  # fraction of the source's light on the target, from bstcad's ledger
     heights_off: float | None = None  # RMS error of the judge's faces (mm)
-    slopes_off: float | None = None  # RMS error of their slopes (rad)
+    slopes_off: float | None = None  # RMS error of the slopes of the judge's faces (rad)
     moved_by: float | None = None  # shift of light by these errors (pixels)
     seconds: float | None = None  # time of the judge (s)
 
     @property
     def figure(self) -> str:
-        """Name of its pictures: judge_batoid, and judge_batoid_2 for the second target."""
+        """Name of the judge's pictures: judge_batoid, and judge_batoid_2 for the second target."""
         number = int(re.sub(r"\D", "", self.target) or 0) + 1
         return f"judge_{self.name}" if number == 1 else f"judge_{self.name}_{number}"
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A judge's outcome with checks and pictures (rows, columns) of equal sum; without them if the judge declined."""
+    """A judge's outcome with checks and pictures (rows, columns) of equal sum, or only the reason for declining."""
 
     judge: Judge
     checks: tuple[Check, ...] = ()
@@ -92,7 +92,7 @@ class OwnJudge(Protocol):
     version: str
 
     def cannot(self, lens: Lens, channels: Sequence[Channel]) -> str:
-        """Return why the judge cannot trace this light, in a sentence; "" if it can."""
+        """Return the reason, a sentence, why the judge cannot trace this light; "" if it can."""
 
     def light(self, lens: Lens, channels: Sequence[Channel]) -> Sequence[Channel]:
         """Return the channels with the losses that the judge simulates."""

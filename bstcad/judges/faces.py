@@ -23,7 +23,7 @@ from bstcad.optics.surfaces import Surface
 from bstcad.optics.unfolding import per_radian
 
 PARAMETER_STEPS = 6  # steps of Newton's method for a parameter; the first guess has an error of at most half a span
-GRID_CELLS = 512  # cells per side of the grid over a face without knots
+GRID_CELLS = 512  # number of cells per side of the grid over a face without knots
 PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # radii relative to the rim; slim triangles leak light
 
 
@@ -31,8 +31,8 @@ PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # radii relative to 
 class Shape:
     """Heights and slopes of a face at some points, arrays of one shape."""
 
-    x: np.ndarray  # position (mm)
-    y: np.ndarray  # position (mm)
+    x: np.ndarray  # x of the points (mm)
+    y: np.ndarray  # y of the points (mm)
     z: np.ndarray  # height (mm)
     z_x: np.ndarray  # ∂z/∂x
     z_y: np.ndarray  # ∂z/∂y
@@ -109,7 +109,7 @@ class Freeform:
 class Revolved:
     """z = z0 + c r² / (1 + sqrt(1 - (1 + k) c² r²)), r² = x² + y²: plane, sphere or conic."""
 
-    z0: float  # mm
+    z0: float  # z of the vertex (mm)
     curvature: float  # c (1/mm)
     conic_constant: float  # k
     half: tuple[float, float]  # half extents along x and y (mm)
@@ -172,7 +172,7 @@ class Traced:
     """A judge's picture of the light on a screen."""
 
     halves: np.ndarray = field(repr=False)  # flux per pixel, (2, rows, columns), row 0 = y max, each with the full flux
-    rays: int  # number of rays in both halves
+    rays: int  # total number of rays
     error: FaceError  # largest error of the judge's faces
     by: str = ""  # variant of the program, if it has several
 
@@ -186,7 +186,7 @@ class Traced:
 
 
 def rim(outline: Outline, points: int = 512) -> np.ndarray:
-    """Return points (points, 2) along an outline (mm), counterclockwise; a rectangle with all its corners."""
+    """Return points (points, 2) along an outline (mm), counterclockwise, including all corners of a rectangle."""
     if isinstance(outline, Circle):
         turn = np.linspace(0, 2 * np.pi, points, endpoint=False)
         return outline.radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
@@ -197,7 +197,7 @@ def rim(outline: Outline, points: int = 512) -> np.ndarray:
 
 
 def clip_to_rim(outline: Outline, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return True for points inside an outline, and x and y (mm); points outside are moved to the nearest rim point."""
+    """Return a mask of points inside an outline, and x, y (mm); points outside are moved to the nearest on it."""
     a, b, r2 = outline.limits
     r, core_x, core_y = math.sqrt(r2), np.clip(x, -a, a), np.clip(y, -b, b)
     distance = np.hypot(x - core_x, y - core_y)
@@ -260,20 +260,20 @@ def _mesh_error(face: Face, shape: Shape, x: np.ndarray, y: np.ndarray, *, whole
 
 
 def wall(front: Face, back: Face, apertures: tuple[Outline, Outline]) -> Trimesh:
-    """Return the sides of a lens between the rims of the clear apertures of front and back."""
+    """Return the mesh of a lens's wall between the rims of the clear apertures of front and back."""
     below, around = map(rim, apertures)
     low, high = front.at(*below.T).points, back.at(*around.T).points
     return _strips([low, high], np.c_[around / np.linalg.norm(around, axis=1, keepdims=True), np.zeros(len(around))])
 
 
 def plate(front: Face, outline: Outline) -> Trimesh:
-    """Return a plate around the front, level with its rim."""
+    """Return the mesh of a plate around the front, at the height of the front's rim."""
     hole = front.at(*rim(outline).T).points
     return _strips([hole * (ring, ring, 1.0) for ring in PLATE_RINGS], np.tile([0.0, 0.0, 1.0], (len(hole), 1)))
 
 
 def disc(outline: Outline, centre: tuple[float, float, float], along: tuple[float, float, float]) -> Trimesh:
-    """Return the inside of an outline on a level plane, with normals of any direction, and u, v from 0 to 1."""
+    """Return the mesh of an outline's inside at constant z, with normals `along`, and texture u, v from 0 to 1."""
     around = rim(outline, 4) if outline.shape == "rectangle" else rim(outline)
     points = np.concatenate([np.zeros((1, 2)), around])
     k = np.arange(len(around))

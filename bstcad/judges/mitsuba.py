@@ -40,10 +40,10 @@ from bstcad.optics.trace import window
 MIN_LLVM = 16  # first version of LLVM that compiles Mitsuba's kernels; with 15 the process crashes
 SCREEN_REFLECTANCE = 1e-3  # reflectance of the screen, so low that light reflected to the lens is negligible
 PHOTONS_PER_PASS = 1 << 22  # largest number of photons in a pass, limited by memory
-MESH_PARTS = (1, 2, 4)  # cells of the mesh per half span of the net, tried in turn
+MESH_PARTS = (1, 2, 4)  # numbers of mesh cells per half span of the net, tried in turn
 MAX_CORNERS = 5_000_000  # largest number of corners of a mesh
 MAX_FACET_SHIFT = 0.007  # largest shift of light by facets (RMS, pixels); 0.02 changes a picture by 0.8 %
-TEXELS = 1024  # texels of a slide along each side
+TEXELS = 1024  # number of texels of a slide along each side
 TEXEL_CENTRES = (2 * np.arange(TEXELS) + 1) / TEXELS - 1  # centres of texels, from -1 to 1
 FIELD_MARGIN = 1.01  # ratio of a projector's field to that of the lens
 SPOT_EDGE = 1e-5  # width of a spot's edge, relative to its cone
@@ -54,7 +54,7 @@ S = TypeVar("S", Collimated, Point)
 
 
 def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
-    """Return why Mitsuba cannot trace this light, in a sentence; "" if it can."""
+    """Return the reason, a sentence, why Mitsuba cannot trace this light; "" if it can."""
     if lens.before or lens.behind:
         return "it simulates only the lens, and there are windows or mirrors before or behind it"
     if lens.own_passes is not None:

@@ -35,10 +35,10 @@ MAX_GAUSS_NEWTON_STEPS = 30  # maximum number of Gauss-Newton steps
 MAX_OUTLIER_ROUNDS = 6  # maximum number of rounds of outlier rejection
 STEP_TOLERANCE = 1e-10  # largest component (mm at the rim) of a step that ends the iteration
 FOOT_ITERATIONS = 3  # iterations for the foot of a perpendicular; each scales the error by distance x curvature
-INDEPENDENT_PATCHES = 100  # patches of a face whose form errors are independent
-SCALE_PATCHES = 16  # patches of a face with independent form errors that resemble a change of scale, such as power
-MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty by form errors, in half widths, above which a motion is not determined
-MIN_SENSITIVITY = 1e-7  # mm of distance per mm of motion; smaller values are rounding
+INDEPENDENT_PATCHES = 100  # assumed number of patches of a face with independent form errors
+SCALE_PATCHES = 16  # assumed number of patches with independent form errors that resemble a scale, such as power
+MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty from form errors, in half widths, above which a motion is not determined
+MIN_SENSITIVITY = 1e-7  # smallest change of distance per motion (mm per mm); smaller values are rounding errors
 RIM_MARGIN = 2e-3  # width, in half widths, of the rim that is ignored: points there may lie on the edge
 FACE_DISTANCE_FRACTION = 0.25  # largest distance of a point of the face, as a fraction of the minimum thickness
 MOTION_NAMES = ("shift in x", "shift in y", "shift in z", "rotation about x", "rotation about y", "rotation about z")
@@ -129,7 +129,7 @@ class Alignment:
     points: np.ndarray = field(repr=False)  # points of the face (n, 3), mm, in the frame of the design
     distances: np.ndarray = field(repr=False)  # signed distances along the normal (n,), mm
     normals: np.ndarray = field(repr=False)  # unit normals of the face at the points (n, 3)
-    motions: np.ndarray = field(repr=False)  # orthonormal motions (6, k) that the face determines
+    motions: np.ndarray = field(repr=False)  # orthonormal motions (6, k) that the points of the face determine
     undetermined: tuple[str, ...]  # names of the motions that the face does not determine
     outside: int  # number of points outside the outline, or on its rim
     off_face: int  # number of points inside the outline, but far from the face

@@ -13,8 +13,8 @@ from bstcad.measured.point_text import INCH, INPUT_HINT, MeasuredPoints, read_te
 from bstcad.optics.outlines import Outline
 from bstcad.runs import files
 
-MAX_CLOUD_SIZE = 1_000_000_000  # bytes
-MIN_CLOUD_POINTS = 100  # minimum number of points: six degrees of freedom and a form are fitted to them
+MAX_CLOUD_SIZE = 1_000_000_000  # largest size of a file (bytes)
+MIN_CLOUD_POINTS = 100  # minimum number of points, to which six degrees of freedom and a form are fitted
 MESH_SUFFIXES = (".ply", ".stl")
 UNIT_SIZES = {"inches": 1 / INCH, "metres": 1e-3, "micrometres": 1e3}  # 1 mm in each unit
 PLAUSIBLE_RATIOS = (0.3, 1.7)  # limits of the ratio of extents, cloud to lens: half a lens, or a lens in a fixture

@@ -30,16 +30,16 @@ POLYNOMIAL_DEGREE = 2
 NET_MARGIN = 0.2  # margin of the field's net around the face, in sides; cosines have zero slope at the net's ends
 POINTS_PER_NET_CELL = 6.0  # mean number of points in a cell of the net
 FIELD_NET_LIMITS = (9, 513)  # minimum and maximum number of control points per side
-MAX_REFINEMENT = 4  # maximum ratio of control points per side to the net of the lens, since the nets are not nested
+MAX_REFINEMENT = 4  # maximum ratio of control points per side, of the field to the lens; the nets are not nested
 BANDS_PER_OCTAVE = 4
 SPECTRUM_ROUNDS = 8  # number of alternating estimates of field and spectrum
 FIRST_MOTION_ROUND = 3  # round from which the spectrum is good enough to weight the motions
 MAX_FIELD_STEPS, FIELD_TOLERANCE = 30, 1e-4  # maximum steps of conjugate gradients, and their relative tolerance
 DETECTION_SIGMAS = 3.0  # excess over noise, in standard deviations, at which a band of frequencies contains form
-UNDETECTED_VARIANCE = 1e-4  # variance of a band without detected form, relative to the noise
+UNDETECTED_VARIANCE = 1e-4  # variance of the form in a band without detected form, relative to the noise
 MAX_RELIEF_UNCERTAINTY = 0.001  # uncertainty of a motion from fine relief, in half widths, above which it stays zero
 EXTRAPOLATION_BANDS = 6  # number of bands from which the spectrum is extrapolated below the noise
-MIN_NOISE_RATIO = 1e-3  # lower bound of the noise relative to the deviation
+MIN_NOISE_RATIO = 1e-3  # lower bound of the noise relative to the RMS deviation
 SAMPLING_STRIPS = 32  # number of strips in which a net is sampled, which bounds the memory
 
 
@@ -242,9 +242,9 @@ def _bands(frequency: np.ndarray) -> tuple[np.ndarray, int]:
 
 DEVIATION_MAP_POINTS = 301  # number of points per side of the deviation map
 ZERNIKE_ORDER = 10  # maximum n + |m| of the 36 terms of the fringe set
-ZERNIKE_FIT_POINTS = 50_000  # approximate number of points to which the terms are fitted
+ZERNIKE_FIT_POINTS = 50_000  # approximate number of points to which Zernike terms are fitted
 MAP_FILES = ("deviation.npz", "deviation.csv")  # file names of the deviation map
-SHORTEST_PERIOD = 2.0  # shortest period of a form error, in pitches of its net
+SHORTEST_PERIOD = 2.0  # shortest period of a form error, in pitches of the field's net
 
 
 @dataclass(frozen=True)
@@ -347,8 +347,8 @@ def zernike(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 # --- the minimum zone -------------------------------------------------------------------------------------------------
 
-ZONE_TOLERANCE = 1e-3  # relative tolerance by which points may lie outside the minimum zone
-ZONE_CHUNK = 400  # number of points in the first linear program, and added to it in each round
+ZONE_TOLERANCE = 1e-3  # distance by which points may lie outside the minimum zone, relative to its half width
+ZONE_CHUNK = 400  # number of points in the first linear program, and added in each round
 MAX_ZONE_ROUNDS = 30
 
 

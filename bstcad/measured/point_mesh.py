@@ -15,13 +15,13 @@ import numpy as np
 from bstcad.measured.point_text import MeasuredPoints, make_points
 
 EXPORT_HINT = "export it again"
-PLY_TYPES = {  # number types of PLY and of numpy
+PLY_TYPES = {  # names of number types in numpy, by their names in PLY
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
-MAX_PLY_HEADER_SIZE = 1 << 20  # bytes
+MAX_PLY_HEADER_SIZE = 1 << 20  # largest size of a header (bytes)
 STL_HEADER_SIZE, STL_TRIANGLE_SIZE = 84, 50  # bytes: 80 of text and a count; twelve float32 and two bytes
 
 

@@ -18,7 +18,7 @@ from itertools import pairwise
 import numpy as np
 
 INPUT_HINT = "give x, y and z in mm, one point per line"
-INCH = 25.4  # mm
+INCH = 25.4  # length of an inch (mm)
 UNITS_IN_MM = {  # sizes (mm) of units as they are written in headings
     "mm": 1.0, "millimetre": 1.0, "millimeter": 1.0, "cm": 10.0, "m": 1e3, "metre": 1e3, "meter": 1e3, "um": 1e-3,
     "\u00b5m": 1e-3, "\u03bcm": 1e-3, "micron": 1e-3, "microns": 1e-3, "nm": 1e-6, "in": INCH, "inch": INCH,

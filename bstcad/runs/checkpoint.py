@@ -26,7 +26,7 @@ from bstcad.runs import files
 from bstcad.runs.files import SceneError
 
 MAGIC = b"bstcad checkpoint 9\n"  # version; increase it if fields of a state's records or of the purpose change
-DIGEST_SIZE = 65  # bytes of the line with the SHA-256
+DIGEST_SIZE = 65  # length of the line with the SHA-256 (bytes)
 MAX_SIZE = 8 << 30  # largest size of a checkpoint (bytes); 2049 x 2049 control points need 1 GB
 MAX_WRITING_FRACTION = 0.02  # largest fraction of the run's time that checkpoints may take
 

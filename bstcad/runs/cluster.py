@@ -19,7 +19,7 @@ from bstcad.runs.files import MachineError, SceneError, first_line
 
 CONNECTION_TIMEOUT = 30.0  # timeout (s) for the scheduler's answer, and for the first worker
 JOB_INTERVAL = 0.5  # time (s) between two checks for finished jobs
-RETRIES = 2  # retries of a job after an error of a worker
+RETRIES = 2  # number of retries of a job after an error of a worker
 MAX_WORKERS = 1000
 THIS_MACHINE = "here"  # `Answer.where` of a job on this machine; otherwise it is the address of the worker
 

@@ -26,8 +26,8 @@ DESIGN_FILES = ("report.json", "lens.step", "scene.toml")  # files that only a d
 # Kinds of files for a shop, as in `bstcad export --as` and the scene's output.export.
 Export = Literal["sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet"]
 EXPORTS: tuple[str, ...] = get_args(Export)
-MAX_ARCHIVE_SIZE = 600_000_000  # bytes of an archive, enough for a net of 2049 x 2049 and pictures of 4096 x 4096
-MAX_ARRAY_HEADER = 4096  # bytes of an array's header, with a margin
+MAX_ARCHIVE_SIZE = 600_000_000  # largest archive (bytes), enough for a net of 2049 x 2049, pictures of 4096 x 4096
+MAX_ARRAY_HEADER = 4096  # largest size of an array's header (bytes), with a margin
 NO_MEMORY = re.compile(  # words of Python, torch, the system and the dynamic loader for a lack of memory
     "not enough memory|out of memory|bad_alloc|can(not|'t) allocate memory|failed to map segment|can't start new thread"
 )

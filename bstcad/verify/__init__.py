@@ -1,1 +1,1 @@
-"""Verification: the written files, measured against the design."""
+"""Verification of a design: its written files are measured and compared with it."""

@@ -1,8 +1,8 @@
-"""Proof of a design: its written files, measured against the design.
+"""Proof of a design: its written files are measured and compared with it.
 
 The proof is independent of the optimisation.  Net and knots are read by a parser that is not OCC, the surface is
-sampled through OCC, the mesh is read back from the STL, and the irradiance is traced through the geometry of the STEP
-file, by rays that tailoring has not used, and by flux tubes.
+sampled with OCC, the mesh is read back from the STL, and the irradiance is traced through the geometry of the STEP
+file, with rays that tailoring has not used, and with flux tubes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from bstcad.verify.verdict import Check
 if TYPE_CHECKING:
     from bstcad.verify.step_checks import ExaminedFile  # this import loads OCC
 
-VERTEX_ROUNDING = 2e-7  # distance of a vertex in float32 from its sloped face, relative to the largest coordinate
+VERTEX_ROUNDING = 2e-7  # distance of a float32 vertex from a sloped face, relative to the largest coordinate
 VERIFY_SEED = 1_000_003  # offset of the seed, for rays that tailoring has not used
 TARGET_TOLERANCE = 1e-3  # difference of targets by versions of picture libraries, relative to the brightest pixel
 DEFAULT_RRMSD_LIMIT = 0.25  # limit of the RRMSD in remarks, plans and tolerance studies without accept.rrmsd
@@ -56,7 +56,7 @@ TIME_LIMIT, TIME_LIMIT_PER_MB = 120.0, 3.0  # timeout of OCC (s) and its increas
 R = TypeVar("R")
 Lines = tuple[SpectralLine, ...]  # pictures of the lines of a spectrum on one target
 OnLight = Callable[[Light, Lines, int], None]  # function that is called with the light on a target, and its index
-FINE_GRID = ", on a grid four times finer than the net"  # end of the names of checks on such a grid
+FINE_GRID = ", on a grid four times finer than the net"  # suffix of the names of checks on such a grid
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Nominal:
 class AtBound:
     """A bound of the scene that limits the tailored faces."""
 
-    share: float | None  # fraction of their area within 3 % of the bound; None for a bound of the thickness
+    share: float | None  # fraction of the faces' area within 3 % of the bound; None for a bound of the thickness
     tightest: str  # position nearest to the bound, "at (1, 2) mm"; "" for a thickness
 
 
@@ -103,7 +103,7 @@ class Proof:
     """Result of the proof of a design's files."""
 
     checks: tuple[Check, ...]
-    lens: Lens  # lens re-read from lens.step; with a mount from part.step, with its clear apertures
+    lens: Lens  # lens re-read from lens.step or, with a mount, from part.step, including clear apertures
     lights: tuple[Light, ...]  # light of the lens on each target
     shape: dict[str, float | None]  # dimensions of the lens within the mount's rim, and volume of lens.step (mm³)
     stability: dict[str, float | int | None]  # margins to numerical limits, see `_stability`
@@ -136,7 +136,7 @@ def verify(
     on_light: OnLight = lambda light, lines, number: None,
     effort: Effort | None = None,
 ) -> Proof:
-    """Check lens.step and lens.stl in `folder` against the design; ValueError if one of them cannot be read at all.
+    """Check lens.step and lens.stl in `folder` against the design; ValueError if one of the two cannot be read.
 
     submit: with bstcad.runs.processes.submit, a second process reads the STEP file by OCC, while this one reads the
     file's text and the mesh.  on_lens: called with the lens of the STEP file once it has been read.  on_light: called
@@ -208,7 +208,7 @@ def _read_text(path: Path, read: Future[Lens]) -> StepText:
 
 
 def _measure_targets(lens: Lens, nominal: Nominal, effort: Effort, on_light: OnLight) -> list[tuple[Light, Lines]]:
-    """Measure the light on each target, and the lines of a spectrum there; ValueError if no light falls on one."""
+    """Measure the light on each target, and the lines of a spectrum there; ValueError if a target gets no light."""
     found = []
     for number, goal in enumerate(nominal.goals):
         light = nominal.light(lens, goal, effort)
@@ -254,7 +254,7 @@ def _mounted_lens(read: Future[Lens], bare: Lens, nominal: Nominal, path: Path) 
 
 
 def _aperture_check(name: str, measured: Outline, designed: Outline) -> Check:
-    """Check the largest distance (mm) between the rims of a face's clear aperture and of the designed one."""
+    """Check the largest distance (mm) between the rims of a face's clear aperture and of the designed aperture."""
     off = max(float(np.abs(a.depth(*b.rim_points())).max()) for a, b in ((measured, designed), (designed, measured)))
     where = f"the part has {measured.words}, but the lens was tailored for {designed.words}; generate the design again"
     name = f"part.step: clear aperture of the {name}, deviation from the mount's"
@@ -407,7 +407,7 @@ def _mesh_checks(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal)
 def _light_checks(
     light: Light, accept: Accept, meets: str = "enters the lens", of: str = "", why: str = ""
 ) -> list[Check]:
-    """Check the irradiance through the re-read geometry, by rays and by flux tubes, which share only the trace.
+    """Check the irradiance of the re-read lens, computed with rays and with flux tubes, which share only the trace.
 
     of: suffix of the checks' names, for one of several targets (Goal.suffix).  why: reason why a limit is not met.
     """
@@ -436,7 +436,7 @@ def _light_checks(
 
 
 def _wavefront_checks(lens: Lens, nominal: Nominal) -> tuple[WavefrontError | None, list[Check]]:
-    """Return the error of the wavefront through the re-read lens, and its checks; None without a requested wave."""
+    """Return the wavefront error of the re-read lens, and its checks; None if the scene requests no wave."""
     wave, accepted = nominal.scene.wavefront, nominal.scene.accept.wavefront
     if wave is None:
         return None, []

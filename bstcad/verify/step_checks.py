@@ -35,8 +35,8 @@ from bstcad.verify import text_checks
 from bstcad.verify.text_checks import net_check
 from bstcad.verify.verdict import Check
 
-NORMAL_TOLERANCE = 1e-9  # largest angle (rad) between normals
-CURVATURE_TOLERANCE = 1e-12  # largest difference of curvatures (1/mm)
+NORMAL_TOLERANCE = 1e-9  # largest angle (rad) between written and designed normals
+CURVATURE_TOLERANCE = 1e-12  # largest difference (1/mm) of written and designed curvature
 CONIC_TOLERANCE = 1e-9  # largest difference of sag (mm) due to the conic constant, uncertain for a nearly flat front
 GAP_TOLERANCE = 5e-7  # largest gap (mm); shapes are written with a tolerance of 1e-7 mm
 PART_EDGE_TOLERANCE = 1e-6  # largest distance (mm) between edges of two parts, written with a tolerance of 1e-7 mm
@@ -228,7 +228,7 @@ def _properties(path: Path, stamp: object) -> MassProperties | None:
 
 @one_sentence
 def whole_part(path: Path) -> tuple[Lens, WholePart | None]:
-    """Read the lens of a part, with an arbitrary index, and the part around it."""
+    """Read the lens of a part, with an arbitrary refractive index, and the part around it; None for a bare lens."""
     reread = step_reading.read(path, _part(path, _stamp(path))[1])
     return step_reading.lens(reread, index=1.5), solid_properties.whole_part(reread, _properties(path, _stamp(path)))
 

@@ -20,7 +20,7 @@ from bstcad.step_text.part21 import FreeformSurface, StepText, ValidationPropert
 from bstcad.verify.verdict import Check
 
 SOURCE = "STEP text"  # source of the checked values, at the beginning of the checks' names
-NET_TOLERANCE = 1e-11  # absolute tolerance of control points (mm): rounding to sixteen digits of text
+NET_TOLERANCE = 1e-11  # absolute tolerance of control points (mm), for rounding to sixteen digits of text
 RELATIVE_ROUNDING = 2e-15  # relative tolerance of coordinates, larger than NET_TOLERANCE beyond 5 m from the origin
 MEASURE_TOLERANCE = 1e-6  # relative tolerance of area, volume and centroid; integrals over a rough back err by 1e-9
 VALUE_TOLERANCE = 1e-12  # absolute tolerance of stated numbers (mm or g/cm³), more than their rounding in the text
@@ -83,7 +83,7 @@ def _open_edge(text: StepText) -> str:
 
 
 def net_check(name: str, read: np.ndarray, designed: np.ndarray, *, id: str) -> Check:
-    """Check the control points (m, n, 3) in a file against the designed ones (mm)."""
+    """Check the control points (m, n, 3) in a file against the designed control points (mm)."""
     off, where = _largest_difference(read, designed, "control point")
     farthest = float(np.abs(designed).max(initial=0.0))
     return Check.at_most(name, off, max(NET_TOLERANCE, RELATIVE_ROUNDING * farthest), unit="mm", where=where, id=id)
