@@ -91,7 +91,7 @@ FULL_APERTURE = 0.99  # extent of the light, relative to the clear aperture, fro
 
 
 def needed_apertures(source: Emitter, lens: Lens) -> dict[str, Outline | None]:
-    """Return the clear aperture (mm) needed on each face: the smallest circle or rectangle that holds all light.
+    """Return the clear aperture (mm) needed on each face: the smallest circle or rectangle with all light.
 
     None: the light fills the clear aperture of the face.  Only light that passes all faces counts.  An extended source
     is represented by its centre and the ends of its extent.
@@ -117,7 +117,7 @@ def _hits(source: Emitter, lens: Lens) -> Tensor:
 
 
 def _aperture(hits: Tensor, aperture: Outline) -> Outline | None:
-    """Return the smallest outline that holds points (2, n) of a face; None if they fill its clear aperture."""
+    """Return the smallest outline that contains points (2, n) of a face; None if they fill its clear aperture."""
     if not hits.numel():
         return Circle(0.0)
     half_x, half_y = (float(part.abs().max()) for part in hits)
@@ -158,7 +158,7 @@ MIN_MOUNT_RAYS = 48  # smallest number of rays per side for one channel
 class MountLosses:
     """Fractions of the light that a mount blocks."""
 
-    cut: float  # fraction of the light through both faces of the uncut lens that misses the clear apertures
+    cut: float  # fraction of the light through the two faces of the uncut lens that misses the clear apertures
     on_flange: float  # fraction of the light through the clear apertures that meets a wall of the flange's opening
 
 

@@ -1,8 +1,8 @@
 """Slope that a tailored face needs for the light of a target; it may exceed that of any surface z(x, y).
 
-To refract a ray from direction d to d', a face of relative index η = n / n' needs a normal along η d - d'.
-A face z(x, y) is less steep than 90 degrees, and tailoring makes it no steeper than MAX_SLOPE_DEG; light that needs
-more misses its aim.  This concerns wide beams: light at 60 degrees in PMMA, sent straight on, would need an overhanging
+To refract a ray from direction d to d', a face of relative index η = n / n' needs a normal along η d - d'. A face z(x,
+y) is less steep than 90 degrees, and tailoring makes it no steeper than MAX_SLOPE_DEG; light that needs a steeper face
+misses its aim.  This concerns wide beams: light at 60 degrees in PMMA, sent straight on, would need an overhanging
 face.  Light that no slope deflects far enough is not counted here (see optics/reach.py).
 """
 

@@ -1,7 +1,7 @@
 """The procedure of the paper: stages 1 and 2 by Adam on raw control points (Wang et al. 2023, sections 2.3 and 3).
 
-The other qualities are compared with it.  Where the paper gives no number, the choice is stated here or in quality.py:
-steps per level, learning rates that fall to zero in each level, and the learning rate of stage 2.
+Lenses of other `quality` are compared with it.  Choices for which the paper gives no number are stated here or in
+quality.py: steps per level, learning rates that fall to zero in each level, and the learning rate of stage 2.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def transport(task: Task, lens: Lens) -> Mapping:
 
 
 def tent_average(target: Tensor) -> Tensor:
-    """Return a picture of constant irradiance in each pixel after tent binning: [1, 6, 1] / 8 along both axes.
+    """Return a picture of constant irradiance in each pixel after tent binning: [1, 6, 1] / 8 along the two axes.
 
     Compared with this picture, instead of the sharp one, a perfect lens has merit zero.
     """

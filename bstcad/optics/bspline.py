@@ -33,8 +33,8 @@ from bstcad.optics.sides import Sides, as_pair, side
 from bstcad.optics.surfaces import Surface
 
 DEGREE = 2  # degree of the basis functions (order 3)
-SPANS_AT_A_TIME = 1 << 14  # spans evaluated at a time, so that their numbers stay in the cache
-# Positions in a span at which slope and curvature of the back are limited and reported, with both sides of each knot.
+SPANS_AT_A_TIME = 1 << 14  # spans evaluated at a time, so that their values stay in the cache
+# Positions in a span at which slope and curvature of the back are limited and reported, on the two sides of each knot.
 QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
@@ -73,7 +73,7 @@ def basis(u: Tensor, m: int) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], tup
     """Return the three non-zero basis functions at u and their derivatives in u; Wang et al. 2023, Eqs. 8-12.
 
     With s = t - k and q = 1 - s in span k: B_k = a q², B_{k+2} = b s², B_{k+1} = 1 - B_k - B_{k+2}, where a = 1 in
-    the first span, b = 1 in the last and both are 1/2 otherwise (the four corner functions; the paper prints B_{m-1}
+    the first span, b = 1 in the last, and otherwise a, b = 1/2 (the four corner functions; the paper prints B_{m-1}
     and the first piece of B_{m-2} reversed, the correct form is the mirror image of B_0 and B_1).  Since the control
     points are uniform, du/dt = Σ i B'_i = 2 (a q + b s).
 
@@ -140,7 +140,7 @@ def resample(values: np.ndarray, fine: int) -> np.ndarray:
     """Resample the coefficients (m, …) of a spline to `fine` control points, (fine, …), by least squares.
 
     The knot vectors are not nested, so the spline is fitted at eight points per span of the finer net; in two
-    dimensions apply it along each axis.  Both matrices are banded: the work grows in proportion to the net.
+    dimensions apply it along each axis.  The matrices are banded: the work grows in proportion to the net.
     """
     coarse, u = len(values), np.linspace(0.0, 1.0, 8 * (fine - 2) + 1)
     on_fine, on_coarse = basis_matrix(u * (fine - 1), fine), basis_matrix(u * (coarse - 1), coarse)

@@ -133,7 +133,7 @@ class Collimated(Emitter):
         return torch.where(inside, peak, torch.zeros_like(x))
 
     def _gaussian(self) -> tuple[float, float]:
-        """Return (∫ exp(-2 r² / w²) over the aperture, w²) of a gaussian profile, both in mm²."""
+        """Return (∫ exp(-2 r² / w²) over the aperture, w²) of a gaussian profile, each in mm²."""
         assert self.radius_1e2 is not None  # a gaussian profile needs it (`widths`)
         w = self.radius_1e2
         if isinstance(self.aperture, Circle):

@@ -117,7 +117,7 @@ class Interface:
 
 @dataclass(frozen=True)
 class Hit:
-    """Rays that have crossed an interface; the cosines hold for those still alive."""
+    """Rays that have crossed an interface; the cosines are valid for alive rays."""
 
     rays: Rays  # rays on the surface, with their new directions
     cos_in: Tensor  # cosine of the angle of incidence
@@ -125,7 +125,7 @@ class Hit:
 
 
 def cross(rays: Rays, interface: Interface) -> Hit:
-    """Trace rays to an interface and through it: refract or reflect those that meet it inside the outline."""
+    """Trace rays to an interface and through it: refract or reflect rays that meet it inside the outline."""
     at, z_x, z_y = intersect(interface.surface, rays, interface.outline, interface.status_if_missed)
     hit = deflect(at, z_x, z_y, interface.law, level=interface.surface.level)
     if not interface.losses:

@@ -1,8 +1,8 @@
 """Irradiance pictures and flux ledgers from the landing points of rays.
 
 A picture is (rows, columns), row 0 = y max, column 0 = x min.  `tent` distributes a ray over the four nearest pixel
-centres (differentiable, for tailoring); `box` adds it to the pixel it falls into (as a detector does, for
-verification).  Both sum in float64: float32 sums stop growing at 2^24 rays.
+centres (differentiable, for tailoring); `box` adds it to the pixel where it lands (as a detector does, for
+verification).  They sum in float64: float32 sums stop growing at 2^24 rays.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ class Key:
 
     meaning: str  # meaning, one sentence
     unit: str = ""  # unit; "": a pure number or a word
-    minimum: float | None = None  # lower end of the range; None: the field holds no number
+    minimum: float | None = None  # lower end of the range; None: the field contains no number
     maximum: float | None = None
     example: Any = None  # example value of a key that every scene must state
     remedy: str = ""  # advice on a number out of range; "": choose a value in between

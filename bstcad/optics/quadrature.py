@@ -47,7 +47,7 @@ class Border:
 
 @dataclass(frozen=True)
 class Sums:
-    """Integrals over a piece of a solid's surface with the unit normal n; the sum over all describes the solid."""
+    """Integrals over a piece of a solid's surface with unit normal n; their sum over all pieces describes the solid."""
 
     area: float = 0.0  # ∫ dA (mm²)
     volume: float = 0.0  # ∫ r·n dA / 3 (mm³), volume of the cone from the origin to the piece

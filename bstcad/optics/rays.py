@@ -105,7 +105,7 @@ def point_along(start: Vector, distance: float, direction: Vector) -> Vector:
 def axes(tilt: tuple[float, float]) -> Frame:
     """Return (e_x, e_y, n): the axes of space, rotated first about the x axis by α, then about y by β (degrees).
 
-    e_x = (cos β, 0, -sin β), e_y = (sin α sin β, cos α, sin α cos β), n = (cos α sin β, -sin α, cos α cos β).  Both
+    e_x = (cos β, 0, -sin β), e_y = (sin α sin β, cos α, sin α cos β), n = (cos α sin β, -sin α, cos α cos β).  The
     rotations are right-handed: a positive α inclines n towards -y and a positive β towards +x.
     """
     (sin_a, sin_b), (cos_a, cos_b) = ([f(math.radians(t)) for t in tilt] for f in (math.sin, math.cos))

@@ -77,10 +77,10 @@ def wanted_slopes(at_face: Rays, aim: Tensor, plane: Receiver, law: Law) -> tupl
 def slopes_towards(at_face: Rays, out: Tensor, law: Law) -> tuple[Tensor, Tensor]:
     """Return the slopes (∂z/∂x, ∂z/∂y) that deflect each ray into the direction d' of `out`, unit vectors (3, …).
 
-    By both laws η d - d' is parallel to the normal (-z_x, -z_y, 1), with d and d' the directions in front of the face
-    and behind it; into glass, η < 1, it is antiparallel.  If no face can deflect a ray so far, the slope deflects it
-    towards the same side by the largest angle, that of a ray which meets or leaves the face at MAX_EXIT_ANGLE.  No
-    slope is steeper than MAX_SLOPE.
+    By the laws of refraction and reflection η d - d' is parallel to the normal (-z_x, -z_y, 1), with d and d' the
+    directions before and behind the face; into glass, η < 1, it is antiparallel.  If no face can deflect a ray so far,
+    the slope deflects it towards the same side by the largest angle, that of a ray which meets or leaves the face at
+    MAX_EXIT_ANGLE.  No slope is steeper than MAX_SLOPE.
     """
     d = at_face.direction
     along = dot(d, out)

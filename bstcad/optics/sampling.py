@@ -75,7 +75,7 @@ def random(window: Rectangle, count: int, seed: int, dtype: torch.dtype = torch.
 
 
 def point_pairs(outline: Outline, pairs: int, draw: int = 0) -> list[tuple[float, float]]:
-    """Return points (x, y) evenly over an outline, each followed by its reflection in the centre: their mean is 0.
+    """Return points (x, y) uniformly over an outline, each followed by its reflection in the centre: their mean is 0.
 
     A golden lattice, a = (k + 1/2) / pairs and b = (k φ + shift) mod 1 for k = 0, 1, …, covers one half: of a rectangle
     as (a, 2 b - 1), of a disc as the sunflower spiral r² = a, ψ = π b.  The shift depends on `draw`.  From two pairs on

@@ -1,6 +1,6 @@
 """Numbers along the two sides of a rectangle: control points of a net, cells of a grid, flux tubes of a sheet.
 
-One number stands for both sides; a pair is (along x, along y).
+One number applies to the two sides; a pair is (along x, along y).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ def as_pair(sides: Sides) -> tuple[int, int]:
 
 
 def simplified(sides: Sides) -> Sides:
-    """Return one number if both sides are equal, else the pair."""
+    """Return one number if the numbers are equal, else the pair."""
     x, y = as_pair(sides)
     return x if x == y else (x, y)
 

@@ -169,7 +169,7 @@ class _Revolved(Surface):
 
         a s² - 2 g s + c r² = 0, a = c (1 + k d_z²), g = d_z - c (x d_x + y d_y), is solved as
         s = c r² / (g + sqrt(g² - a c r²)), the root at which a ray comes from below, d_z > ∇z · (d_x, d_y).
-        sense: -1 for light along -z, which takes the other root.
+        sense: -1 for light along -z, which meets the surface at the other root.
         """
         c, (dx, dy, dz) = self.curvature, direction
         f = c * (x * x + y * y)

@@ -35,7 +35,7 @@ MAX_BAND_ROWS = 256  # maximum rows of tubes traced at a time for a picture; eve
 MAX_BAND_TUBES = 1 << 19  # maximum tubes traced at a time for a picture, which limits its memory
 MAX_RAYS_PER_BAND = 1 << 17  # maximum rays traced at a time in plain torch: a megabyte per quantity
 PARTS_PER_SIDE = 4  # parts per side of a tube that is partly lit
-MIN_TRIANGLE_AREA = 1e-9  # smallest area of a triangle that is clipped (pixel²); smaller ones count in one pixel
+MIN_TRIANGLE_AREA = 1e-9  # smallest area of a triangle that is clipped (pixel²); smaller triangles count in one pixel
 COARSE_GRID_POINTS = 65  # points per side of the coarse grid on which `rays_to` solves first
 MAX_BROYDEN_STEPS = 30  # maximum number of Broyden steps of `rays_to`
 RAY_TOLERANCE = 1e-8  # largest distance between a ray found and its point, as a fraction of the grid's extent
@@ -355,7 +355,7 @@ def _broyden_update(inverse: list[Tensor], step: tuple[Tensor, Tensor], shift: t
 
 
 def _interpolate(lines: Sequence[Tensor], shape: Sequence[int], t: Tensor) -> Tensor:
-    """Interpolate t linearly along both axes to (rows, columns); lines: rows and columns at which t is given."""
+    """Interpolate t linearly along the two axes to (rows, columns); lines: rows and columns at which t is given."""
     for known, n in zip(lines, shape, strict=True):  # each iteration takes one axis and transposes t
         index = torch.arange(n)
         right = torch.searchsorted(known, index, right=True).clamp(1, len(known) - 1)

@@ -90,7 +90,7 @@ class PlaneWave(_Wave):
 class SphericalWave(_Wave):
     """Spherical wave W = ∓ (|p - f| - |o - f|), p = (x, y, z), f the focus, o the point of the axis on the plane.
 
-    The upper sign holds for a focus behind the plane, to which rays converge; from a focus before it they diverge.
+    The upper sign applies to a focus behind the plane, to which rays converge; from other foci they diverge.
     """
 
     focus: Annotated[Vector, Key(FOCUS, "mm", -1e8, 1e8, example=[0.0, 0.0, 200.0])]

@@ -42,7 +42,7 @@ ROUNDINGS_PER_SEGMENT = 4  # roundings of a path segment: two ends, length and s
 
 @dataclass(frozen=True, eq=False)
 class ExitPupil:
-    """Light behind a lens on a plane z = const: n x n rays, evenly spaced on the plane of the first vertex."""
+    """Light behind a lens on a plane z = const: n x n rays, uniformly spaced on the plane of the first vertex."""
 
     x: Tensor  # (n, n) x of the rays on the plane, mm
     y: Tensor  # (n, n) y of the rays on the plane, mm
@@ -180,7 +180,7 @@ def wavefront_error(source: Emitter, lens: Lens, wave: Wave, n: int = RAYS_PER_S
 def residual(pupil: ExitPupil, wave: Wave, nm: float) -> Tensor:
     """Return the OPD (n, n) without piston and tilt, in waves of nm, times sqrt(flux fraction); 0 if not compared.
 
-    The root of its sum of squares is the RMS.  Raises ValueError if no ray can be compared.
+    The root of the sum of squares is the RMS OPD.  Raises ValueError if no ray can be compared.
     """
     compared, without_piston, fit, share = _compare(pupil, wave, nm)
     weighted = torch.zeros_like(pupil.path)

@@ -15,7 +15,7 @@ With G = ∂L/∂I and H(x, y) = ∫_y^∞ G dy the adjoint needs for each edge 
 ∫ s G ds (an edge that moves by δ sweeps the area δ · n ds, n its normal).  They are the same for the two triangles.
 
 All lengths are in pixels, x along columns, y down the rows.  Columns come first in the sums, as x does in a sheet of
-tubes: the rows of tubes that one part takes reach few of them.
+tubes: the rows of tubes of one part reach few columns.
 """
 
 from __future__ import annotations
@@ -266,7 +266,7 @@ def _density(sums, thinnest, a, b, c, flux):
 
 @njit(error_model="numpy")
 def _add_row(sums, thinnest, corner, flux, k, upper):
-    """Add row k of tubes and the edges between it and the row before, whose densities `upper` (m,) holds.
+    """Add row k of tubes and the edges between it and the row before, whose densities `upper` (m,) contains.
 
     Corners 0 and 3 of a tube lie in row k, 1 and 2 in row k + 1; the tube before shares 0 and 1.  Its triangles are 012
     and 023, or 013 and 123 where the diagonal runs the other way.  Returns Σ flux · (mean square of the corners'

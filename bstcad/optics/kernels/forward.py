@@ -1,10 +1,10 @@
 """Fused CPU kernel (numba) behind `trace.simulate`: stratified rays from the source to pixels, without storing them.
 
-Each part (see reductions.py) takes rows of cells and traces them in blocks through the steps of the plain torch form,
-which is the reference: launch, front face, back face, screen, pixel.  A block stays in the first-level cache (`work`
-holds BLOCK numbers of each quantity, from the offset of its name on).  Steps without a table run in vector registers.
-In the search for the back face all rays of a block take a Newton step in turn, so that the steps of different rays
-overlap.  Arithmetic is float64 for every precision of the net; memory is a pair of pictures per part.
+Each part (see reductions.py) traces rows of cells in blocks through the steps of the plain torch form, which is the
+reference: launch, front face, back face, screen, pixel.  A block stays in the first-level cache (`work` contains BLOCK
+numbers of each quantity, from the offset of its name on).  Steps without a table run in vector registers.  In the
+search for the back face all rays of a block take a Newton step in turn, so that the steps of different rays overlap.
+Arithmetic is float64 for every precision of the net; memory is a pair of pictures per part.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Conversion of lens, light, cells and screen to the numbers that a fused kernel takes (records.py).
+"""Conversion of lens, light, cells and screen to the arguments of a fused kernel (records.py).
 
 The constants of the plain form are passed as numbers too: a cached kernel would not notice that a constant imported
 from a file outside this folder has changed.
@@ -102,7 +102,7 @@ def beam(source: Emitter, lens: Lens, tables: bool = True) -> Beam | None:
 def _table_of_light(source: Emitter, window: Rectangle, z: float) -> Beam | None:
     """Return the coarsest table of the light that is accurate midway between its points; None: none of TABLE_SIDES is.
 
-    The table holds splines through the source's irradiance and ray slopes at points of the plane z (mm).
+    The table contains splines through the source's irradiance and ray slopes at points of the plane z (mm).
     """
     last = math.inf
     for side in TABLE_SIDES:

@@ -1,4 +1,4 @@
-"""Records of lens, light, cells and screen as the numbers that a fused kernel takes: named tuples of fixed types.
+"""Records of lens, light, cells and screen as arguments of a fused kernel: named tuples of fixed types.
 
 A compiled kernel finds a field by its index, so the records are part of this folder, on whose contents the cache of
 kernels depends (compiling.py).  Emitters create their own Beam; kernel_arguments.py creates the other records.
@@ -62,7 +62,7 @@ class Beam(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """Constants of the plain form; all are floats, so that a parallel kernel takes them as one tuple."""
+    """Constants of the plain form; all are floats, so that a parallel kernel accepts them as one tuple."""
 
     newton_steps: float  # interfaces.NEWTON_STEPS
     approach_steps: float  # interfaces.APPROACH_STEPS
@@ -157,7 +157,7 @@ class Pixels(NamedTuple):
 class LossTables(NamedTuple):
     """Losses of faces and glass: the transmission of each face at cosines k / (n - 1), k = 0 … n - 1.
 
-    At a face into the denser medium, or at a mirror, it is the cosine of the angle of incidence, else of refraction.
+    At a face into the denser medium, or at a mirror, the cosine is that of the angle of incidence, else of refraction.
     The transmission is smooth in this cosine, and its linear interpolation is accurate to 1e-7.
     """
 
