@@ -28,8 +28,8 @@ MAIN_FIELDS: tuple[Mapping[str, str], ...] = (
         "target.uniform": "Uniform light instead of a picture", "target.profile.shape": "Shape of the light spot",
     },
     {"target.z": "Position of the wall (z)"},
-    {"target.x": "Picture on the wall: left and right edge (x)"},
-    {"target.y": "Picture on the wall: lower and upper edge (y)"},
+    {"target.x": "Picture on the wall: from left to right (x)"},
+    {"target.y": "Picture on the wall: from bottom to top (y)"},
     {"lens.outline.shape": "Outline of the lens"},
     {
         "lens.outline.width": "Width of the lens", "lens.outline.diameter": "Diameter of the lens",
@@ -40,16 +40,38 @@ MAIN_FIELDS: tuple[Mapping[str, str], ...] = (
     {"lens.material": "Material", "lens.index": "Refractive index"},
     {"source.kind": "Light source"},
     {"source.wavelength": "Wavelength"},
-    {"target.seen_from": "Side of the wall from which the picture is seen"},
+    {"target.seen_from": "Place of the viewer"},
     {"target.rotate": "Rotation of the picture"},
     {"target.fit": "Fit of a picture with other proportions"},
     {"target.gamma": "Gamma of the picture"},
     {"tailoring.quality": "Quality"},
 )  # fmt: skip
-THICKNESS = "Thickness at the centre"  # label of lens.back.z for a front face at z = 0
+# Labels of two positions z for a front face at z = 0, from which they are measured.
+FROM_FRONT = {"lens.back.z": "Thickness at the centre", "target.z": "Distance of the wall from the front face"}
+HELP = {  # help of main fields, instead of the description of the key
+    "target.z": "The front is the face that the light enters; the drawing shows the distance from the other face.",
+    "target.x": "-30, 30 is a picture 60 mm wide, centred on the axis of the lens.",
+    "target.y": "-20, 20 is a picture 40 mm high, centred on the axis of the lens.",
+    "lens.outline.width": "Size from left to right.",
+    "lens.outline.height": "Size from bottom to top.",
+    "lens.back.z": "Before the relief is computed; the face moves if the smallest thickness requires it.",
+    "lens.material": "PMMA is acrylic, PC is polycarbonate; glasses have their catalogue names, such as N-BK7.",
+    "source.kind": "collimated: parallel light, such as the sun or a laser beam. point: a lamp or an LED.",
+    "source.wavelength": "Colour of the light; for sunlight or white light leave it. Several: [[nm, weight], …].",
+    "target.seen_from": "lens: beside the lens, in front of the wall. behind: behind a translucent wall.",
+    "target.fit": "crop: cut off its edges. pad: add dark borders. stretch: change its proportions.",
+    "target.gamma": "For a photo leave it empty; 1 if the numbers of the file are irradiance.",
+    "tailoring.quality": "draft is fast, fine is accurate; paper is the procedure of Wang et al. 2023.",
+}
 SECTIONS = {  # labels, by key, of sections whose key would be unclear as a title
     "source": "light source", "before": "optics before the lens", "behind": "optics behind the lens",
     "accept": "limits of the checks", "output": "files and their accuracy", "part": "title block of the part",
+    "tailoring": "computation of the lens",
+}  # fmt: skip
+ADDITIONS = {  # labels of buttons that add a table, by key
+    "before": "Add a window or mirror before the lens", "behind": "Add a window or mirror behind the lens",
+    "wavefront": "Add a required wavefront", "mount": "Add a mount (rim, flange, holes)",
+    "effects": "Add an effect (losses, ghosts)", "tolerance": "Add a tolerance",
 }  # fmt: skip
 LOCKED_SIDES = {"x": "y", "y": "x", "width": "height", "height": "width"}  # side: the other side, which a lock changes
 OPTIONAL_TABLES = ("mount",)  # tables that have a meaning even if they are empty
@@ -158,17 +180,22 @@ def form(data: Table) -> SceneForm:
         for key, label in labels.items():
             if several and key.startswith("target."):
                 key, label = key.replace("target", "target[0]", 1), f"{label} ({_label('target[0]')})"
-            elif key == "lens.back.z" and value_at("lens.front.z", data) == 0:
-                label = THICKNESS
-            found += [replace(known[key], label=label)] if key in known else []
+            elif value_at("lens.front.z", data) == 0:
+                label = FROM_FRONT.get(key, label)
+            if key in known:
+                meaning = HELP.get(without_numbers(key), known[key].meaning)
+                found.append(replace(known[key], label=label, meaning=meaning))
         first += sorted(found, key=lambda field: not field.is_set)[:1]
     taken = {field.key for field in first}
     return SceneForm(tuple(first), tuple(_without(section, taken) for section in sections), whole.additions)
 
 
 def _without(group: Group, taken: set[str]) -> Group:
+    """Return a group without the main fields, and without inner groups that they have emptied."""
     left = tuple(field for field in group.fields if field.key not in taken)
-    return replace(group, fields=left, groups=tuple(_without(inner, taken) for inner in group.groups))
+    inner = (_without(each, taken) for each in group.groups)
+    groups = tuple(each for each in inner if each.fields or each.groups or each.additions or each.removable)
+    return replace(group, fields=left, groups=groups)
 
 
 def _group(key: str, node: Node, table: Table, data: Table, removable: bool = False) -> Group:
@@ -190,7 +217,7 @@ def _group(key: str, node: Node, table: Table, data: Table, removable: bool = Fa
         elif isinstance(value, dict):
             groups.append(_group(at, inner, value, data, removable=name not in required))
         elif at in OPTIONAL_TABLES or len(may_be) > 1 or may_be[0].get("required"):
-            additions.append(Addition(at, f"Add {_label(at)}", new_table(at, data)))
+            additions.append(Addition(at, ADDITIONS.get(at, f"Add {_label(at)}"), new_table(at, data)))
         else:  # a table that exists by default
             groups.append(_group(at, inner, {}, data))
     parts = {"fields": tuple(fields), "groups": tuple(groups), "additions": tuple(additions)}
@@ -203,6 +230,7 @@ def _list(key: str, node: Node, value: Any, data: Table, maximum: int) -> Group:
     tables = tables if value else []
     behind = f"{key}[{len(tables)}]"
     label = f"Add {'another ' if tables else ''}{_label(key).removesuffix('s')}"
+    label = label if tables else ADDITIONS.get(key, label)
     more = (Addition(behind, label, new_table(behind, data)),) if len(tables) < maximum else ()
     if len(tables) == 1 and node.get("type") != "array":
         alone = _group(key, node, tables[0], data)

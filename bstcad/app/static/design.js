@@ -9,9 +9,9 @@ let next = 0, began = null, light = "";
 
 // Names of the stages, as in the tutorial.
 const STAGES = {
-  "control points": "number of control points", reach: "area that light can reach", "stage 1": "stage 1: transport map",
-  "stage 2": "stage 2: face by ray tracing", "stage 3": "stage 3: face for the extended source",
-  write: "writing the files", verify: "proof of the files", report: "report",
+  "control points": "number of control points", reach: "area that light can reach", "stage 1": "stage 1: first face, by optimal transport",
+  "stage 2": "stage 2: better face, by ray tracing", "stage 3": "stage 3: better face, for the size of the source",
+  write: "writing the files", verify: "verification of the files", report: "report",
 };
 const named = (stage) => STAGES[stage] ?? stage;
 const left = (seconds) => (seconds < 90 ? `${Math.ceil(seconds)} s left` : `${Math.ceil(seconds / 60)} min left`);

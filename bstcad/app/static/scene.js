@@ -19,7 +19,7 @@ const form = element("form");
 function take(reply) {
   const isNew = reply.revision !== state.revision || !form.firstChild;
   state = reply;
-  element("saved").textContent = reply.saved ? "saved" : "unsaved changes, which are stored on this machine";
+  element("saved").textContent = reply.saved ? "saved" : "unsaved changes; Save writes them to the scene file";
   element("save").disabled = element("drop-changes").disabled = reply.saved;
   const area = element("text");
   if (document.activeElement !== area || !area.dataset.changed) area.value = reply.text;
