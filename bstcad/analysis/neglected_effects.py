@@ -63,9 +63,9 @@ class Change:
 class Reference:
     """Light of one channel through a lens onto a picture, without the effect."""
 
-    lens: Lens
-    channel: Channel
-    screen: Screen
+    lens: Lens  # lens that the light passes
+    channel: Channel  # light without the effect
+    screen: Screen  # target
     picture: np.ndarray  # flux in each pixel (rows, columns), row 0 = y max, of any sum
     points: tuple[Tensor, Tensor]  # x and y of points of the last face (mm), (n, n) each
     pixel: np.ndarray  # landing points (column, row) of the light from these points, (2, n, n)

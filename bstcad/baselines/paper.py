@@ -44,11 +44,11 @@ MAX_RAYS_PER_CONTROL_POINT = 8  # rays per control point in each direction, limi
 class Level:
     """State of stage 1 between two steps on one of its nets."""
 
-    level: int
-    mapping: Mapping
+    level: int  # number of the net, from 0
+    mapping: Mapping  # map from the front's vertex plane to the target
     lens: Parameters  # parameters at the start of this level
-    best: Best
-    search: AdamState
+    best: Best  # best parameters so far
+    search: AdamState  # state of Adam after the last step
 
 
 def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[StageStep]:
@@ -128,8 +128,8 @@ def tent_average(target: Tensor) -> Tensor:
 class TentMerit:
     """RRMSD² of rays by tent binning (Wang et al. 2023, Eq. 15), plus the overshoot term of merit.py, over channels."""
 
-    channels: tuple[Channel, ...]
-    screen: Screen
+    channels: tuple[Channel, ...]  # channels of the light
+    screen: Screen  # screen of the target
     target: Tensor  # (rows, columns) picture of flux 1 after tent binning
     overshoot: float
 
@@ -152,8 +152,8 @@ class RaySearch:
     """State of stage 2 between two steps."""
 
     lens: Parameters  # parameters at the start of stage 2
-    best: Best
-    search: AdamState
+    best: Best  # best parameters so far
+    search: AdamState  # state of Adam after the last step
 
 
 def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[StageStep]:

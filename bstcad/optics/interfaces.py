@@ -103,7 +103,7 @@ class Loss(Protocol):
 class Interface:
     """One surface on the path of the light, with its clear aperture, law and losses."""
 
-    surface: Surface
+    surface: Surface  # surface that the light meets
     outline: Outline  # clear aperture; light that meets the surface outside it is lost
     law: Law
     status_if_missed: Status  # status of rays that do not meet the surface inside the outline

@@ -37,8 +37,8 @@ class Lens:
     Rays are traced through `interfaces`; the surfaces that tailoring shapes are those of `freeform`.
     """
 
-    front: Surface
-    back: Surface
+    front: Surface  # lower surface, at smaller z
+    back: Surface  # upper surface, at larger z
     outline: Outline  # outline of front and back
     index: float  # refractive index at the design wavelength; unused for a first-surface mirror
     reflects: bool = False  # True if a face reflects; without `own_passes` True means a mirror and False a lens

@@ -30,7 +30,7 @@ Polarisation = Literal["none", "s", "p"]
 class CoatingLayer:
     """A single-layer coating of a face."""
 
-    index: float
+    index: float  # refractive index at the wavelength
     thickness: float  # physical thickness, nm
 
 
@@ -83,11 +83,11 @@ def metal_reflectance(index: complex, cos_in: Tensor, polarisation: Polarisation
 class Transmission:
     """Transmittance T = 1 - R of a face; the rest counts as reflected."""
 
-    n_in: float
-    n_out: float
+    n_in: float  # refractive index before the face
+    n_out: float  # refractive index behind the face
     wavelength: float  # wavelength in vacuum, nm
     polarisation: Polarisation = "none"
-    coating: CoatingLayer | None = None
+    coating: CoatingLayer | None = None  # single layer on the face; None: uncoated
 
     line, in_glass, fused = REFLECTED, False, True
 
@@ -129,7 +129,7 @@ class AbsorptionLoss:
 class CustomLoss:
     """A loss defined by a script or a package (scene.effects.effect), without a kernel."""
 
-    name: str
+    name: str  # name of the effect in the scene
     wavelength: float  # wavelength, nm
     loss: Any = field(compare=False)  # object with share(cos_in, cos_out, path), determined by name and wavelength
 
@@ -160,7 +160,7 @@ class FresnelLoss:
 
     wavelength: float  # wavelength, nm
     polarisation: Polarisation = "none"
-    coating: CoatingLayer | None = None
+    coating: CoatingLayer | None = None  # single layer on the face; None: uncoated
     metal: complex | None = None  # n + ik of the mirror's metal; None: no mirror
 
     def of(self, interface: Interface, index: float = 1.0) -> Loss:
@@ -176,9 +176,9 @@ class FresnelLoss:
 class Losses:
     """Losses at the faces and in the glass of a lens, for light of one wavelength."""
 
-    fresnel: FresnelLoss | None = None
-    absorption: AbsorptionLoss | None = None
-    own: tuple[CustomLoss, ...] = ()
+    fresnel: FresnelLoss | None = None  # reflection at the faces; None: none
+    absorption: AbsorptionLoss | None = None  # absorption in the glass; None: none
+    own: tuple[CustomLoss, ...] = ()  # losses defined by scripts or packages
 
     def on(self, interfaces: Sequence[Interface]) -> tuple[Interface, ...]:
         """Return the interfaces of a lens, each with the losses at the face and in the glass before it."""

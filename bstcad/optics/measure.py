@@ -214,7 +214,7 @@ class _Rays:
 class _Setup:
     """Lens, light and target of a measurement."""
 
-    lens: Lens
+    lens: Lens  # lens that is measured
     draw: Draw  # function that returns the channels of a set of rays
     screen: Screen
     target: Tensor  # (rows, columns), row 0 = y max, of any sum
@@ -439,7 +439,7 @@ class RayTubes:
     A tube carries the light between four neighbouring rays; its picture is differentiable in the heights of all nets.
     """
 
-    channels: tuple[Channel, ...]
+    channels: tuple[Channel, ...]  # channels of the light
     sheets: tuple[tubes.Tubes, ...]  # tubes of each channel
 
     @classmethod

@@ -158,7 +158,7 @@ def nearest(name: str) -> list[str]:
 class Medium:
     """A material, and the pages of refractiveindex.info with its n and k."""
 
-    name: str
+    name: str  # name in scenes and reports
     page: str  # page of n, and of k unless `absorption` names another
     absorption: str | None = None  # page of k; None: `page`
     nominal: float | None = None  # nominal density, g/cm³, for a page without a density
@@ -227,7 +227,7 @@ _MEDIA, _METALS = _by_name(MEDIA), _by_name(METALS)
 def medium(material: str) -> Medium:
     """Return the transparent medium of this name; ValueError, with the nearest names, if there is none."""
     if normalise_name(material) in _METALS:
-        raise ValueError(f"{material!r} is a metal, which transmits no light; choose a glass or polymer, as 'PMMA'")
+        raise ValueError(f"{material!r} is a metal, which transmits no light; choose a medium such as 'PMMA'")
     return _MEDIA.get(normalise_name(material)) or _page(material, MEDIA)
 
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from bstcad.optics.rays import Vector
 
-ORIGIN: Vector = (0.0, 0.0, 0.0)
+ORIGIN: Vector = (0.0, 0.0, 0.0)  # origin, mm
 
 
 @dataclass(frozen=True, eq=False)

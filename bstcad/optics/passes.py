@@ -20,15 +20,15 @@ Face = Literal["front", "back"]
 class Pass(NamedTuple):
     """A face that light meets, and the law there."""
 
-    face: Face
-    law: type[Refract] | type[Reflect]
+    face: Face  # face that light meets
+    law: type[Refract] | type[Reflect]  # law of the face
 
 
 @dataclass(frozen=True)
 class Passes:
     """Passes of light through a solid in air, in the order of the light."""
 
-    steps: tuple[Pass, ...]
+    steps: tuple[Pass, ...]  # passes in the order of the light
 
     @property
     def faces(self) -> tuple[Face, ...]:

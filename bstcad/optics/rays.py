@@ -21,7 +21,7 @@ MIN_AXIAL_COSINE = 1e-9  # largest cosine to the axis of a ray that counts as pa
 class Status(IntEnum):
     """State of a ray: alive, or the reason of its loss."""
 
-    ALIVE = 0
+    ALIVE = 0  # not lost
     MISSED_FRONT = 1  # missed the clear aperture of the first surface
     VIGNETTED = 2  # missed a later face of the solid, or met it outside its clear aperture
     TOTAL_REFLECTION = 3  # total internal reflection at a face
@@ -92,7 +92,7 @@ class Landed:
         return self.status == Status.ALIVE
 
 
-Vector = tuple[float, float, float]
+Vector = tuple[float, float, float]  # (x, y, z)
 Frame = tuple[Vector, Vector, Vector]  # unit vectors (e_x, e_y, n) in space
 
 

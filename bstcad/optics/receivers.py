@@ -151,8 +151,8 @@ def _by_component(rays: Rays, position: Any, direction: Any) -> Rays:
 class MovedReceiver(Receiver):
     """A receiver after a rigid motion: rays are moved back and traced to the receiver at rest."""
 
-    rest: Receiver
-    motion: Motion
+    rest: Receiver  # receiver before the motion
+    motion: Motion  # rigid motion
 
     def __post_init__(self) -> None:
         for name in ("unit", "light", "names", "position_text", "per_radian", "areas"):  # unchanged by motions

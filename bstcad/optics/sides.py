@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-Sides = int | tuple[int, int]
+Sides = int | tuple[int, int]  # number for the two sides, or (along x, along y)
 MIN_SIDE = 5  # minimum control points per side of a net: two end spans and one inner span
 
 

@@ -99,7 +99,7 @@ class Surface(ABC):
     @property
     def unknown(self) -> ValueError:
         """Error for a surface that is not a net, a plane, a sphere or a conic."""
-        return ValueError(f"the {self.kind} has no conic constant; pass it to scene.changed, which fits a net to it")
+        return ValueError(f"the {self.kind} has no conic constant; pass the surface to scene.changed, which fits a net")
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Self:
         """Return the surface with its tensors in another precision or on another device; numbers stay numbers."""

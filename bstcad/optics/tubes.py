@@ -28,7 +28,7 @@ from bstcad.optics.receivers import LevelPlane, Receiver
 from bstcad.optics.sides import Sides, as_pair, spread
 from bstcad.optics.trace import behind, from_first_net, is_transmitted, whole_kernel
 
-ALL = slice(None)
+ALL = slice(None)  # all rows or columns
 SHEET_TUBES = 256  # tubes per side of the sheet from which finer sheets are interpolated
 RIM_SHRINK = 1e-9  # relative shrink towards the centre, so that corners on the rim of the light count as lit
 MAX_BAND_ROWS = 256  # maximum rows of tubes traced at a time for a picture; even, since the diagonals alternate

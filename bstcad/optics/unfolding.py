@@ -72,7 +72,7 @@ class Image(PlaneReceiver):
 class BehindGlass(Receiver):
     """A receiver for light that is still in the glass and leaves it through a flat face, z = const."""
 
-    rest: Receiver
+    rest: Receiver  # receiver behind the face
     z: float  # plane of the face, mm
     eta: float  # index of the glass relative to the index behind the face
 

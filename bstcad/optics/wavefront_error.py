@@ -57,7 +57,7 @@ class ExitPupil:
 def exit_pupil(source: Emitter, lens: Lens, z: float, n: int = RAYS_PER_SIDE) -> ExitPupil:
     """Return the light of a point or parallel source that passes the lens, on the plane z (mm)."""
     if source.extent is not None:
-        raise ValueError("an extended source has no single wavefront; pass one of its points or directions")
+        raise ValueError("an extended source has no single wavefront; pass source.central, or another point of it")
     lens, source = lens.plain(), source.central
     area = clear_window(source, lens)
     x, y = sampling.grid(area, n)
@@ -193,7 +193,7 @@ def _compare(pupil: ExitPupil, wave: Wave, nm: float) -> tuple[Tensor, Tensor, _
     """Return (compared rays (n, n); for these: OPD without piston in mm, its plane fit, fraction of their flux)."""
     compared = pupil.alive & wave.contains(pupil.x, pupil.y)
     if int(compared.sum()) < 3:
-        raise ValueError(f"no light reaches the part of the plane z = {wave.z:g} for which the wavefront is stated")
+        raise ValueError(f"no light reaches the goal wave on the plane z = {wave.z:g}; change its plane or circle")
     x, y, path, flux = (part[compared] for part in (pupil.x, pupil.y, pupil.path, pupil.flux))
     opd, share = path - wave.path(x, y, nm), flux / float(total(flux))
     fit = _least_squares(x, y, opd, share=share)
@@ -204,9 +204,9 @@ def _compare(pupil: ExitPupil, wave: Wave, nm: float) -> tuple[Tensor, Tensor, _
 class _Fit:
     """Plane fit of an OPD (mm): piston + slopes · (p - middle)."""
 
-    piston: float
-    slopes: tuple[float, float]
-    middle: tuple[float, float]
+    piston: float  # mean OPD, weighted by flux (mm)
+    slopes: tuple[float, float]  # slopes of the plane along x and y
+    middle: tuple[float, float]  # mean position (x, y), weighted by flux (mm)
 
     def at(self, x: Tensor, y: Tensor) -> Tensor:
         """Return the tilt part at (x, y)."""
