@@ -30,12 +30,12 @@ from bstcad.step_text.placement import own_frame
 if TYPE_CHECKING:  # which loads numba
     from bstcad.optics.bspline import BSplineSurface
 
-# Range of (1 + k) c² r² of a conic at the rim: 1 has a vertical tangent; below the minimum it is nearly a cone.
+# Range of (1 + k) c² r² of a conic at the rim: at 1 its tangent is vertical; below the minimum it is nearly a cone.
 MIN_CONIC_BEND, MAX_CONIC_BEND = -7.0, 0.85
 MAX_FITTED_SLOPE = 60.0  # degrees; steepest slope at the rim of a surface to which a net is fitted
 MAX_RECESS_SLOPE = 80.0  # degrees; steepest slope at the rim of a front with an outline of its own
-MIN_RECESS_SAG = 1e-3  # mm; smallest sag at the rim of such a front, so that it has an edge
-MIN_RECESS_GAP = 1e-2  # mm; smallest distance between the outline of a front and that of the lens
+MIN_RECESS_SAG = 1e-3  # mm; smallest sag at the rim of a front with its own outline, so that there is an edge
+MIN_RECESS_GAP = 1e-2  # mm; smallest distance between the outlines of such a front and of the lens
 CONIC_CONSTANTS = (-1e3, 1e3)
 CURVATURES = (-1e3, 1e3)  # range of curvatures, 1/mm
 INDICES = (1.01, 5.0)  # range of the refractive index
@@ -43,15 +43,15 @@ BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # keys
 
 NET_FILE = "front.npz"  # file name of the copy of the net of lens.front.file, beside a design
 NET_REMEDY = "give the folder of a design, its design.npz or its lens.step"
-MAX_AXIS_SINE = 1e-9  # sine of the angle between a side of a net and an axis of the file; a larger one is a turn
+MAX_AXIS_SINE = 1e-9  # sine of the largest angle between a net and the axes of a file that counts as 0
 UNIFORM_TOLERANCE = 1e-9  # mm; largest deviation of a net from uniform spacing in x and y
 VERTEX_TOLERANCE = 1e-12  # mm; a net whose vertex is this near to z = 0 is not shifted
 MAX_CONTROL_POINTS = 2049
 NET_SIZES = (MIN_SIDE, MAX_CONTROL_POINTS)  # range of the control points per side of a net
-FIT_TOLERANCE = 1e-6  # mm; largest distance between a fitted net and its surface (a toroid, or a user's own)
+FIT_TOLERANCE = 1e-6  # mm; largest distance between a fitted net and its surface (a toroid, or a user's class)
 FIT_SIZES = (33, 65, 129, 257, 513, 1025)  # control points per side of a fitted net, tried in turn
 MAX_CELL_RATIO = 1.5  # ratio of length and width of a cell of the net above which a warning proposes another net
-MIN_ROUND_POINTS = 6  # control points per side; a net of 5 has no two spans to spare outside a round rim
+MIN_ROUND_POINTS = 6  # control points per side for a round lens, whose net extends two spans past the rim
 
 Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 
@@ -61,7 +61,7 @@ Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 
 @dataclass(frozen=True)
 class FileNet(FileContent):
-    """A B-spline surface with its vertex at z = 0; the scene holds its heights, so that a design can be repeated."""
+    """A B-spline surface with its vertex at z = 0; the scene contains its heights, so that a design can be repeated."""
 
     name = NET_FILE
     shape: tuple[int, int]  # control points along x and along y
@@ -71,7 +71,7 @@ class FileNet(FileContent):
 
     @classmethod
     def of(cls, surface: BSplineSurface) -> FileNet:
-        """Return the net of a surface, which may lie at any z."""
+        """Return the net of a surface, moved so that its vertex is at z = 0."""
         resting = surface.plain().moved(0.0)
         vertex = resting.from_vertex()
         heights = (vertex if abs(vertex.z) > VERTEX_TOLERANCE else resting).heights
@@ -93,7 +93,7 @@ class FileNet(FileContent):
 
 
 def read_net(path: Path) -> FileNet:
-    """Read the back face of the design at `path`; SceneError if there is none, or it is damaged.
+    """Read the back face of the design at `path`; SceneError if it is missing or damaged.
 
     A face of a STEP file keeps its position in x and y; its shift along z is dropped.
     """
@@ -112,7 +112,7 @@ def read_net(path: Path) -> FileNet:
     uniform = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     deviation = np.abs(net[..., :2] - uniform).max()
     if min(shape) < MIN_SIDE or not np.isfinite(net).all() or not deviation <= UNIFORM_TOLERANCE:
-        raise SceneError(f"lens.front.file: {name} does not hold the net of a design; {NET_REMEDY}")
+        raise SceneError(f"lens.front.file: {name} does not contain the net of a design; {NET_REMEDY}")
     return FileNet.of(BSplineSurface.from_control_points(net, 0.0))
 
 
@@ -170,7 +170,7 @@ class _Front:
 
     @property
     def surface(self) -> Surface:
-        """The surface of optics."""
+        """Surface of bstcad.optics with the parameters of the front."""
         of, _ = FRONTS[self.kind]
         surface = of(**{each.name: getattr(self, each.name) for each in fields(of)})
         return surface if self.outline is None else Recess(surface, self.outline)
@@ -181,7 +181,7 @@ class _Front:
         return self.kind == "bspline" and self.optimise is True
 
     def traced(self, outline: Outline) -> Surface:
-        """Return the surface as a lens of this outline has it: the front's own, or a net fitted to it."""
+        """Return the surface that a lens of this outline has: the front's surface, or a net fitted to it."""
         return self.surface
 
     @property
@@ -209,7 +209,7 @@ class _Front:
             size = f"{2 * own.radius:g} mm is too large, as the lens is {2 * half:g} mm wide"
             yield f"outline.diameter: {size}; make it smaller, or remove the outline"
         if self.free:
-            yield "optimise: a front with an outline of its own cannot be optimised; remove one of the two"
+            yield "optimise: a front with an outline of its own cannot be optimised; remove outline or optimise"
         surface, (x, y) = self.surface, _farthest(own)
         _, slope, _ = surface.optical.relative_sag_and_slope(x, y)
         steep = math.degrees(math.atan(abs(float(slope)))) if bool(surface.optical.reaches(x, y)) else 90.0
@@ -348,12 +348,12 @@ class NetFront(_Front):
 
     @property
     def surface(self) -> Surface:
-        """The surface of optics; a plane before tailoring if there is no file."""
+        """Surface of bstcad.optics; a plane before tailoring if there is no file."""
         return Plane(self.z) if self.file is None else self.file.surface(self.z)
 
     @property
     def free(self) -> tuple[str, ...]:
-        """No names: a net has heights instead of parameters."""
+        """Empty: a net has heights instead of parameters."""
         return ()
 
     def complaints(self, outline: Outline) -> Iterator[str]:
@@ -369,7 +369,7 @@ class NetFront(_Front):
             yield from (f"control_points: {complaint}" for complaint in net_complaints(outline, self.control_points))
             return
         if self.control_points is not None:
-            yield "control_points: the file gives the control points of the front; remove one of the two"
+            yield "control_points: the file gives the control points of the front; remove this key, or file"
         own, sides = net_extent(outline, self.file.shape), outline.half_extent
         for name, ends, half, side in zip("xy", (self.file.x, self.file.y), own, sides, strict=True):
             middle = (ends[0] + ends[1]) / 2
@@ -383,7 +383,7 @@ class NetFront(_Front):
                 yield f"file: its net covers {covers}; give a design of the same outline"
 
 
-# Surface of optics and record of each kind of front that is no net.
+# Surface of bstcad.optics and record of each kind of front that is not a net.
 FRONTS: dict[str, tuple[type[Any], Callable[..., Any]]] = {
     "plane": (Plane, PlaneFront),
     "sphere": (Sphere, SphereFront),
@@ -395,7 +395,7 @@ FRONTS: dict[str, tuple[type[Any], Callable[..., Any]]] = {
 def as_front(value: Any, outline: Outline | None = None) -> Any:
     """Return the front of a scene for a surface of optics; return any other value as it is.
 
-    outline: outline of the lens, inside which a net is fitted to a surface of a kind that a scene does not have.
+    outline: outline of the lens, inside which a net is fitted to a surface of any other kind; None: ValueError.
     """
     if not hasattr(value, "relative_sag_and_slope"):
         return value
@@ -406,7 +406,7 @@ def as_front(value: Any, outline: Outline | None = None) -> Any:
         own = {} if value.outline is None else {"outline": value.outline}
         return front(value.z, **value.parameters(), **own)
     if outline is None:
-        raise ValueError(f"a scene cannot hold a {value.kind}; use scene.changed, which fits a net to it")
+        raise ValueError(f"a scene cannot contain a {value.kind}; use scene.changed, which fits a net to it")
     return as_front(fit_net(value, outline))
 
 
@@ -431,7 +431,7 @@ def fit_net(surface: Surface, outline: Outline) -> BSplineSurface:
 
 
 def net_extent(outline: Outline, net: Sides) -> tuple[float, float]:
-    """Return half the width of a net in x and y (mm): it extends two spans past the rim of the lens.
+    """Return half the width of a net in x and y (mm), so that it extends two spans past the rim of the lens.
 
     Then x(t) is linear inside the rim.  In the end spans x(t) is quadratic, and the slope z'(t) / x'(t) a Möbius
     function of t: its derivative grows eightfold inwards across 1.5 control points, for any heights.  The rim of the
@@ -462,10 +462,10 @@ Front = Annotated[
 
 
 def stated_index(material: str | None, index: float | None, wavelength: float) -> float:
-    """Return the refractive index that a table states, by itself or by its material, at a wavelength (nm)."""
+    """Return the refractive index that a table states as a number or by a material, at a wavelength (nm)."""
     if index is not None:
         return index
-    assert material is not None  # `complaints` refuse a table without either
+    assert material is not None  # `complaints` refuse a table with neither
     return refractive_index(material, wavelength)
 
 
@@ -495,7 +495,7 @@ class Back(Record):
 class Bounds:
     """Bounds on tailored faces everywhere inside the outline; None: unbounded.
 
-    A tool cuts the back from +z and the front from -z; valleys and ridges are meant as the tool sees them.
+    A tool cuts the back from +z and the front from -z; for the tool a valley is concave and a ridge convex.
     """
 
     concave: float | None = None  # maximum curvature of a valley, 1/mm
@@ -509,8 +509,8 @@ class Bounds:
 class LensBlank(Record):
     """The lens before tailoring: light enters through the front and leaves through the back.
 
-    A mirror is a plate whose back, its upper face, reflects; its front is the rear of the plate.  If the front
-    reflects, light crosses the back before and after the front.
+    A mirror is a plate whose back (the upper face) reflects, and whose front is its rear.  If the front reflects,
+    light crosses the back before and after the front.
     """
 
     material: Annotated[str | None, Key("Name on refractiveindex.info; or give the index.")] = None
@@ -561,7 +561,7 @@ class LensBlank(Record):
 
     @property
     def front_sags(self) -> tuple[float, float]:
-        """Lowest and highest sag of the front inside the outline (mm), and zero."""
+        """Lowest and highest sag (mm) of the front inside the outline, including the vertex (0)."""
         return self.front.surface.sags(self.outline)
 
     @property
@@ -583,7 +583,7 @@ class LensBlank(Record):
         return None if fixed is None else simplified(fixed.shape)
 
     def _tailored_front_net(self, net: Sides) -> Sides:
-        """Return the control points of a tailored front for a back of `net`, in the ratio that the scene has."""
+        """Return the control points of a tailored front for a back of `net`, in the ratio of the scene."""
         own = self.front.file.shape if self.front.file else self.front.control_points
         if own is None:
             return net
@@ -635,7 +635,7 @@ class LensBlank(Record):
         """Yield the faults of the table."""
         given = [name for name in ("material", "index") if getattr(self, name) is not None]
         if self.front.reflect and self.back.reflect:
-            yield "lens.front.reflect: no light reaches the front, as lens.back.reflect is true; remove one of the two"
+            yield "lens.front.reflect: no light reaches the front, as lens.back.reflect is true; remove one of them"
         if not self.passes.enters and given:
             yield f"lens.{given[0]}: light does not enter a mirror (lens.back.reflect); remove this key"
         if self.passes.enters and len(given) != 1:
@@ -657,7 +657,7 @@ class LensBlank(Record):
         for key in ("min_thickness", "edge_thickness"):
             if thickest is not None and thickest < (getattr(self, key) or 0.0):
                 less = f"{thickest:g} mm is less than lens.{key} = {getattr(self, key):g} mm"
-                yield f"lens.max_thickness: {less}; make it larger, or the other smaller"
+                yield f"lens.max_thickness: {less}; make it larger, or lens.{key} smaller"
         if thickest is not None and thickest - thinnest < highest - lowest:
             thick = f"{thinnest:g} mm at its thinnest point and {thinnest + highest - lowest:.6g} mm at its thickest"
             why = f"{thickest:g} mm is too small: with its curved front and a flat back the lens is {thick}"

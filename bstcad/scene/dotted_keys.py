@@ -1,4 +1,4 @@
-"""Dotted keys of a scene file, lens.back.z or target[1].text, and the setting of values by them.
+"""Dotted keys of a scene file, such as lens.back.z or target[1].text, and how to set and find their values.
 
 A number in brackets counts the tables of a list from 0.  A single table is the same as a list of one.
 """
@@ -43,7 +43,7 @@ def override(data: dict[str, Any], key: str, value: Any, shown: str) -> None:
         alternatives = ONE_OF.get(".".join(table for table, _ in tables), ())
         for other in alternatives if name in alternatives else ():
             table.pop(other, None)
-        table[name] = copy.deepcopy(value)  # a later key may change parts of it
+        table[name] = copy.deepcopy(value)  # a later key may change parts of the value
 
 
 def tables_at(node: Any, key: str, shown: str = "") -> Iterator[tuple[str, Any]]:
@@ -59,7 +59,7 @@ def tables_at(node: Any, key: str, shown: str = "") -> Iterator[tuple[str, Any]]
 
 
 def _inner(table: dict[str, Any], steps: Sequence[Step], shown: str) -> dict[str, Any]:
-    """Return the table at the first of the steps that are left of a key."""
+    """Return the table at the first of the remaining steps of a key; an absent table is created."""
     name, number = steps[0]
     inner = table.setdefault(name, {})
     listed = isinstance(inner, list) and all(isinstance(part, dict) for part in inner)
@@ -70,7 +70,7 @@ def _inner(table: dict[str, Any], steps: Sequence[Step], shown: str) -> dict[str
         inner = inner[number]
     elif listed and len(inner) > 1:
         example = ".".join([f"{name}[0]", *(_step_text(other) for other in steps[1:])])
-        raise SceneError(f"{shown}: there are {len(inner)} [[{name}]] tables; write the number of one, {example}")
+        raise SceneError(f"{shown}: there are {len(inner)} [[{name}]] tables; write the number of one, as in {example}")
     elif listed and inner:
         inner = inner[0]
     if not isinstance(inner, dict):
@@ -79,7 +79,7 @@ def _inner(table: dict[str, Any], steps: Sequence[Step], shown: str) -> dict[str
 
 
 def _set_table(table: dict[str, Any], name: str, number: int, value: Any, shown: str) -> None:
-    """Replace one table of a list, append one, or remove one (None)."""
+    """Replace or append the table of this number in a list; None removes the table."""
     inner = [*_tables(table.get(name, []), name, shown)]
     if number >= len(inner) + (value is not None):
         raise _no_such_table(inner, name, number, shown)
@@ -101,6 +101,6 @@ def _no_such_table(tables: list[Any], name: str, number: int, shown: str) -> Sce
 
 
 def _step_text(step: Step) -> str:
-    """Return a step as a key has it."""
+    """Return a step as it is written in a key."""
     name, number = step
     return name if number is None else f"{name}[{number}]"

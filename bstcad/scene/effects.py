@@ -51,8 +51,8 @@ class Absorption(Record):
 class Ghost(Record):
     """Light reflected twice inside the lens, in verification.
 
-    A scene with a ghost also has `fresnel`, since its faces reflect: that of bare faces and unpolarised light unless
-    the scene names another.
+    A scene with a ghost also has `fresnel`, since its faces reflect: for bare faces and
+    unpolarised light unless the scene states other values.
     """
 
     kind: Annotated[Literal["ghost"], Key("Light reflected twice inside the lens, in verification.")]
@@ -78,11 +78,11 @@ class Own(Record):
 def effect(name: str, makes: LossFactory) -> Own:
     """Return an effect of your own for scene.changed({"effects": [...]}): a loss of flux at faces or in the glass.
 
-    makes(wavelength in nm) returns an object with a method share(cos_in, cos_out, path).  This returns the fraction of
-    each ray's flux that continues: a tensor of the shape of its arguments, differentiable in them.  cos_in and cos_out
+    makes(wavelength in nm) returns an object with a method share(cos_in, cos_out, path).  It returns the fraction of
+    each ray's flux that continues: a tensor of the shape of the arguments, differentiable in them.  cos_in and cos_out
     are the cosines of incidence and of refraction (or reflection), path is the path before the face in mm.  The loss
     acts at each face that light crosses or is reflected by; with the attribute in_glass = True it acts along the path
-    in the glass only.  The ledger counts the lost flux as "taken by NAME".  The scene file holds the name.  A script
+    in the glass only.  The ledger counts the lost flux as "taken by NAME".  The scene file contains NAME.  A script
     that opens such a design calls `effect` first; an installed package declares an entry point NAME = "module:makes"
     of the group "bstcad.effects" instead.
     """
@@ -135,7 +135,7 @@ def find_effect(effects: Effects, kind: type[OneEffect]) -> OneEffect | None:
 
 
 def reflection_of(effects: Effects) -> Fresnel | None:
-    """Return the reflection of the scene; that of bare faces if it has only a ghost; None if it has neither."""
+    """Return the reflection of the scene: of bare faces if it has only a ghost; None if it has neither effect."""
     bare = Fresnel(kind="fresnel") if find_effect(effects, Ghost) else None
     return find_effect(effects, Fresnel) or bare
 

@@ -1,7 +1,7 @@
 """Windows and mirrors before and behind the lens: the tables [[before]] and [[behind]] of a scene.
 
-They are not part of the lens and are written to no file.  Light meets those before the lens, then the lens, then those
-behind it, each once, in the order of the tables.  It loses no flux at their faces.
+These elements are not part of the lens or of its files.  Light meets the elements before the lens, then the lens, then
+the elements behind it, each once, in the order of the tables.  Light loses no flux at their faces.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ RIM = Key("Outline of the clear aperture, seen along z.", example={"shape": "cir
 
 
 class Window(Record):
-    """A transparent plate with plane or spherical faces, tilted about its middle."""
+    """A transparent plate with plane or spherical faces, tilted about its centre."""
 
     kind: Annotated[Literal["window"], Key("A plate that transmits light.")]
     z: Annotated[float, Key("Position of the face with the lower z.", "mm", *COORDINATES, example=40.0)]
@@ -42,7 +42,7 @@ class Window(Record):
     outline: Annotated[Outlined, RIM]
     curvature: Annotated[
         tuple[float, float],
-        Key("Curvatures of the face with the lower z and of the other.", "1/mm", *CURVATURES, example=[0.01, 0.011]),
+        Key("Curvatures of the lower face (smaller z) and the upper face.", "1/mm", *CURVATURES, example=[0.01, 0.011]),
     ] = (0.0, 0.0)
     tilt: Annotated[tuple[float, float] | None, TILT] = None
 
@@ -150,9 +150,9 @@ def interfaces(elements: Sequence[Window | Mirror], sense: int, wavelength: floa
 
 @dataclass(frozen=True)
 class Station:
-    """A part of the scene along the path of the light."""
+    """Source, element or lens on the path of the light, and its extent along z."""
 
-    key: str  # key of its position
+    key: str  # key that states the position
     words: str  # name in messages
     low: float  # lowest z, mm
     high: float  # highest z, mm
@@ -185,7 +185,7 @@ class LightPath:
         return any(element.kind == "mirror" for element in self.behind)
 
     def complaints(self) -> Iterator[str]:
-        """Yield the faults of the elements, alone, in their order along the light, and for stage 1."""
+        """Yield the faults of each element, of their order along the light, and of targets seen in their mirrors."""
         for name, elements in (("before", self.before), ("behind", self.behind)):
             for k, element in enumerate(elements):
                 key = f"{name}[{k}]"
@@ -195,7 +195,7 @@ class LightPath:
                     yield f"{key}.curvature: {ends}; make the curvature or the outline smaller"
                 if name == "behind" and steepest:
                     plane = "behind the lens only plane faces are possible"
-                    yield f"{key}.curvature: {plane}; remove it, or put the element before the lens"
+                    yield f"{key}.curvature: {plane}; remove the curvature, or put the element before the lens"
                 yield from element.complaints(key)
         for key, target in self.targets.items():
             if self.behind and target.screen.plane.frame is None:

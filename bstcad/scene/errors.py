@@ -19,13 +19,13 @@ KEY_NAME = r"""[\w-]+|"[^"\n]*"|'[^'\n]*'"""  # name between the dots of a TOML 
 DOTTED = rf"(?:{KEY_NAME})(?:\s*\.\s*(?:{KEY_NAME}))*"
 HEADER, KEY = re.compile(rf"\s*(\[\[?)\s*({DOTTED})\s*\]"), re.compile(rf"\s*({DOTTED})\s*=")
 
-NOT_BUILT = {  # unknown words of features that bstcad does not have yet, with the beginning of a sentence on each
+NOT_BUILT = {  # unknown word for a feature that bstcad does not have yet: beginning of a sentence about the feature
     **dict.fromkeys(("ies", "ldt", "eulumdat", "intensity"), "files of luminous intensity (IES, EULUMDAT) are"),
     **dict.fromkeys(("rayfile", "ray_file", "rayset", "ray_set"), "files of measured rays are"),
     **dict.fromkeys(("diffraction", "coherent", "interference"), "wave optics is"),
     **dict.fromkeys(("scatter", "scattering", "bsdf", "haze"), "scattering is"),
 }
-# Keys of a single target in a sentence, at its beginning or inside it; and the key of one of several targets.
+# Key of a single target at the beginning of a sentence or inside it; key of one of several targets.
 THE_TARGET, ONE_TARGET = re.compile(r"^target(?=[.:])|(?<=\s)target(?=\.[a-z])"), re.compile(r"target\[\d+\]")
 SIMILARITY = 0.7  # smallest ratio of difflib at which a known word is proposed; "ies" and "pixels" have 0.67
 
@@ -36,7 +36,7 @@ SENTENCES = {  # sentence for each type of error of pydantic; {shown} is the val
         "{shown} is not a whole number; write one, without quotes or a decimal point"
     ),
     ("string_type",): "{shown} is not text; put it in quotes",
-    ("bool_type", "bool_parsing"): "{shown} is neither true nor false; write one of the two, without quotes",
+    ("bool_type", "bool_parsing"): "{shown} is neither true nor false; write true or false, without quotes",
     ("tuple_type",): "{shown} is not a list; write it in brackets, such as {listed}",
     ("too_long",): "has {actual_length} values, and {max_length} is the maximum; remove the rest",
     ("too_short",): "has {actual_length} values, and {min_length} is the minimum; add some",
@@ -48,15 +48,15 @@ SENTENCES = {  # sentence for each type of error of pydantic; {shown} is the val
 
 
 def with_target_key(sentence: str, key: str) -> str:
-    """Return a sentence on a single target, "target.z: …", with the key of one of several, "target[1].z: …"."""
+    """Return a sentence on a single target, "target.z: …", with the key of one of several targets, "target[1].z: …"."""
     return THE_TARGET.sub(key, sentence)
 
 
 def nearest(word: str, known: list[str], otherwise: str) -> str:
     """Return "did you mean …?" for a misspelt word, or else a list of all known words.
 
-    A word of NOT_BUILT has "… not built yet" before the list.  Words are compared by difflib's ratio: twice the number
-    of letters that they share in order, divided by the number of all letters.
+    For a word of NOT_BUILT, "… not built yet" precedes the list.  Words are compared by difflib's ratio: twice the
+    number of letters that they share in order, divided by the number of all letters.
     """
     choices = f"{otherwise} {', '.join(known)}"
     if missing := NOT_BUILT.get(word.casefold()):
@@ -113,7 +113,7 @@ class _Location:
 
     @property
     def example(self) -> str:
-        """The key with a value, or as a table with its required keys."""
+        """Example of the key with a value, or as a table with its required keys."""
         name = self.key.rpartition(".")[2]
         node: Node = next((o["properties"][name] for o in self.owners if name in o["properties"]), {})
         if "examples" in node:
@@ -162,15 +162,15 @@ def _type_sentence(kind: str, location: _Location, value: Any, context: Mapping[
 
 
 def _value_text(value: Any) -> str:
-    """Return a value as a file has it, at most 40 characters."""
+    """Return a value as it is written in a file, at most 40 characters."""
     text = repr(value) if not isinstance(value, bool) else str(value).lower()
     return text if len(text) <= 40 else text[:39] + "…"
 
 
 def toml_positions(text: str) -> dict[str, int]:
-    """Return the line, from 1, of each table and key of a TOML text: "source", "source.kind", "effects[0].kind".
+    """Return the line number, from 1, of each table and key of a TOML text: "source", "source.kind", "effects[0].kind".
 
-    Keys of an inline table, front = { kind = "plane" }, are left out; `line_of` finds them on the table's line.
+    Keys of an inline table, front = { kind = "plane" }, are omitted; `line_of` returns the line of the table.
     """
     lines: dict[str, int] = {}
     counts: dict[str, int] = {}

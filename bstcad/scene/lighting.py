@@ -37,7 +37,7 @@ def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:
             yield f"source.wavelength: the weight {weight:g} of the line at {nm:g} nm is not above 0; remove the line"
     if len({nm for nm, _ in listed}) > 1 and lens.index is not None:
         lines = f"the {len(listed)} lines of source.wavelength"
-        yield f'lens.index: one index does not hold for {lines}; set lens.material instead, such as material = "PMMA"'
+        yield f'lens.index: one index is not valid for {lines}; set lens.material instead, such as material = "PMMA"'
     try:
         indices = [lens.index_at(nm) for nm, _ in listed]
     except ValueError as error:

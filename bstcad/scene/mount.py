@@ -22,9 +22,9 @@ from bstcad.scene.schema import COORDINATES, LENGTHS, Record
 
 MAX_DRAFT = 30.0  # degrees; largest draft angle of the walls of a lens
 MIN_WEB = 0.1  # mm; smallest width of material between a hole and any other edge
-LAND = 0.1  # height of the wall without draft below the rim of the back, mm, or as a fraction of a wall below 1 mm
-ITERATIONS = 60  # iterations of the position of the wall's end; a front of slope 0.5 halves the error in each
-MIN_CLOSING = 0.25  # smallest approach of a wall with draft to the front, mm per mm of the wall's height
+LAND = 0.1  # height of the wall without draft below the back's rim, mm; for walls below 1 mm a fraction of the wall
+ITERATIONS = 60  # iterations for the end of a wall; each halves the error on a front of slope 0.5
+MIN_CLOSING = 0.25  # smallest approach of a wall with draft to the front (mm per mm of height)
 MIN_CLEAR_APERTURE = 1e-3  # smallest clear aperture of the front after draft and bevel, as a fraction of the rim
 LENS_COLOUR, MIRROR_COLOUR = "#9ed3f580", "#c8ccd0"
 MAX_TEXT = 200  # largest number of characters of a text of the title block
@@ -60,7 +60,7 @@ class Part:
         return replace(self, **{name: value for name, value in known.items() if getattr(self, name) is None})
 
     def complaints(self, lens: LensBlank) -> Iterator[str]:
-        """Yield the faults of the table itself, and for this lens."""
+        """Yield the faults of the table, alone and for this lens."""
         for field in fields(self):
             text = getattr(self, field.name)
             if isinstance(text, str) and not (text.strip() and text.isprintable() and len(text) <= MAX_TEXT):
@@ -71,7 +71,7 @@ class Part:
             yield "part.density: a density needs the name of its material; add part.material"
         for key in ("surface_profile", "front_profile"):
             if getattr(self, key) is not None and self.schema == "AP214":
-                yield f'part.{key}: AP214 cannot hold this tolerance; remove it, or the line schema = "AP214"'
+                yield f'part.{key}: AP214 cannot contain this tolerance; remove it, or the line schema = "AP214"'
         thickness = lens.back.z - lens.front.z
         if self.thickness_tolerance is not None and not self.thickness_tolerance < thickness:
             large = f"{self.thickness_tolerance:g} mm is not less than the thickness of the blank, {thickness:g} mm"
@@ -144,7 +144,7 @@ class Flange(Record):
         tuple[tuple[float, float, float], ...],
         Key("Further holes [x, y, diameter].", "mm", *COORDINATES, example=[[14.0, 0.0, 3.2]]),
     ] = ()
-    draft: Annotated[float, Key("Draft angle of the outer walls, narrower above.", "degrees", 0.0, 45.0)] = 0.0
+    draft: Annotated[float, Key("Draft angle of the outer walls, which narrow upwards.", "degrees", 0.0, 45.0)] = 0.0
     bevel: Annotated[float, Key("Bevel at 45 degrees of the edges of the outer walls.", "mm", 0.0, 1e5)] = 0.0
 
     def all_holes(self) -> list[tuple[float, float, float]]:
@@ -160,7 +160,7 @@ class Mount(Record):
         Key("Origin z = 0 of part.step: the origin of the scene, the vertex of the front or the flange's lower face."),
     ] = "source"
     rim: Annotated[Shape | None, Key("Rim of the lens after cutting; lens.outline if absent.")] = None
-    draft: Annotated[float, Key("Draft angle of the lens's walls, narrower below.", "degrees", 0.0, MAX_DRAFT)] = 0.0
+    draft: Annotated[float, Key("Draft angle of the walls, which narrow downwards.", "degrees", 0.0, MAX_DRAFT)] = 0.0
     bevel: Annotated[float, Key("Bevel at 45 degrees of the edge between walls and front.", "mm", 0.0, 1e5)] = 0.0
     flange: Annotated[Flange | None, Key("A plate around the lens, one piece with it.")] = None
 
@@ -206,8 +206,8 @@ class Mount(Record):
     def _inset(self, rim: Outline, front: Surface, top: float) -> float:
         """Return the largest distance (mm) by which draft and bevel move the edge of the front inwards.
 
-        A line of the wall from (p, top) goes down to the front, inwards along m by tan(draft) per mm of depth; the
-        bevel cuts its end at 45 degrees.  The intersection is that of cad.walls.LeaningPiece.ends, found by iteration.
+        From (p, top), p on the rim, a line of the wall goes down to the front, and inwards along m by tan(draft) per mm
+        of depth.  The bevel cuts its end at 45 degrees.  Iteration finds the ends of cad.walls.LeaningPiece.ends.
         """
         (x, y), tangent = rim.rim_points(), math.tan(math.radians(self.draft))
         m_x, m_y = rim.inset_direction(x, y)
@@ -283,7 +283,7 @@ def _wall_complaints(mount: Mount, lens: LensBlank, rim: Round | Box) -> Iterato
         gap = f"only {inradius - own.radius:.3g} mm lie between the rim and the front, {own.words}"
         yield f"{key}: draft and bevel remove {taken:.3g} mm, and {gap}; make them smaller"
     if not taken < half:
-        yield f"{key}: draft and bevel remove {taken:.3g} mm, and rim and axis are {half:g} mm apart; make them smaller"
+        yield f"{key}: draft and bevel remove {taken:.3g} mm, and the axis is {half:g} mm away; make them smaller"
 
 
 def _depth(shape: Round | Box, x: float, y: float) -> float:

@@ -23,8 +23,8 @@ SIZE = 80.0  # default size of a plate, mm
 WIDTH_TO_THICKNESS = 10.0  # ratio of the width of a plate to its thickness
 MIN_THICKNESS = 3.0  # mm; smallest thickness of a plate
 RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # ranges of the options, mm
-BLUR_MARGIN = 1.1  # ratio of the limit to the RRMSD of the blurred picture; standard quality ends well below it
-MIN_RRMSD, MAX_RRMSD = 0.05, 0.25  # smallest and largest limit that is written
+BLUR_MARGIN = 1.1  # ratio of the limit to the RRMSD of the blurred picture; standard quality ends well below
+MIN_RRMSD, MAX_RRMSD = 0.05, 0.25  # smallest and largest accept.rrmsd of a new scene
 
 LIKE_THE_PHOTO = re.compile(r"(?:([^xX×]+)[xX×])?photo")  # size with the photo's proportions: "photo" or "120xphoto"
 
@@ -41,7 +41,7 @@ class Light:
     of: str  # the light in a sentence, "an LED"
     header: str  # description of the light, true for other lengths in the scene too
     pixels: int = 256  # pixels along the longer side of the target
-    size: float = 0.0  # mm for a lamp, degrees for parallel light; 0: no blur
+    size: float = 0.0  # size of the source: mm for a lamp, degrees for parallel light; 0: no blur
     square: bool = False  # True for a square chip, False for a disc
     ahead: float = 0.0  # distance from the lamp to the plate, in longer sides of the plate; 0: parallel light
     throw: float = 5.0  # default distance from the plate to the wall, in longer sides of the plate
@@ -99,7 +99,7 @@ class Plate:
         return self.magnification * self.side / self.light.pixels
 
     def source_image(self, distance: float) -> float:
-        """Return the size (mm) of the source's image at a distance L (mm): 2 L tan(δ / 2), or d L / l from l before."""
+        """Return the size (mm) of the source's image at a distance L (mm): 2 L tan(δ / 2), d L / before for a lamp."""
         if self.before:
             return self.light.size * distance / self.before
         return 2 * distance * math.tan(math.radians(self.light.size / 2))
@@ -115,8 +115,8 @@ class Plate:
         """Return a sentence on the finest detail; blurred: RRMSD of the picture blurred by the source's image."""
         wide, detail = self.magnification * self.side, self.detail(self.distance)
         text = f"The finest detail on this wall is {detail:.2g} mm wide"
-        if self.light.square:  # traced through the whole plate it is 4.86 mm, where the middle has 5.77
-            text += " behind the middle of the plate, and less beside it, where the chip is seen at an angle"
+        if self.light.square:  # traced: 4.86 mm over the whole plate, 5.77 mm at its centre
+            text += " behind the centre of the plate, and less beside it, where the chip is seen at an angle"
         text += f", 1/{wide / detail:.0f} of the picture's {wide:.4g} mm"
         if blurred is None:
             return f"{text}."
@@ -171,7 +171,7 @@ def new_scene(
     name: str, folder: Path, *, picture: Path | None = None, light: str | None = None, size: str | float | None = None,
     distance: str | float | None = None, template: str | None = None,
 ) -> Written:  # fmt: skip
-    """Write NAME.toml to `folder`, a commented scene that loads; an existing file is never replaced.  SceneError.
+    """Write NAME.toml to `folder`, a commented scene that loads; SceneError for an existing file.
 
     The scene is a plate with a picture as large as its shadow on the wall, or a copy of a template.  light: a name of
     LIGHTS.  size: size of the plate, mm: one number, width by height "80x60", or with the proportions of the picture
@@ -223,7 +223,7 @@ def _lengths(name: str, given: str | float, example: str, count: int) -> list[fl
     except ValueError:
         found = []
     if not 0 < len(found) <= count:
-        raise SceneError(f"--{name} {given}: is not a {name}; give mm, such as {example}")
+        raise SceneError(f"--{name} {given}: is not a {name}; give a length in mm, such as {example}")
     low, high = RANGES[name]
     for length in found:
         if not low <= length <= high:
@@ -261,7 +261,7 @@ def _template(template: str, name: str) -> str:
 
 
 def _folder() -> Traversable:
-    """Return the folder of the templates: in an installed package, or beside it in the source tree."""
+    """Return the folder of the templates: in an installed package, or beside the package in the source tree."""
     package = resources.files("bstcad")
     return inside if (inside := package / "templates").is_dir() else package / ".." / "templates"
 

@@ -31,7 +31,7 @@ from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 from bstcad.scene.schema import FileContent
 
-# File name suffix of the copy for each format that is read; the second line has those in a HEIF file.
+# File name suffix of the copy, by format; the second line has the formats in a HEIF file.
 FORMATS = {"PNG": ".png", "JPEG": ".jpg", "MPO": ".jpg", "TIFF": ".tif", "WEBP": ".webp", "BMP": ".bmp", "GIF": ".gif"}
 FORMATS |= {"HEIF": ".heic", "AVIF": ".avif"}
 PILLOW_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "GIF")  # formats read by Pillow; an MPO begins with a JPEG
@@ -46,10 +46,10 @@ MAX_TILE = 4096**2  # largest number of pixels of a tile; programs write tiles o
 MAX_PICTURE_SIZE = 400_000_000  # bytes; 64 million pixels of three 16-bit channels
 MAX_PROFILE_SIZE = 10_000_000  # bytes of an ICC profile; profiles of printers have a few millions
 STRIP_ROWS = 256  # rows of a picture that are processed at a time
-INTEGERS = "16 bits or more and no colour tag: its numbers are taken as sRGB; gamma = 1 takes them as irradiance"
-FLOATS = "floats and no colour tag: they are taken as irradiance; gamma = 2.2 takes them as brightness on a screen"
-MAX_BLACK = 8 / 255  # largest number of a logo in black on transparency, whose opacity is taken as the picture
-MAX_GAMMA = 10.0  # largest exponent of a file, and its inverse the smallest; others are mistakes
+INTEGERS = "16 bits or more and no colour tag: its numbers are read as sRGB; with gamma = 1, as irradiance"
+FLOATS = "floats and no colour tag: they are read as irradiance; with gamma = 2.2, as brightness on a screen"
+MAX_BLACK = 8 / 255  # largest number that is black; the opacity of a logo in black on transparency is its picture
+MAX_GAMMA = 10.0  # largest exponent that a file may state; the smallest is its inverse
 LINEAR, PQ, HLG = 8, 16, 18  # transfer characteristics of a cICP chunk (ITU-T H.273)
 SWAPPED = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}  # opposite byte order of each order
 DEVICE = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.IGNORECASE)  # names of devices on Windows
@@ -87,7 +87,7 @@ def safe_name(text: str) -> str:
 
 
 def read_picture(path: Path) -> Picture:
-    """Read the picture file at `path`; SceneError if it is missing, too large or no picture."""
+    """Read the picture file at `path`; SceneError if it is missing, too large or not a picture."""
     try:
         data = files.contents(path, MAX_PICTURE_SIZE)
     except ValueError as error:
@@ -97,7 +97,7 @@ def read_picture(path: Path) -> Picture:
 
 
 def kind_of(data: bytes, name: str = "the picture") -> str:
-    """Return the file name suffix of a picture by its content, ".png"; SceneError if it is too large or no picture."""
+    """Return the file name suffix for the content of a picture, ".png"; SceneError if too large or not a picture."""
     with decoding(name):
         return FORMATS[str(_open_picture(name, data).format)]
 
@@ -105,7 +105,7 @@ def kind_of(data: bytes, name: str = "the picture") -> str:
 def from_array(values: np.ndarray) -> Picture:
     """Return a picture of an array of irradiance on any scale, (rows, columns), row 0 at the top.
 
-    It is stored as a TIFF file of float32 with maximum 1, beside its design.  SceneError for other arrays.
+    The array is stored as a TIFF file of float32 with maximum 1, beside its design.  SceneError for other arrays.
     """
     for fault in _array_faults(values):
         raise SceneError(f"target.image: {fault}")
@@ -133,7 +133,7 @@ def _array_faults(values: np.ndarray) -> Iterator[str]:
 
 @contextlib.contextmanager
 def decoding(given: Picture | str) -> Iterator[None]:
-    """Turn all errors of the decoders into one sentence on a picture or its name, and silence their warnings."""
+    """Raise each error of a decoder as SceneError on the picture `given` (or its name), and silence warnings."""
     name = given if isinstance(given, str) else given.name
     try:
         with _DECODING, warnings.catch_warnings(), _silent():
@@ -234,8 +234,8 @@ class Photo:
     image: Image.Image
     curve: Curve
     profile: Conversion | None = None  # the picture's ICC profile; None: the colours are sRGB
-    low: Image.Image | None = None  # second bytes of colours of 16 bits, of which Pillow keeps the first
-    white: float = 1.0  # number of white, for numbers of neither 8 nor 16 bits
+    low: Image.Image | None = None  # second bytes of 16-bit colours; Pillow keeps only the first bytes
+    white: float = 1.0  # number that is white, if the numbers have neither 8 nor 16 bits
     other_curve: Curve | None = None  # second possible curve of an untagged file of uncommon depth
     assumed: str = ""  # sentence on the assumed curve of such a file
     several: bool = False  # True if the file has further pictures
@@ -328,7 +328,7 @@ def photo(given: Picture | str, gamma: float | None = None, invert: bool = False
     """Return the decoded picture of a file, or one of SAMPLES.
 
     gamma: irradiance = number ** gamma; None: as the file states.  The numbers of a sample are irradiance, as in the
-    paper and in other programs, for comparison.  invert: take the negative.
+    paper and in other programs, for comparison.  invert: return the negative.
     """
     if isinstance(given, str):
         from skimage import data  # loads much of scikit-image, needed for samples only
@@ -358,7 +358,7 @@ def photo_size(given: Picture | str) -> tuple[int, int]:
 
 
 def _white(image: Image.Image) -> float:
-    """Return the number of white: 1 for floats and 65535 for 32 bits, or the largest number if that is more."""
+    """Return the number that is white: 1 for floats, 65535 for 32 bits, or the largest number if it is larger."""
     if image.mode not in ("I", "F"):
         return 1.0
     usual, (_, largest) = 65535.0 if image.mode == "I" else 1.0, image.getextrema()
@@ -374,7 +374,7 @@ def _negative_curve(curve: Curve) -> Curve:
 def _second_bytes(image: Image.Image, data: bytes) -> Image.Image | None:
     """Return the second bytes of colours of 16 bits as a picture; None for a picture without colours.
 
-    Pillow keeps the first byte.  With the opposite byte order in its decoder it keeps the second.
+    Pillow keeps the first byte.  With the opposite byte order in its decoder, it keeps the second byte.
     """
     if image.mode not in ("RGB", "RGBA"):
         return None

@@ -16,7 +16,7 @@ from scipy.special import erf
 from bstcad.optics.key import Key
 from bstcad.scene.schema import LENGTHS, Record
 
-# Gauss-Legendre nodes per cell of the quadrature, in which E changes by a factor of at most about e, or its 4th root.
+# Gauss-Legendre nodes per quadrature cell in which E changes by a factor up to about e, or up to its fourth root.
 NODES, FEWER_NODES = 8, 4
 MAX_VALUES = 1 << 20  # values of E computed at a time
 DARK = 1e-20  # E, relative to the centre, below which a pixel has no light
@@ -82,7 +82,7 @@ class GaussianProfile(_Profile):
     """A Gaussian: E = exp(-2 (r / w)²), with w the radius at which E is 1/e² of its value at the centre."""
 
     shape: Annotated[Literal["gaussian"], Key("The profile of a Gaussian beam.")] = "gaussian"
-    radius_1e2: Annotated[float, Key("Radius at 1/e² of the irradiance in the middle.", "mm", *LENGTHS, example=6.0)]
+    radius_1e2: Annotated[float, Key("Radius at 1/e² of the irradiance at the centre.", "mm", *LENGTHS, example=6.0)]
 
     @property
     def half_extent(self) -> tuple[float, float]:
@@ -103,7 +103,7 @@ class SuperGaussianProfile(_Profile):
     """
 
     shape: Annotated[Literal["super_gaussian"], Key("A nearly uniform disc with a soft edge.")] = "super_gaussian"
-    radius_1e2: Annotated[float, Key("Radius at 1/e² of the irradiance in the middle.", "mm", *LENGTHS, example=6.0)]
+    radius_1e2: Annotated[float, Key("Radius at 1/e² of the irradiance at the centre.", "mm", *LENGTHS, example=6.0)]
     order: Annotated[float, Key("Order: 2 is a Gaussian, 10 is nearly uniform.", "", 2.0, 100.0, example=10.0)]
 
     @property
@@ -144,15 +144,15 @@ def edges(pixels: Pixels, size: Size) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cell(pixels: Pixels, size: Size) -> float:
-    """Return the area of a cell of the raster, that is, of a pixel (mm²)."""
+    """Return the area of a pixel (mm²)."""
     return size[0] * size[1] / (pixels[0] * pixels[1])
 
 
 def corner_area(x: np.ndarray, y: np.ndarray, radius: float) -> np.ndarray:
     """Return the area (mm²) of the disc r < R between (0, 0) and (x, y), with the sign of x y.
 
-    It is ∫_0^x min(y, sqrt(R² - t²)) dt for x, y >= 0: x y up to c = sqrt(R² - y²), where the circle has the height y,
-    and c y + G(x) - G(c) from there on, G(t) = (t sqrt(R² - t²) + R² asin(t / R)) / 2.
+    For x, y >= 0 it is ∫_0^x min(y, sqrt(R² - t²)) dt: x y for x <= c = sqrt(R² - y²), and c y + G(x) - G(c) for
+    x > c, with G(t) = (t sqrt(R² - t²) + R² asin(t / R)) / 2.
     """
     across, up = np.minimum(np.abs(x), radius), np.minimum(np.abs(y), radius)
     c = np.sqrt(np.maximum(radius**2 - up**2, 0.0))

@@ -29,13 +29,13 @@ BASELINES = {  # methods without limits of time, accuracy or shape: name in mess
 }
 COARSEST_GRID = 64  # smallest number of cells per side of the transport problem; it costs almost no time
 VERIFICATION_POINTS = 32  # points of an extended source for the pictures and margins of a verification, not its RRMSD
-VERIFICATION_DRAW = 1 << 12  # number of the draw of these points; each further spectral line takes the next number
+VERIFICATION_DRAW = 1 << 12  # number of the random sample of these points; each further line has the next number
 
 
 class Tailoring(Record):
     """The effort of tailoring; a setting that is None has the value of its quality (PRESETS)."""
 
-    quality: Annotated[Literal["draft", "standard", "fine", "paper"], Key("More time for a smaller error.")] = (
+    quality: Annotated[Literal["draft", "standard", "fine", "paper"], Key("Effort; fine has the smallest error.")] = (
         "standard"
     )
     seed: Annotated[int, Key("Seed of all random numbers.", "", 0, 2**63 - 1)] = 0
@@ -45,12 +45,12 @@ class Tailoring(Record):
     ] = None
     levels: Annotated[
         tuple[OneOrTwo, ...] | None,
-        Key("Nets, coarse to fine, each as lens.back.control_points.", "", *NET_SIZES, example=[129, 257]),
+        Key("Control points of the nets, from coarse to fine.", "", *NET_SIZES, example=[129, 257]),
     ] = None
     transport_grid: Annotated[int | None, Key("Cells per side of the transport map.", "", 16, 2049, example=512)] = None
     transport_iterations: Annotated[int | None, Key("Transport map iterations.", "", 1, 100_000, example=100)] = None
     rays: Annotated[int | None, Key("Rays or flux tubes along each side of the light.", "", 16, 16_384)] = None
-    stage1_iterations: Annotated[int | None, Key("Steps per level with adam.", "", 0, 1_000_000, example=300)] = None
+    stage1_iterations: Annotated[int | None, Key("Iterations per net with adam.", "", 0, 1_000_000, example=300)] = None
     rounds: Annotated[
         int | None, Key("Maximum number of rounds of transport map and slope fit in stage 1.", "", 1, 100, example=10)
     ] = None
@@ -68,7 +68,7 @@ class Tailoring(Record):
     ] = None
     accuracy: Annotated[float | None, Key("RRMSD at which tailoring ends.", "", 1e-6, 10.0, example=0.05)] = None
     max_time: Annotated[
-        float | None, Key("Maximum time until the report; stage 1 always ends.", "s", 1.0, 1e7, example=60.0)
+        float | None, Key("Maximum time until the report; stage 1 is always completed.", "s", 1.0, 1e7, example=60.0)
     ] = None
 
     @property
@@ -78,13 +78,13 @@ class Tailoring(Record):
 
     @property
     def chosen_method(self) -> str:
-        """Method of the scene, or of its quality."""
+        """Method that the scene states, else that of its quality."""
         return self.method or PRESETS[self.quality]["method"]
 
     def resolved(self, net: Sides) -> ResolvedTailoring:
         """Return the settings with all values set, for a net of control points per side, or along x and along y.
 
-        Levels of an oblong net are pairs, with cells of the shape of the net's.  Defaults: at least two rays per cell
+        Levels of an oblong net are pairs, with cells in the same proportions.  Defaults: at least two rays per cell
         of the net along x and along y (two in all for a draft), and at most two cells of the transport per cell.
         """
         levels = tuple(level if isinstance(level, tuple) else coarser(net, level) for level in self.levels or ())
@@ -165,7 +165,7 @@ Name = Literal[
     "screen.tilt", "screen.tilt_x", "screen.tilt_y", "screen.clocking",
 ]  # fmt: skip
 FORM, RIPPLE = ("back.form", "front.form"), ("back.ripple",)
-FACE_ERRORS = {"correlation_length": FORM, "period": RIPPLE, "pattern": RIPPLE}  # errors that each of these keys is for
+FACE_ERRORS = {"correlation_length": FORM, "period": RIPPLE, "pattern": RIPPLE}  # key: errors that can have it
 TWO_FACE_ERRORS = ("front.", "lens.wedge")  # errors of a lens with two refracting faces; zero unless a table names them
 NONE = "none"  # grade of an error that is always zero
 
@@ -173,13 +173,13 @@ NONE = "none"  # grade of an error that is always zero
 class Tolerance(Record):
     """The tolerance of one error, or of several; None: the value of an earlier table, or of the grade."""
 
-    name: Annotated[Name | None, Key("The error; lens.decentre means its x and its y; all errors if absent.")] = None
+    name: Annotated[Name | None, Key("Name of the error; lens.decentre is both x and y; all if absent.")] = None
     grade: Annotated[
         Literal["moulded", "diamond-turned", "precise", "none"] | None, Key("Grade of the limit; none: no error.")
     ] = None
     limit: Annotated[float | None, Key("Limit (±) in the error's unit; RMS of form and ripple.", "", 1e-12, 1e4)] = None
     distribution: Annotated[
-        Literal["normal", "uniform"] | None, Key("Distribution; normal is cut at the limit, two standard deviations.")
+        Literal["normal", "uniform"] | None, Key("Distribution; normal is truncated at the limit, 2 σ.")
     ] = None
     cost: Annotated[float | None, Key("Cost of the limit, relative to the other errors.", "", 1e-6, 1e6)] = None
     correlation_length: Annotated[float | None, Key("Correlation length of a form error.", "mm", 1e-3, 1e4)] = None

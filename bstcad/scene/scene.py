@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 MESH_TOLERANCE = 1e-3  # mm; default distance of mesh facets from a lens of up to 100 mm
 IMAGE_KEY = re.compile(r"target(\[\d+\])?\.image")  # dotted keys of images
-SEARCH_RANGE = 0.999  # fraction of the possible range of a front within which tailoring searches for it
+SEARCH_RANGE = 0.999  # fraction of the possible range of a parameter of the front that tailoring searches
 FLOAT32_ROUNDING = 2.0**-24  # largest relative rounding error of a coordinate in float32
 FINEST_MESH = 4 * FLOAT32_ROUNDING  # smallest tolerance of a mesh, as a fraction of the largest coordinate
 
@@ -62,13 +62,13 @@ class Accept(Record):
     form: Annotated[float, Key("Maximum distance of lens.step from the tailored surface.", "mm", 1e-12, 1.0)] = 1e-6
     efficiency: Annotated[
         float | None,
-        Key("Minimum fraction of the flux from the back on the target.", "", 0.0, 1.0, example=0.9, of_light=True),
+        Key("Minimum fraction of flux from the back that is on the target.", "", 0.0, 1.0, example=0.9, of_light=True),
     ] = None
     light_on_target: Annotated[
-        float | None, Key("Minimum fraction of the flux in the lens on the target.", "", 0.0, 1.0, of_light=True)
+        float | None, Key("Minimum fraction of flux at the lens that is on the target.", "", 0.0, 1.0, of_light=True)
     ] = None
     leak: Annotated[
-        float | None, Key("Maximum fraction of the flux on dark parts of the target.", "", 0.0, 1.0, of_light=True)
+        float | None, Key("Maximum fraction of flux on the target that is on dark pixels.", "", 0.0, 1.0, of_light=True)
     ] = None
     decentre: Annotated[float | None, Key("Maximum decentre of a measured part.", "mm", 1e-6, 1e3)] = None
     wavefront: Annotated[
@@ -94,7 +94,7 @@ class Scene(Record):
     title: Annotated[str, Key("One line for the report.")] = ""
     source: Annotated[Collimated | Point, Field(discriminator="kind"), Key("The source of light.")]
     lens: Annotated[LensBlank, Key("The lens before tailoring, and the bounds on its tailored faces.")]
-    targets: Annotated[Targets, Field(alias="target"), Key("The picture and its place; several are [[target]] tables.")]
+    targets: Annotated[Targets, Field(alias="target"), Key("Picture and its position; several: [[target]] tables.")]
     before: Annotated[Elements, Key("Windows and mirrors that light meets before the lens: [[before]] tables.")] = ()
     behind: Annotated[Elements, Key("Windows and mirrors that light meets behind the lens: [[behind]] tables.")] = ()
     wavefront: Annotated[
@@ -106,7 +106,7 @@ class Scene(Record):
     tolerance: Annotated[tuple[Tolerance, ...], Key("Tolerances of part, mount and source: [[tolerance]].")] = ()
     output: Annotated[Output, Key("Accuracy of the meshes, and files for the shop.")] = Output()
     part: Annotated[Part, Key("The title block in lens.step.")] = Part()
-    mount: Annotated[Mount | None, Key("How the lens is mounted; with it bstcad writes part.step.")] = None
+    mount: Annotated[Mount | None, Key("Mount of the lens; with this table bstcad writes part.step.")] = None
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -144,7 +144,7 @@ class Scene(Record):
             yield from self._of_targets(lambda target: target.unfaced(lens))
         yield from coplanar_complaints(self.targets)
         if self.wavefront is not None and self.light_path.is_folded:
-            yield "wavefront: cannot be set with a mirror in [[behind]], which turns the wave; remove one of the two"
+            yield "wavefront: cannot be set with a mirror in [[behind]], which turns the wave; remove one of them"
         yield from _wavefront_complaints(self.wavefront, source, lens, accept=self.accept)
         yield from self.tailoring.complaints(lens)
         yield from _method_complaints(self)
@@ -205,7 +205,7 @@ class Scene(Record):
 
     @model_serializer(mode="wrap")
     def _written(self, handler: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
-        """Return the tables as a file has them: `target` is one table, or a list of several."""
+        """Return the tables as they are written in a file: `target` is one table, or a list of several."""
         found = {("target" if name == "targets" else name): value for name, value in handler(self).items()}
         if len(found.get("target", ())) == 1:
             found["target"] = found["target"][0]
@@ -230,7 +230,7 @@ class Scene(Record):
 
     @property
     def rim(self) -> Outline:
-        """Rim of the back, as its mount leaves it; no light passes outside it."""
+        """Rim of the back after the cut to its mount; no light passes outside this rim."""
         return self.lens.outline if self.mount is None else self.mount.rim_of(self.lens.outline).outline
 
     @property
@@ -263,7 +263,7 @@ class Scene(Record):
         return before, elements.interfaces(self.behind, 1, wavelength)
 
     def clearance(self, highest: float) -> tuple[float, str]:
-        """Return (gap, key) of the next part behind a lens up to z = highest; gap in mm, negative if they cross."""
+        """Return (gap, key) of the part that follows a lens up to z = highest; gap in mm, negative if they cross."""
         room = [(elements.lowest(self.behind) - highest, "behind[0].z")] if self.behind else []
         if not self.light_path.is_folded:
             for target, key in zip(self.targets, self.target_keys, strict=True):
@@ -273,8 +273,8 @@ class Scene(Record):
     def flat_lens(self, net: Sides, as_wide_as: Sides | None = None) -> Lens:
         """Return the lens before tailoring, with a flat net as its back.
 
-        net: control points per side of the back's net, or (along x, along y).  A tailored front is a net too: its
-        control points are as many relative to the back's as in the scene, and it is flat, or as in its file.
+        net: control points per side of the back's net, or (along x, along y).  A tailored front is a net too, flat or
+        as in its file; the ratio of its control points to the back's is that of the scene.
         as_wide_as: the finest net to which `net` will be refined (default: `net`), whose spans determine how far the
         nets extend past the rim.
         """
@@ -306,12 +306,12 @@ class Scene(Record):
         return self._with_losses(channels_of(self.source, self.lens.index_at, points, draw))
 
     def verification_channels(self) -> tuple[Channel, ...]:
-        """Return the channels of a verification: more points of an extended source than in tailoring, and others."""
+        """Return the channels of a verification: more and other points of an extended source than in tailoring."""
         return self.channels(VERIFICATION_POINTS, VERIFICATION_DRAW)
 
     @property
     def draw(self) -> Draw | None:
-        """Function of (points, seed) that draws the channels of an extended source; None for a point source."""
+        """Function of (points, seed) that samples the channels of an extended source; None: a point source."""
         if self.source.extent is None:
             return None
         return lambda points, seed: self._with_losses(drawn_channels(self.source, self.lens.index_at, points, seed))
@@ -360,7 +360,7 @@ class Scene(Record):
         A value is a number, a text, a list, a record (bstcad.Sphere(8.0, 0.01)) or, for target.image, an array of
         irradiance.  None removes the key.  "target[1].text" is a key of the second of several targets.  A value
         replaces its alternatives (text, image, …).  A path is relative to the working folder.  lens.front may be your
-        own bstcad.Surface; the scene holds a net within 1e-6 mm of it, inside the outline.  A source or a target of
+        own bstcad.Surface; the scene contains a net within 1e-6 mm of it, inside the outline.  A source or a target of
         your own class stays; keys of such a target can be changed.  Raises SceneError.
         """
         given: dict[str, FileContent] = {}
@@ -388,7 +388,7 @@ class Scene(Record):
         unused = set() if self.source.extent else {"source_points"}
         optic = f"refractive index {self.index:.6g}" if self.lens.passes.enters else f"a {self.optic}"
         comment = f"# {optic}; quality {self.tailoring.quality}"
-        if self.lens.back.control_points is not None:  # they set the knobs
+        if self.lens.back.control_points is not None:  # the settings depend on them
             knobs = self.tailoring.resolved(self.lens.back.net).model_dump(exclude={"quality", "seed"} | unused)
             comment += ": " + ", ".join(f"{key} {value}" for key, value in knobs.items())
         return f"{comment}\n" + tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
@@ -447,7 +447,7 @@ def _doubts_of_goals(scene: Scene) -> Iterator[str]:
 
 
 def _mesh_complaints(tolerance: float | None, lens: LensBlank) -> Iterator[str]:
-    """Yield complaints about a mesh tolerance (mm) below the rounding of float32, in which STL holds coordinates."""
+    """Yield complaints about a mesh tolerance (mm) below the rounding of float32, in which STL stores coordinates."""
     size = max(*lens.outline.half_extent, abs(lens.front.z), abs(lens.back.z))
     if tolerance is not None and tolerance < (smallest := FINEST_MESH * size):
         rounded = f"STL rounds coordinates of {size:g} mm by up to {FLOAT32_ROUNDING * size:.1g} mm"
@@ -522,7 +522,7 @@ def _validated(
 
 
 def _circle(outline: Any, key: str) -> None:
-    """Replace the diameter of a circle by its radius, which the record has."""
+    """Replace the diameter of a circle in a table by its radius, the field of the record."""
     if not isinstance(outline, dict):
         return
     if key == "lens.front.outline" and outline.setdefault("shape", "circle") != "circle":

@@ -18,7 +18,7 @@ NESTED = "is nested too deeply; give a scene file like those in templates"
 
 
 def read(path: Path) -> tuple[str, dict[str, Any]]:
-    """Read the text and the tables of a scene file; SceneError if it is none."""
+    """Read the text and the tables of a scene file; SceneError if it cannot be read as one."""
     if os.path.isdir(path):
         inside = min(path.glob("*.toml"), default=path / "scene.toml")
         raise SceneError(f"{path}: is a folder; give a scene file, such as {inside}")
@@ -59,12 +59,12 @@ def _fault(text: str, fault: str) -> str:
 
 
 def too_dotted(text: str) -> bool:
-    """True if a line, not a comment, has more than MAX_DOTS dots, so that parsing could take hours."""
+    """Return True if a line other than a comment has more than MAX_DOTS dots, so that parsing could take hours."""
     return any(line.count(".") > MAX_DOTS for line in text.split("\n") if not line.lstrip().startswith("#"))
 
 
 def toml_value(text: str) -> Any:
-    """Return the TOML value of an override, or its text if it is no TOML value."""
+    """Return the TOML value of an override, or its text if it is not a TOML value."""
     try:
         table = {} if too_dotted(text) else tomllib.loads(f"value = {text}")
     except (ValueError, RecursionError):

@@ -23,11 +23,11 @@ from bstcad.runs import files
 
 FILE = Path(__file__).with_name("schema.json")
 TAGS = ("kind", "shape")  # keys whose value selects the record of a union
-ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # characters that TOML makes of backslashes, as in "C:\new\ten.png"
+ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # characters that TOML reads from backslash escapes, as in "C:\new\ten.png"
 LENGTHS, COORDINATES = (1e-3, 1e6), (-1e8, 1e8)  # ranges of lengths and of coordinates, mm
 
 Node = Mapping[str, Any]
-# A number, or a pair of numbers along x and along y; the tags make messages speak of the form that was given.
+# A number, or a pair of numbers along x and along y; the tags make messages refer to the form that was given.
 OneOrTwo = Annotated[
     Annotated[int, Tag("number")] | Annotated[tuple[int, int], Tag("pair")],
     Discriminator(lambda given: "pair" if isinstance(given, list | tuple) else "number"),
@@ -44,7 +44,7 @@ class Record(BaseModel):
 
 
 class FileContent:
-    """The content of a file that a scene names; the scene holds all of it, so that a design can be repeated."""
+    """The content of a file that a scene names; the scene contains all of it, so that a design can be repeated."""
 
     name: str  # file name of the copy beside a design
     data: bytes  # content; a subclass that is a dataclass leaves it out of its repr
@@ -61,7 +61,7 @@ class FileContent:
 
 
 def contents(value: Any, key: str = "") -> Iterator[tuple[str, FileContent]]:
-    """Yield (dotted key, content) of all files that a value of a scene names, a record or a tuple."""
+    """Yield (dotted key, content) of all files that a value of a scene (a record or a tuple) names."""
     if isinstance(value, FileContent):
         yield key, value
         return
@@ -77,7 +77,7 @@ def contents(value: Any, key: str = "") -> Iterator[tuple[str, FileContent]]:
 
 
 def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], example: str) -> tuple[Any, ...]:
-    """Return the annotations of a field of type `kind` that is written as a path and holds the content of the file.
+    """Return the annotations of a field of type `kind` that is written as a path and contains the content of the file.
 
     A path is relative to the scene file, or to the user's home.  If the context of a validation has `bounds`, folders,
     a path into one of them must not lead out of them by links.
@@ -267,7 +267,7 @@ def _default(record: Node, name: str) -> str:
 
 
 def toml(value: Any) -> str:
-    """Return a value as a scene file has it, in one line."""
+    """Return a value as it is written in a scene file, in one line."""
     if isinstance(value, dict):
         return f"{{ {', '.join(f'{key} = {toml(part)}' for key, part in value.items())} }}"
     return f"[{', '.join(map(toml, value))}]" if isinstance(value, list | tuple) else json.dumps(value)

@@ -38,7 +38,7 @@ PLANE_DISTANCE = 1e-3  # mm; smallest distance between the planes of two targets
 LARGEST_IN_METRES, FARTHEST_IN_METRES = 0.5, 10.0  # largest plausible numbers in metres: width of a lens, z of a target
 MAX_REDUCTION = 20.0  # largest plausible ratio between the widths of a lens and its target
 EDGE_ON = math.sin(math.radians(1.0))  # sine of the smallest angle between the line of sight and a target's plane
-GRAZING_VIEW = 8.0  # degrees to a target's plane; at less it is hardly lit (RRMSD at 30: 0.07, at 10: 0.33, at 5: 1.6)
+GRAZING_VIEW = 8.0  # degrees between view and target plane; RRMSD 0.07 at 30, 0.33 at 10, 1.6 at 5
 DIRECTIONS = {1: "+z", -1: "-z"}
 
 PictureFile = Annotated[
@@ -52,28 +52,28 @@ Tilt = Annotated[tuple[float, float] | None, AfterValidator(lambda tilt: tilt if
 
 # Remedy for a wall that is nearly parallel to the axis.
 AIM = (
-    "to light a wall beside the lamp, turn the lamp towards the middle of the picture; then target.z is the distance "
-    "to that middle, and target.tilt the remaining angle, such as [60.0, 0.0]"
+    "to light a wall beside the lamp, turn the lamp towards the centre of the picture; then target.z is the distance "
+    "to this centre, and target.tilt the remaining angle, such as [60.0, 0.0]"
 )
 
 
 class Target(Record):
-    """The picture on the plane z, or on a plane tilted about its middle, over the rectangle x by y."""
+    """The picture on the plane z, or on a plane tilted about its centre, over the rectangle x by y."""
 
-    z: Annotated[float, Key("Position of the target, of its middle if tilted.", "mm", *COORDINATES, example=1000.0)]
+    z: Annotated[float, Key("Position of the target; if tilted, of its centre.", "mm", *COORDINATES, example=1000.0)]
     x: Annotated[tuple[float, float], Key("Ends of the target along x.", "mm", *COORDINATES, example=[-200.0, 200.0])]
     y: Annotated[tuple[float, float], Key("Ends of the target along y.", "mm", *COORDINATES, example=[-200.0, 200.0])]
     tilt: Annotated[Tilt, Key("Tilt about x, then about y.", "degrees", -89.0, 89.0, remedy=AIM)] = None
-    pixels: Annotated[OneOrTwo, Key("Pixels of the longer side or [columns, rows].", "", MIN_PIXELS, 4096, example=512)]
+    pixels: Annotated[OneOrTwo, Key("Pixels: longer side, or [columns, rows].", "", MIN_PIXELS, 4096, example=512)]
     text: Annotated[str | None, Key("Text as the picture, centred, as large as fits with a margin.")] = None
     image: Annotated[PictureFile | None, Key("Picture file, relative to the scene file.", example="photo.jpg")] = None
     sample: Annotated[picture.Sample | None, Key("Sample picture of scikit-image.")] = None
-    uniform: Annotated[Literal[True] | None, Key("No picture: the same irradiance everywhere.")] = None
+    uniform: Annotated[Literal[True] | None, Key("Uniform irradiance instead of a picture.")] = None
     profile: Annotated[
-        Profile | None, Key("No picture: an irradiance of this shape.", example={"shape": "disc", "radius": 6.0})
+        Profile | None, Key("Irradiance of this shape instead of a picture.", example={"shape": "disc", "radius": 6.0})
     ] = None
     gamma: Annotated[
-        float | None, Key("Irradiance = number^gamma; as the file states if absent.", "", 0.1, 10.0, example=1.0)
+        float | None, Key("Irradiance = (pixel value)^gamma; the file's if absent.", "", 0.1, 10.0, example=1.0)
     ] = None
     invert: Annotated[bool, Key("Negative of the picture.", example=True)] = False
     seen_from: Annotated[Literal["lens", "behind"], Key("Side from which the picture is not mirrored.")] = "lens"
@@ -86,7 +86,7 @@ class Target(Record):
         Crop | None,
         Key("Part to show: [left, top, right, bottom] as fractions.", "", 0.0, 1.0, example=[0.1, 0.0, 0.9, 1.0]),
     ] = None
-    outline: Annotated[Outlined | None, Key("Outline of the light, centred; it is dark outside.")] = None
+    outline: Annotated[Outlined | None, Key("Outline of the picture, centred; dark outside.")] = None
     unreachable: Annotated[Literal["dark", "refuse"], Key("Unreachable parts: dark, or refuse the scene.")] = "dark"
     weight: Annotated[float, Key("Weight of the target's squared error.", "", 1e-6, 1e6, example=2.0)] = 1.0
 
@@ -145,7 +145,7 @@ class Target(Record):
 
     @property
     def photo(self) -> Picture | str | None:
-        """Picture file, or name of a sample; None for another picture."""
+        """Picture file, or name of a sample; None for other pictures."""
         return self.sample if self.image is None else self.image
 
     def as_rotated(self, shown: Pixels) -> Pixels:
@@ -319,7 +319,7 @@ def coplanar_complaints(targets: tuple[Target, ...]) -> Iterator[str]:
 
 
 def _in_one_plane(one: Screen, other: Screen) -> bool:
-    """Return True if the corners of each are in the plane of the other; receivers that are no planes must be equal."""
+    """Return True if the corners of each are in the plane of the other; receivers other than planes must be equal."""
     heights = _corner_heights(one, other) + _corner_heights(other, one)
     return max(map(abs, heights)) < PLANE_DISTANCE if heights else one.plane == other.plane
 
@@ -331,7 +331,7 @@ def _cuts(screen: Screen, other: Screen) -> bool:
 
 
 def _corner_heights(screen: Screen, other: Screen) -> list[float]:
-    """Return the heights (mm) of the screen's corners above the other's plane; none if a receiver is no plane."""
+    """Return the heights (mm) of the screen's corners above the other's plane; none if a receiver is not a plane."""
     plane, own = other.plane, screen.plane
     if not (isinstance(plane, PlaneReceiver) and isinstance(own, PlaneReceiver)):
         return []
@@ -380,7 +380,7 @@ def _drawing(target: Target) -> Drawing:
 
 
 def _photo_light(target: Target, given: Picture | str, pixels: Pixels, size: Size) -> tuple[np.ndarray, list[str]]:
-    """Return the irradiance (rows, columns) of a photo on the unrotated target, and remarks on it or ""."""
+    """Return the irradiance (rows, columns) of a photo on the unrotated target, and remarks on it ("": none)."""
     photo = picture.photo(given, target.gamma, target.invert)
     if target.crop is not None:
         photo = photo.part(crop_box(photo.image.size, target.crop))
@@ -393,7 +393,7 @@ def _photo_light(target: Target, given: Picture | str, pixels: Pixels, size: Siz
 
 
 def _curve_remark(photo: picture.Photo, light: np.ndarray, part: Window, pixels: Pixels) -> str:
-    """Return a remark on the assumed curve if the other one changes the light by more than NOTICEABLE, or else ""."""
+    """Return a remark on the assumed curve if the other curve changes the light by more than NOTICEABLE; else ""."""
     if photo.other_curve is None:
         return ""
     other = average(replace(photo, curve=photo.other_curve).light, photo.image.size, part, pixels)
@@ -439,7 +439,7 @@ Window = tuple[float, float, float, float]  # left, top, right, bottom in pixels
 def window(shown: Pixels, size: Size, fit: str) -> Window:
     """Return the part of a picture (width, height in pixels) that fills a target of this size (width, height).
 
-    fit "crop" takes the middle, "pad" extends outside the picture.  A difference below one pixel is ignored.
+    fit "crop" returns the central part, "pad" extends outside the picture.  A difference below one pixel is ignored.
     """
     width, height = shown
     across, down = height * size[0] / size[1], width * size[1] / size[0]

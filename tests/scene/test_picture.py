@@ -117,7 +117,7 @@ def test_it_is_said_which_curve_was_taken_where_that_changes_the_light():
     other = off * from_srgb(RAMP / 255).mean() / RAMP.mean() / np.linalg.norm(from_srgb(RAMP / 255))
     assert f"(RRMSD between the two: {other:.2g})" in remark
     [remark] = drawn(saved((RAMP / 255).astype(np.float32), "TIFF"), name="p.tif").remarks
-    assert "the file has floats and no colour tag: they are taken as irradiance; gamma = 2.2" in remark
+    assert "the file has floats and no colour tag: they are read as irradiance; with gamma = 2.2" in remark
     stated = with_chunk(png(deep), b"sRGB", b"\0"), png(deep, (b"gAMA", struct.pack(">I", 100_000))), saved(RAMP)
     white = png(np.where(RAMP > 99, 65535, 0).astype(np.uint16)[..., None])  # black and white are alike by both
     for silent in (*stated, white, picture.from_array(RAMP / 255)):

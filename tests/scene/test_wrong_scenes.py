@@ -111,7 +111,7 @@ WRONG = {
         ({"source.wavelength": "[[486.1, -1.0]]"}, "source.wavelength: the weight -1 of the line at 486.1 nm is not"),
         ({"source.wavelength": "[486.1, 587.6]"}, "source.wavelength: a spectrum is a list of lines"),
         ({"source.wavelength": "[[486.1, 1], [2000, 1]]"}, "lens.material: .* PMMA .*nm"),
-        ({"source.wavelength": RGB, "lens.index": "1.5"}, "lens.index: one index does not hold for the 3 lines"),
+        ({"source.wavelength": RGB, "lens.index": "1.5"}, "lens.index: one index is not valid for the 3 lines"),
         ({"source.divergence": "90", "source.tilt": "[50, 0]"}, r"source.divergence: .* 89 degrees"),
         ({"source.tilt": "[91, 0]"}, r"source.tilt: .* 89 degrees"),
         ({"source.tilt": "[10, 0]", "source.z": "-500"}, "source.tilt: no light reaches the lens; turn"),
