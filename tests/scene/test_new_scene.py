@@ -125,7 +125,7 @@ class TestLight:
                                                     "target.size": (120, 120)}, "is 1.1 mm wide, 1/106 of the"),
         # 1 mm at 80 mm: on a wall at 400 mm 5 mm, as wide as a disc of 5.8 mm; its faces reflect at a slant
         (["--light", "led"], {"source.width": 1, "source.profile": "lambertian", "lens.front.z": 80},
-         "is 6.2 mm wide behind the middle of the plate, and less beside it, where the chip is seen at an angle, 1/78 "
+         "is 6.2 mm wide behind the centre of the plate, and less beside it, where the chip is seen at an angle, 1/78 "
          "of the picture's 480 mm; a smaller chip"),
     ])  # fmt: skip
     def test_the_light_is_simulated_and_its_detail_is_said(self, place, capsys, arguments, made, sentence):
