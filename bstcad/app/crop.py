@@ -19,7 +19,7 @@ def target_of(scene: Scene, key: str) -> Target:
     """Return the target at a key such as target or target[1].  SceneError if it does not exist or has no photo."""
     found = dict(zip(scene.target_keys, scene.targets, strict=True)).get(key)
     if found is None or (found.image is None and found.sample is None):
-        raise SceneError(f"{key[:40]}: has no photo; give it an image or a sample")
+        raise SceneError(f"{key[:40]}: has no photo; give the target an image or a sample")
     return found
 
 

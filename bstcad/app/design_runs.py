@@ -39,7 +39,7 @@ NO_RUN = State("none")
 
 @dataclass(frozen=True)
 class Run:
-    """Run of one kind that belongs to a design; it need not exist."""
+    """Run of one kind for a design, which may not have been started."""
 
     design: Path  # folder of the design
     kind: str = DESIGN  # key of JOBS
@@ -70,7 +70,7 @@ class Run:
     def go_on(self) -> None:
         """Resume a run that was stopped or killed; a design continues from its checkpoint."""
         if not self.read(JOB):
-            raise SceneError(f"{self.design.name}: there is no run to resume; start a new one")
+            raise SceneError(f"{self.design.name}: there is no run to resume; start a new run")
         if self.state.state != "running":
             for path in self.folder.iterdir():
                 if path.is_symlink():  # never write through a link

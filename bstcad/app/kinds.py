@@ -123,7 +123,7 @@ def cast(node: Node, value: Any) -> Any:
 
 
 def _cast_table(union: list[Node], table: Any) -> dict[str, Any]:
-    """Cast the values of a table; invalid values stay unchanged, so that the scene's own check reports them."""
+    """Cast the values of a table; invalid values stay unchanged, so that the check of the scene reports them."""
     if not isinstance(table, dict):
         raise ValueError
     nodes, taken = matching_records(union, table)[0]["properties"], dict(table)
@@ -248,7 +248,7 @@ def are_numbers(*values: Any) -> bool:
 
 
 def _scaled_z(data: Table, key: str, times: float = 1.0, more: float = 0.0) -> float | None:
-    """Return times * z + more for the z of a table (mm); None without z."""
+    """Return times * z + more (mm) for the key z of the table at `key`; None without z."""
     z = table_at(key, data).get("z")
     return times * z + more if are_numbers(z) else None
 

@@ -47,7 +47,7 @@ class PreviewRequest:
 
     @property
     def done(self) -> bool:
-        """True if all answers are there or the page no longer waits for them."""
+        """True if all answers exist or the page no longer waits for them."""
         return self.replaced or len(self.answers) == len(STAGES) or time.monotonic() > self.poll_time + PAGE_TIMEOUT
 
 
@@ -85,7 +85,7 @@ class PreviewDesk:
             return request.answers[stage] if len(request.answers) > stage else None
 
     def last(self, page: str) -> PreviewRequest | None:
-        """Return the latest request of a page."""
+        """Return the latest request of a page; None without one."""
         with self._news:
             return self._requests.get(page)
 
@@ -123,7 +123,7 @@ class PreviewDesk:
             self._serve(request)
 
     def _next(self) -> PreviewRequest | None:
-        """Return the latest of the requests with the fewest answers, so that a new request comes first."""
+        """Return the latest of the requests with the fewest answers, so that a new one comes first; None if none."""
         now = time.monotonic()
         waiting = [each for each in self._unanswered() if not each.answers or now > each.preview_time + IDLE_DELAY]
         return min(reversed(waiting), key=lambda request: len(request.answers), default=None)

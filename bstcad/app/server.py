@@ -350,7 +350,7 @@ class Workbench:
         return self._answered(asking, 0)
 
     def answer(self, request: Request) -> Response:
-        """Answer with a later stage of a page's request: ?page, number and stage; {} if it is not there yet."""
+        """Answer with a later stage of a page's request (?page, number, stage); {} if the stage is not finished."""
         query = request.query_params
         number, stage = _integer(_required(query, "number")), _integer(_required(query, "stage"))
         body = self.desk.last(_required(query, "page"))
@@ -496,7 +496,7 @@ class Workbench:
         name = request.path_params["name"]
         paths = [(each, self.workspace.file(name, each)) for each in self.workspace.file_names(name)]
         if not paths:
-            raise SceneError(f"{name}: has no files yet; wait until its design ends")
+            raise SceneError(f"{name}: has no files yet; wait until the design ends")
         headers = {"Content-Disposition": f'attachment; filename="{name}.zip"'}
         return StreamingResponse(_zip_parts(name, paths), media_type="application/zip", headers=headers)
 

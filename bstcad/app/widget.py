@@ -39,7 +39,7 @@ class Workbench:
         try:
             import ipywidgets
         except ImportError:
-            raise SceneError("ipywidgets is not installed; pip install 'bstcad[app]' brings it") from None
+            raise SceneError("ipywidgets is not installed; run: pip install 'bstcad[app]'") from None
         self._widgets = ipywidgets
         self._path = None if isinstance(scene, Scene) else Path(scene).expanduser()
         self.scene = scene if isinstance(scene, Scene) else load(self._path)

@@ -48,7 +48,7 @@ class OpenScene:
 
 
 class Workspace:
-    """Folder of the scene files and folder of the designs; one thread at a time changes a scene."""
+    """The folder of the scene files and the folder of the designs; only one thread at a time changes a scene."""
 
     def __init__(self, scene_folder: Path, designs: Path) -> None:
         self.scenes, self.designs = scene_folder.resolve(), designs.resolve()
@@ -69,7 +69,7 @@ class Workspace:
                 raise SceneError(f"{given}: is not a scene file; give a TOML file, such as my-lens.toml, or a folder")
             return cls(given.parent, usual), f"/scene/{given.stem}"
         if not given.is_dir():
-            raise SceneError(f"{given}: no such scene file or folder; give an existing one, or omit the argument")
+            raise SceneError(f"{given}: no such scene file or folder; give another path, or omit the argument")
         if any((given / name).is_file() for name in DESIGN_FILES):
             given = given.resolve()
             if not NAME.fullmatch(given.name):

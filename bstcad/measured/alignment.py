@@ -68,7 +68,7 @@ class BackFace:
         return cls(lens, pivot, max(lens.outline.half_extent), max_distance)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Return True for points (n, 3) inside the outline, without its rim of RIM_MARGIN."""
+        """Return a mask (n,) of the points (n, 3) inside the outline, except those within RIM_MARGIN of the rim."""
         return self.lens.outline.contains(*torch.from_numpy(points[:, :2].T * (1 + RIM_MARGIN))).numpy()
 
     def distance(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -105,7 +105,7 @@ class Pose:
         return (points - self.pivot - self.shift) @ self.rotation + self.pivot
 
     def compose(self, motion: np.ndarray, reach: float) -> Pose:
-        """Return the pose that removes this one and then moves points by `motion` (6,), as in BackFace.columns."""
+        """Return the pose that removes this pose, then moves points by `motion` (6,), as in BackFace.columns."""
         turn = Rotation.from_rotvec(motion[3:] / reach).as_matrix()
         rotation = self.rotation @ turn.T
         return Pose(rotation, self.shift - rotation @ motion[:3], self.pivot)
@@ -147,7 +147,7 @@ class Alignment:
 
 
 def align(face: BackFace, cloud: np.ndarray, start: Pose) -> Alignment:
-    """Align a cloud (n, 3) in mm with a face by least squares, all points weighted equally and outliers left out.
+    """Align a cloud (n, 3) in mm with a face by least squares, with equal weights and without outliers.
 
     start: a pose near the solution.  Outliers are sought there, and again among points that reach the face later.
     """
@@ -346,7 +346,7 @@ def _rarity(matrix: np.ndarray) -> int:
 
 
 def _sample(cloud: np.ndarray) -> np.ndarray:
-    """Return START_SAMPLE points of a cloud, drawn with a fixed seed."""
+    """Return START_SAMPLE random points of a cloud, chosen with a fixed seed."""
     return cloud[np.random.default_rng(0).permutation(len(cloud))[:START_SAMPLE]]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from bstcad.measured.point_text import MeasuredPoints, make_points
 
-EXPORT_HINT = "export it again"
+EXPORT_HINT = "export the file again"
 PLY_TYPES = {  # names of number types in numpy, by their names in PLY
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -56,7 +56,7 @@ class _Element:
         return any(length for _, _, length in self.properties)
 
     def row(self, order: str) -> np.dtype:
-        """Return the type of a row without lists."""
+        """Return the numpy type of a row without lists; order: "<" or ">", the byte order."""
         return np.dtype([(name, order + kind) for name, kind, _ in self.properties])
 
     def shortage_error(self, follow: int) -> ValueError:
@@ -79,7 +79,7 @@ def _ply(data: bytes) -> np.ndarray:
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
-    """Return the format, the elements in their order, and the offset of the data."""
+    """Return the format, the elements in the order of their data, and the offset of the data."""
     end = re.compile(rb"^[ \t]*end_header[ \t]*(?:\r\n|\n|\r)", re.MULTILINE).search(data[:MAX_PLY_HEADER_SIZE])
     if not data.startswith(b"ply") or end is None:
         raise _Damaged("its header does not end" if data.startswith(b"ply") else "it does not begin with ply")

@@ -38,7 +38,7 @@ Purpose = dict[str, Any]  # description of the checkpoint's design: numbers, tex
 
 
 def write(path: Path, purpose: Purpose, state: Any) -> None:
-    """Write a checkpoint of a design (`purpose`) to `path`, completely or not at all.  OSError."""
+    """Write a checkpoint of a design (`purpose`) to `path`, completely or not at all.  OSError if not."""
     arrays: dict[str, np.ndarray] = {}
     tree = json.dumps([purpose, state], default=partial(_packed, arrays))
     with files.atomic_file(path) as file:  # without a copy of the state in memory

@@ -37,7 +37,7 @@ class Answer:
 
 
 class Machines(Protocol):
-    """Processes that do jobs."""
+    """Interface of processes that do jobs, such as `Cluster`."""
 
     @property
     def capacity(self) -> int:
@@ -47,7 +47,7 @@ class Machines(Protocol):
         """Start the job work(*arguments)."""
 
     def next(self, tick: Callable[[], None]) -> Answer:
-        """Wait for the next job that ends; `tick` is called meanwhile."""
+        """Wait for the next job that ends, return its answer, and call `tick` meanwhile."""
 
 
 @contextlib.contextmanager
@@ -126,7 +126,7 @@ class Cluster:
         return self._ended(self._keys, tick)
 
     def _ended(self, futures: Collection[Any], tick: Callable[[], None] = lambda: None) -> Answer:
-        """Wait for the first of these futures that is done, and return its answer."""
+        """Wait until one of these futures is done, return its answer, and call `tick` meanwhile."""
         while True:
             for future in [future for future in futures if future.done()]:
                 return self._answer(self._keys.pop(future), future)

@@ -190,7 +190,7 @@ def _environment_variable(name: str, value: str) -> Iterator[None]:
 
 
 def _serve(parent: int) -> None:
-    """Ignore the parent's signals and end with the parent, which cannot shut this process down when it is killed."""
+    """Ignore the parent's signals, and end when the parent ends: a killed parent cannot shut this process down."""
     global _is_second
     _is_second = True
     for number in (*TERMINAL_SIGNALS, signal.SIGTERM):
