@@ -368,7 +368,7 @@ ARCHIVE_TIME = (1980, 1, 1, 0, 0, 0)  # time of the files in a 3MF package, so t
 
 @dataclass(frozen=True)
 class Label:
-    """Name and appearance of a mesh in its file."""
+    """Name and appearance of a mesh in a file."""
 
     name: str = "lens"
     title: str = ""

@@ -232,7 +232,7 @@ def check_fit(lens: Lens, rim: Sequence[LoopPiece], planes: tuple[float, float],
 
 
 def _replace_loops(face: cadquery.Face, replacements: dict[int, list[Loop]] | None) -> TopoDS_Face:
-    """Return a plane face of the body, its wires replaced by loops, by index of the wire; None: an unchanged face."""
+    """Return a plane face of the body with loops in place of some wires, by index of the wire; None: of no wire."""
     if replacements is None:
         return face.wrapped
     loops: list[Loop] = []

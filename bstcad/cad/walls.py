@@ -206,7 +206,7 @@ def _upright_surface(piece: LoopPiece) -> WallSurface:
 
 
 def _plane_or_cone(piece: LoopPiece, start: Sequence[float], tangent: float) -> WallSurface:
-    """Return the plane, cylinder or cone over a line or arc, through a point over its start; tangent: see `Draft`."""
+    """Return the plane, cylinder or cone over a line or arc, through a point above its start; tangent: see `Draft`."""
     x, y, z = map(float, start)
     angle, turn = math.atan(tangent), piece.turn
     if piece.straight:
@@ -306,7 +306,7 @@ NO_DRAFT = Draft()
 class LeaningPiece:
     """A piece of the rim and the leaning wall below it."""
 
-    front: Surface
+    front: Surface  # surface on which the wall ends
     piece: LoopPiece
     mitres: tuple[np.ndarray, np.ndarray]  # mitres m at the two ends of the piece, each (2,)
     z: float  # height of the parting line (mm)

@@ -138,7 +138,7 @@ def _along_axes(net: np.ndarray) -> np.ndarray:
     sines = np.abs(frame.rotation)
     if not (np.abs(sines - sines.round()).max() <= MAX_AXIS_SINE and sines[2, 2] > 0.5):
         needed = "the axis of a front must be along z, and the sides of its net along x and y"
-        raise ValueError(f"its lens is {frame.turn_words}, but {needed}: export it without that turn")
+        raise ValueError(f"its lens is {frame.turn_words}, but {needed}: export it without this rotation")
     along = np.abs(net[-1, 0, :2] - net[0, 0, :2])
     net = net.transpose(1, 0, 2) if along[1] > along[0] else net
     for axis in (0, 1):

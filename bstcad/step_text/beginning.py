@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bstcad.runs.files import SceneError
 
-BYTES_READ = 65_536  # bytes read from a file; comments before its first statement are shorter
+BYTES_READ = 65_536  # number of bytes read from a file; comments before the first statement are shorter
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"  # byte order mark of UTF-8
 STEP_BEGINNING = re.compile(rb"(?:\s|/\*(?:[^*]|\*(?!/))*+\*/)*+ISO-10303-21\s*;")
 OTHER_FORMATS = {  # remedies for files that are not STEP, by their first bytes

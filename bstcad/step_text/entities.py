@@ -127,7 +127,7 @@ def read_entities(text: str) -> tuple[str, Entities]:
 
 
 def required(hit: re.Match[str] | None) -> re.Match[str]:
-    """Return the match of an entity's text; LookupError if it is None, since the text has another form."""
+    """Return the match of an entity's text; LookupError if there is none, because the text has another form."""
     if hit is None:
         raise LookupError
     return hit

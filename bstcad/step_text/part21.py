@@ -57,7 +57,7 @@ class FreeformSurface:
     control_points: np.ndarray  # control net, (m, n, 3), mm, in the frame of the file, u along the first axis
     knots: tuple[np.ndarray, np.ndarray]  # distinct knots in u and v
     multiplicities: tuple[np.ndarray, np.ndarray]  # multiplicity of each distinct knot
-    closed: tuple[bool, bool]  # closed in u, in v
+    closed: tuple[bool, bool]  # True if closed in u, True if closed in v
     self_intersecting: bool | None  # None: not stated
     entity: str  # number of the entity in the file
 
@@ -79,7 +79,7 @@ class ProfileTolerance:
 
 @dataclass(frozen=True)
 class ValidationProperties:
-    """Properties of a part, each as often as the file states it; empty if it does not."""
+    """Properties of a part; each tuple contains one value per statement in the file."""
 
     areas: tuple[float, ...] = ()  # area of the whole surface (mm²)
     volumes: tuple[float, ...] = ()  # volume (mm³)
@@ -89,7 +89,7 @@ class ValidationProperties:
     profiles: tuple[ProfileTolerance, ...] = ()
 
     def moved(self, placement: Placement) -> ValidationProperties:
-        """Return the properties of the part after a placement."""
+        """Return the properties of the part after it is moved by a placement."""
         if not placement.moves:
             return self
         moved = (placement(np.array(centroid)).tolist() for centroid in self.centroids)
@@ -206,7 +206,7 @@ def _product(entities: Entities) -> str:
 
 
 def _units(quantity: str, entities: Entities) -> dict[str, str]:
-    """Return the units of a quantity that the shapes' contexts use, each once, with their entity numbers."""
+    """Return the entity numbers, by name, of the units that the contexts of the shapes use for a quantity."""
     used = set()
     for body in entities.of("COMPLEX").values():
         for context in re.findall(r"GLOBAL_UNIT_ASSIGNED_CONTEXT\(\(([#\d,]*)\)\)", body):
@@ -295,7 +295,7 @@ def _middle_and_normal(surface: FreeformSurface) -> tuple[np.ndarray, np.ndarray
 
 
 def _in_millimetres(surface: FreeformSurface, placement: Placement, unit: float) -> FreeformSurface:
-    """Return a surface in mm after its placement; unit: unit of length of the file (mm)."""
+    """Return a surface in mm, moved by a placement; unit: unit of length of the file (mm)."""
     net = surface.control_points if unit == 1 else unit * surface.control_points
     return replace(surface, control_points=placement(net) if placement.moves else net)
 
@@ -373,7 +373,7 @@ def _properties(entities: Entities, products: set[str], unit: float) -> Validati
 
 
 def _measure(entities: Entities, item: str, kind: str) -> float:
-    """Return the value of a measure, in powers of mm and g as in its unit."""
+    """Return the value of a measure, converted from its unit to powers of mm and g."""
     value = re.search(rf"{kind}\(({NUMBER})\),#(\d+)", entities.bodies.get(item, ("", ""))[1])
     return float(value[1]) * _unit_scale(entities, value[2]) if value else UNKNOWN_VALUE
 
@@ -401,7 +401,7 @@ def _unit_scale(entities: Entities, unit: str) -> float:
 
 
 def _unit_size(entities: Entities, unit: str) -> float | None:
-    """Return a named unit of length in mm or of mass in g; None if it is not derived from an SI_UNIT."""
+    """Return the size of a named unit of length (mm) or mass (g); None if it is not derived from an SI_UNIT."""
     body, factor = entities.bodies[unit][1], 1.0
     if converted := re.search(r"CONVERSION_BASED_UNIT\('\d+',#(\d+)\)", body):  # such as an inch, by a measure in mm
         measure = re.search(rf"\(({NUMBER})\)?,#(\d+)\)", entities.bodies[converted[1]][1])

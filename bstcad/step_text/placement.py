@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-MAX_GRID_DEVIATION = 1e-9  # largest deviation (mm) of an unmoved net from its uniform grid about the axis
+MAX_GRID_DEVIATION = 1e-9  # largest deviation (mm) of an unmoved net from a uniform grid centred on the axis
 FLAT_RMS = 1e-7  # RMS deviation (mm) from a plane below which a net has the normal of that plane
 PARALLEL_SINE = 1e-9  # sine of the angle below which two directions are parallel
 DECIMALS = 9  # decimals of a stated shift (mm) and rotation (degrees); further ones are rounding errors
@@ -54,7 +54,7 @@ class Placement:
         return Placement(self.rotation.T, -(self.rotation.T @ self.shift))
 
     def after(self, first: Placement) -> Placement:
-        """Return the placement `first` followed by this one."""
+        """Return the composition of the placement `first`, then this placement."""
         return Placement(self.rotation @ first.rotation, self(first.shift))
 
     @property
@@ -71,7 +71,7 @@ class Placement:
 
     @property
     def words(self) -> str:
-        """Rotation and shift in words, such as "turned by 90° about z, then shifted by (0, 0, 5) mm"."""
+        """Rotation and shift in words, such as "rotated by 90° about z, then shifted by (0, 0, 5) mm"."""
         shift = np.round(self.shift, DECIMALS) + 0.0
         parts = [self.turn_words] if round(self.turn[0], DECIMALS) else []
         if shift.any() or not parts:
@@ -80,9 +80,9 @@ class Placement:
 
     @property
     def turn_words(self) -> str:
-        """Rotation in words, such as "turned by 90° about z"."""
+        """Rotation in words, such as "rotated by 90° about z"."""
         angle, about = self.turn
-        return f"turned by {angle:.9g}° about {_axis_name(about)}"
+        return f"rotated by {angle:.9g}° about {_axis_name(about)}"
 
     def facts(self) -> dict[str, Any]:
         """Return the placement for JSON: in words, angle (degrees) and axis of its rotation, and shift (mm)."""

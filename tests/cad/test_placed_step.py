@@ -20,10 +20,10 @@ ORIGIN, FAR = Vector(0, 0, 0), Vector(100, 20, -7)
 MOVES = {  # the location, and how the placement is stated
     "lifted": (Location(Vector(0, 0, 5)), "shifted by (0, 0, 5) mm"),
     "by a nanometre": (Location(Vector(1e-6, 0, 0)), "shifted by (1e-06, 0, 0) mm"),
-    "turned": (Location(ORIGIN, Vector(0, 0, 1), 90), "turned by 90° about z"),
-    "face down": (Location(ORIGIN, Vector(1, 0, 0), 180), "turned by 180° about x"),
+    "turned": (Location(ORIGIN, Vector(0, 0, 1), 90), "rotated by 90° about z"),
+    "face down": (Location(ORIGIN, Vector(1, 0, 0), 180), "rotated by 180° about x"),
     "tilted and moved": (
-        Location(FAR, Vector(2, 1, 2), 37), "turned by 37° about (0.666667, 0.333333, 0.666667), then shifted by ("
+        Location(FAR, Vector(2, 1, 2), 37), "rotated by 37° about (0.666667, 0.333333, 0.666667), then shifted by ("
     ),
 }  # fmt: skip
 

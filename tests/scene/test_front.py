@@ -171,8 +171,8 @@ def placed(earlier, place):
     [
         (((1e-6, 0, 0),), "its net is centred at x = 1e-06 mm and not on the axis; export the lens centred"),
         (((0, 3, 0),), "its net is centred at y = 3 mm and not on the axis"),
-        (((0, 0, 0), (1, 0, 0), 90), r"cannot be read \(its lens is turned by 90° about x, but the axis"),
-        (((0, 0, 0), (0, 0, 1), 30), "its lens is turned by 30° about z, but"),
+        (((0, 0, 0), (1, 0, 0), 90), r"cannot be read \(its lens is rotated by 90° about x, but the axis"),
+        (((0, 0, 0), (0, 0, 1), 30), "its lens is rotated by 30° about z, but"),
     ],
 )
 def test_a_placement_that_is_no_front_is_refused(earlier, place, sentence):
