@@ -175,7 +175,7 @@ def test_a_lens_out_of_its_place_fails_in_the_folder_of_its_design(folder, nomin
     cadquery.Assembly(name="whole").add(solid, name="lens", loc=place).export(str(path))
     failed = {check.id: check for check in checks.verify(folder, nominal).checks if not check.passed}
     assert failed.keys() >= {"control-points", "placement"}
-    assert failed["placement"].where == "the lens is turned by 90° about z, then shifted by (0, 0, 5) mm"
+    assert failed["placement"].where == "the lens is rotated by 90° about z, then shifted by (0, 0, 5) mm"
     assert not failed.keys() & {"form", "front-vertex", "rrmsd"}
 
 
