@@ -1,10 +1,10 @@
 """The rays behind a lens with two freeform faces, computed from its goals: one ray through each point of a target.
 
 Behind a lens the rays of a point source or of collimated light are normal to wavefronts (theorem of Malus and Dupin;
-Born and Wolf, Principles of Optics, section 3.1.2).  So their direction cosines on a plane A are the gradient of an
-eikonal.  The eikonal follows from a wavefront goal (`light_of_wave`), or from a picture on a second plane B
-(`between_targets`): light that crosses A at p shall meet B at t.  Let c be the direction cosines along A, and m the
-centroid of the light on B.  The coordinate y in
+Born and Wolf, Principles of Optics, section 3.1.2).  So their direction cosines on a plane A, from which the map
+starts, are the gradient of an eikonal.  The eikonal follows from a wavefront goal (`light_of_wave`), or from a picture
+on a second plane B (`between_targets`): light that crosses A at p shall meet B at t.  Let c be the direction cosines
+along A, and m the centroid of the light on B.  The coordinate y in
 
     c(p, t) = (t - p) / |t - p|,    y = σ (c(p, t) - c(p, m)),
 
@@ -137,6 +137,7 @@ class LightBehind:
 
 def light_for_task(task: Task) -> LightBehind:
     """Return the rays behind the lens for the nearest target and the wavefront, or the nearest and furthest target."""
+    # twice, so that a single goal is both the nearest and the furthest
     near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.receiver.plane.throw(0.0))
     if any(goal.receiver.plane.frame is None for goal in (near, far)):
         raise SceneError("target: a design for several targets needs planes; make each target a plane")

@@ -1,30 +1,33 @@
-"""The merit function of stages 2 and 3, and the Sobolev variable, in which its Hessian is close to the identity.
+"""The merit function of stages 2 and 3, and the variables that condition it (`Spectrum`: of the slope fit of stage 1).
 
 The merit is the weighted mean over the goals, of RRMSD² for a picture and of the squared RMS wavefront error in waves:
 
     M = (Σ_k w_k RRMSD_k² + w (RMS / λ)²) / (Σ_k w_k + w),    RRMSD_k² = Σ_ij |E^s_ij - E_ij|² / Σ_ij E_ij².
 
 All pixels have the same weight, lit or not.  The target E has the sum 1.  The picture E^s is divided by the flux that
-the lens transmits to the target and beside it, so that losses at faces and in the glass do not change the merit, but
-light beside the target does.  (Reports scale both pictures to the sum 1.)
+is left after losses at faces and in the glass, so that these losses do not change the merit, but light beside the
+target does.  (Reports scale both pictures to the sum 1.)
 
-Two terms are added, averaged over the pictures: a penalty on light outside the target, and the fraction of the light
-that is lost.  Light outside the target changes no pixel and so has no gradient; the penalty is `overshoot` (1 / pixel²)
-times the mean square of its distance from the border in pixels.  Pictures and both terms are sums over the channels of
-the light.  For a source of finite size the picture is that of its centre, blurred (source_image.py).  The wavefront
-error of a ray is its optical path S to the plane of the wave minus the phase W of the wave there (wavefront_error.py),
+Two terms are added, averaged over the pictures: a penalty on light outside the target, and the fraction of the light in
+tubes that do not reach the receiver (total internal reflection).  Light outside the target changes no pixel and so has
+no gradient; the penalty is `overshoot` (1 / pixel²) times the mean square of its distance from the border in pixels (of
+the picture with its margin, for a source of finite size).  Pictures and both terms are sums over the channels of the
+light.  For a source of finite size the picture is that of its centre, blurred (source_image.py).  The wavefront error
+of a ray is its optical path S to the plane of the wave minus the phase W of the wave there (wavefront_error.py),
 without piston.
 
 The Hessian: let e be the flux density on the last face, and E the irradiance of the target where its light lands.  A
-change δz of the face moves this light by L ∇δz, where L is the throw (mm), and so changes E by about E L Δδz.  The
-light of an area dA_b of the face falls on the area dA_t = (e / E) dA_b of the target, so that the squared error is
+change δz of the face moves this light by L ∇δz, where L = |∂t/∂p| is the throw of a slope p (mm; for small angles the
+distance times n - 1), and so changes E by about E L Δδz.  The light of an area dA_b of the face falls on the area dA_t
+= (e / E) dA_b of the target, so that the squared error is
 
     ∫ δE² dA_t  =  ∫ (E L Δδz)² (e / E) dA_b  =  L² ∫ e E (Δδz)² dA_b.
 
 As a quadratic form in δz this is the operator Δ e E Δ.  In the variable c with δz = Δ^-1 E^-1/2 c it becomes e, the
-identity for a uniform beam.  Pixels average over finer detail, so that a smaller power of Δ converges faster: 0.5 by
-measurement (the best power is still smaller for letters, larger for portraits).  The weight E^-1/2 halves the number of
-evaluations for pictures with dark parts.  Δ is diagonal in the cosine transform of the net.
+identity for a uniform beam.  Pixels average over finer detail, so that `SobolevVariable` converges faster with a
+smaller power, δz = Δ^-q E^-1/2 c with q = 0.5 by measurement (the best power is smaller for letters, larger for
+portraits).  The weight E^-1/2 halves the number of evaluations for pictures with dark parts.  Δ is diagonal in the
+cosine transform of the net.
 
 Near the critical angle L is not constant: dθ' = η cos θ / cos θ' dθ grows without bound, and some points of the face
 move their light many times further than most.  There the weight is divided by L / (3 median L).
@@ -67,7 +70,7 @@ LAPLACIAN_POWER = 0.5  # power of the Laplacian in `SobolevVariable`
 COARSE_LAPLACIAN_POWER = 0.75  # power of the Laplacian in `CoarseVariable`, whose knot spans are wider than a pixel
 TARGET_BLUR = 1.0  # standard deviation of the blur of the target before the local weight is computed (pixels)
 WEIGHT_SMOOTHING = 1.5  # standard deviation of the smoothing of the weight's logarithm (control points)
-MAX_LOCAL_WEIGHT = 4.0  # largest local weight; the smallest is 1 / MAX_LOCAL_WEIGHT
+MAX_LOCAL_WEIGHT = 4.0  # largest local weight; the smallest is 1 / MAX_LOCAL_WEIGHT, before the division by the throw
 MIN_THROW, MAX_THROW = 3.0, 96.0  # range of the throw / median in which the weight is proportional to 1 / throw
 THROW_STEP = 1e-6  # step of the difference quotients of the throw, relative to the distance to the target
 THROW_STRIDE = 8  # every 8th control point is checked first, since few lenses have a large throw anywhere
@@ -154,7 +157,7 @@ class Merit:
         return Landings(on_goals, None if self.wave is None else traced[0])
 
     def __call__(self, landings: Landings) -> tuple[Tensor, Tensor]:
-        """Return the merit of the landed corners, and the largest RRMSD of the pictures scaled to the sum 1."""
+        """Return the merit of the landed corners, and the largest RRMSD of the pictures, each scaled to the sum 1."""
         pictures = sum(goal.weight for goal in self.goals)
         weights = pictures + (self.wave.weight if self.wave else 0.0)
         merit, worst = torch.zeros(()), torch.zeros(())
@@ -183,7 +186,7 @@ class Merit:
         return weighted_sum(channels, smooth), self.overshoot * (outside / flux)
 
     def _goal_terms(self, k: int, landed: Sequence[Landed]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return (RRMSD² or `picture_error`, penalty, fraction lost, RRMSD scaled to the sum 1) of goal k."""
+        """Return (RRMSD² or `picture_error`, penalty, fraction lost, RRMSD of the scaled picture) of goal k."""
         channels, sheets, target = self.light.channels, self.light.sheets, self.targets[k]
         image, penalty = self.picture(k, landed)
         if self.blur_errors:
@@ -289,8 +292,9 @@ class SobolevVariable:
 class CoarseVariable:
     """Heights h (m, n) in mm of a net as a function of the variable c of a coarser net: h = P h'(c) Q^T.
 
-    P (m, m') and Q (n, n') insert knots, so that h is the same spline on the finer net.  (The long cosines of the finer
-    net have zero slope at its rim, so a slope at the rim would need ripples all over the net.)
+    P (m, m') and Q (n, n') insert knots, so that h is the same spline on the finer net.  (A cosine has zero slope at
+    the rim.  With the cosines of the finer net, a slope of the surface at the rim would need many of them, which ripple
+    all over the net; the few cosines of the coarser net ripple less.)
     """
 
     coarse: SobolevVariable  # variable of the coarser net
@@ -326,7 +330,8 @@ def local_weight(source: Emitter, lens: Lens, goal: Goal, number: int | None = N
     """Return the weight w = (E / mean E)^-1/2 at each control point (m, n), smoothed and clamped.
 
     E is the irradiance of the target where light from the control point lands; before smoothing, w = 1 for light that
-    misses the screen.  number: index of the freeform interface in the lens; None: the back.
+    misses the screen.  On the last net, if light leaves the glass there, the weight is divided by a large throw.
+    number: index of the freeform interface in the lens; None: the back.
     """
     number, screen = lens.number_of("back") if number is None else number, goal.receiver
     net, onwards = lens.interfaces[number].net, lens.unbounded().interfaces[number:]

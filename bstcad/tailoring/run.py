@@ -1,7 +1,7 @@
 """The task of a design, the steps that its stages yield, and the driver that runs the stages.
 
-A stage is an iterator of steps, independent of time.  The driver runs the steps, measures time, saves states, reports
-progress, and stops when there is a reason to end.
+A stage is an iterator of steps, and does not read the clock.  The driver runs the steps, measures time, saves states,
+reports progress, and stops when there is a reason to end.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class Task:
     goals: tuple[Goal, ...]  # targets; stage 1 with one freeform face uses only the first
     knobs: ResolvedTailoring  # settings of the scene's [tailoring]
     min_thickness: float = 0.0  # minimum thickness of the glass everywhere (mm)
-    free: tuple[str, ...] = ()  # names of the parameters of the front that are optimised
+    free: tuple[str, ...] = ()  # names of the parameters of the front that stage 1 optimises
     rim_sags: tuple[float, float] = (-math.inf, math.inf)  # range of the front's sag at the rim (mm)
     progress: Progress = no_progress  # receives the progress within a step
     tidy: Callable[[], None] = lambda: None  # returns freed memory to the system between large allocations
@@ -119,7 +119,7 @@ class Task:
     bounds: Bounds | None = None  # bounds on the shape of the tailored faces; None: no bounds
     extended_sources: tuple[ExtendedSource, ...] = ()  # source at each size of stage 3, for its blur
     edge: Edge | None = None  # light at the edge of a target cut to its reachable part; None: not cut
-    # function of a picture and the target, (rows, columns) and of sum <= 1, that stage 2 minimises; None: RRMSD²
+    # error of a picture relative to the target, (rows, columns) and of sum <= 1, in the merit; None: RRMSD²
     merit: Callable[[Tensor, Tensor], Tensor] | None = None
     wave: Wave | None = None  # required wavefront behind the lens; None: no wavefront goal
     preview: bool = False  # preview: one round per stage, no RRMSD by rays, no costly alternative
@@ -202,7 +202,9 @@ class Task:
 class StageStep:
     """State of a stage after one of its steps; the driver decides whether the stage goes on."""
 
-    make: Callable[[], Lens] | None  # function that returns the best lens so far; None: there is no lens yet
+    make: (
+        Callable[[], Lens] | None
+    )  # returns the lens of this round or, in stage 2, the best of this search; None: no lens yet
     state: Any = None  # record from which the stage can resume here; None: it cannot
     mapping: Mapping | None = None  # transport map that the lens follows (stage 1)
     # x and y (mm), each (columns + 1, rows + 1), of the points of the last tailored face that light the corners of the
@@ -305,7 +307,7 @@ class Driver:
 
     @property
     def reason_to_interrupt(self) -> str:
-        """Reason to end a stage that has no time limit: "interrupt" or "" (none)."""
+        """Reason to end a stage to which the time limit does not apply (stage 1): "interrupt" or "" (none)."""
         return "interrupt" if self.hooks.interrupted() else ""
 
     def run(

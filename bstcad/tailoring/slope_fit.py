@@ -33,8 +33,8 @@ DEPENDENCE_TOLERANCE = 1e-12  # fraction of a monomial's squared slopes that is 
 class Fit:
     """Settings of a slope fit."""
 
-    # weight of the bending energy (spacing · curvature)² of the change of the surface, relative to slope²; this energy
-    # determines the surface where no ray falls
+    # weight of the bending energy (spacing · curvature)² of the change of the surface, relative to slope²; if unlit
+    # is 0, this energy determines the surface where no ray falls
     bending: float = 1e-4
     steps: int = 8  # number of conjugate-gradient steps
     degree: int = 0  # degree of a polynomial that is fitted first and extrapolates where no ray falls; 0: no polynomial
@@ -44,10 +44,11 @@ class Fit:
 def fit_slopes(
     surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: Tensor, weight: Tensor, fit: Fit = Fit()
 ) -> BSplineSurface:
-    """Return the surface that minimises Σ w |∇h(x, y) - (z_x, z_y)|² / Σ w plus a bending energy of its change.
+    """Return the surface after `fit.steps` steps that minimise Σ w |∇h - (z_x, z_y)|² / Σ w plus a bending energy.
 
-    The change is relative to the given surface plus the polynomial of the fit, and is found by conjugate gradients from
-    zero, in the variable of `Spectrum`.  x, y (mm), the slopes z_x, z_y and the weights are (n,).
+    The bending energy is that of the change relative to the given surface plus the polynomial of the fit.  Conjugate
+    gradients start from no change, in the variable of `Spectrum`.  x, y (mm), the slopes z_x, z_y and the weights are
+    (n,).
     """
     pitch_x, pitch_y = surface.pitch
     u, v = surface.along_net(x, y)

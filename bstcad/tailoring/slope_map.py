@@ -8,13 +8,13 @@ form.  With the centroid m of the light on the target, the coordinate
 
     y = σ (p(b, t) - ∇g(b)),    ∇g(b) ≈ p(b, m)
 
-hardly depends on b for a fixed t; g is nearly the surface that focuses all light on m.  The optimal transport map
-b -> y is ∇φ of a convex φ, so that σ y + ∇g are the slopes of a surface.  σ = 1 where light leaves the glass.  Mirrors,
-and faces where light enters the glass, deflect light against their slope: there σ = -1, so that rays of neighbouring
-points do not cross.  If there are surfaces behind the net, light is aimed at the image of the target through them
-(optics/unfolding.py).  The remaining dependence on b, of the order of t - m, enters through the b that the previous
-round assigned to each t.  At the fixed point the surface solves the Monge-Ampère problem of the system for any g, also
-off axis, in the near field and behind a curved front.
+hardly depends on b for a fixed t; g is nearly the surface that focuses all light on m.  The optimal transport map b ->
+y is ∇φ of a convex φ, so that σ y + ∇g are the slopes of a surface.  σ = 1 where light leaves the glass.  Mirrors, and
+faces where light enters the glass, deflect light against their slope: there σ = -1, so that rays of neighbouring points
+do not cross.  If there are surfaces behind the net, light is aimed at the image of the target through them
+(optics/unfolding.py).  y still depends on b a little, by the order of t - m.  Therefore each round computes y(t) at the
+b(t) of the previous round, and the rounds are a fixed-point iteration.  At the fixed point the surface solves the
+Monge-Ampère problem of the system for any g, also off axis, in the near field and behind a curved front.
 
 `map_to_target` and `aim_points` are the map of the paper, from the vertex plane of the front to the target, and the aim
 of each ray.  Stage 1 falls back on this map, and the baselines use it.
@@ -222,7 +222,7 @@ def gathering(
 ) -> BSplineSurface:
     """Return g, the net of GATHERING_NET points per side whose slopes fit p(b, m) best over the lit part of a grid.
 
-    For a fixed sag, p(b, m) is a gradient except for a curl of the order of ∂p/∂z x y.
+    For a fixed sag, p(b, m) is a gradient except for a curl of the order of x y |∂p/∂z|.
     """
     count, fit = (PREVIEW_SAMPLES, PREVIEW_FIT) if preview else (GATHERING_SAMPLES, GATHERING_FIT)
     few, law = grid.thinned(count), lens.last_freeform.law

@@ -45,7 +45,7 @@ IMAGE_PAIRS = 256  # pairs of source points that represent an image
 PIXEL_PARTS = 5  # parts of a pixel per axis in the images; odd
 ERROR_RAYS = 1448  # rays per side in each of the two sets that measure the error of the blur
 ERROR_POINTS = 256  # source points in each of the two sets
-ERROR_SMOOTHING = 0.15  # standard deviation of the smoothing of the blur error, in radii of the image
+ERROR_SMOOTHING = 0.15  # standard deviation of the smoothing of the blur error, relative to the border - 2 pixels
 MAX_TRANSFORM_BYTES, VALUE_BYTES = 2 << 30, 8  # largest size of the transforms of all images, size of one value (bytes)
 MIN_BORDER = 16  # smallest border around the screen (pixels)
 ERROR_SEED_OFFSET = 500_009  # offset of the seed, so that these rays are independent of the rays of the verification
@@ -179,7 +179,7 @@ def widest(screen: Screen, lines: int) -> int:
 
 
 def _operator(images: Sequence[tuple[Tensor, Tensor]], screen: Screen, border: int) -> BlurOperator:
-    """Make B from the image at each node, as dots: offset (2, dots) in pixels, flux (dots,) relative to the centre.
+    """Make B from the image at each node, as points: offset (2, n) in pixels, flux (n,) relative to the centre.
 
     A hat function distributes each dot over parts of a pixel, PIXEL_PARTS per axis, a negligible blur.
     """

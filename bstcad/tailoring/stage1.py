@@ -4,10 +4,11 @@ In Wang et al. 2023 the optimal transport map φ carries points S_i of the sourc
 target, and the surface minimises Σ |P_i^t - P_i|² (Eq. 14), where rays through S_i land at P_i.  Here each round solves
 the transport problem from points of the face to the slopes that send their light to the target (slope_map.py), and fits
 the surface to these slopes by linear least squares (slope_fit.py).  The next round starts from the sag and the map of
-this round; the last rounds use finer grids and nets.  If the result is poor, the map and the merit of the paper are
-tried too (`follow_aims`).
+this round; the last rounds use finer grids and nets.  If the result is poor, the map of the paper is tried too, with
+slope fits to its fixed target points (`follow_aims`).
 
-Free parameters of the front (curvature, conic constant) are optimised first, each candidate with its best back.
+Free parameters of the front (curvature, conic constant) are optimised before the first round; for each candidate the
+back is fitted to the same target points.
 """
 
 from __future__ import annotations
@@ -43,19 +44,20 @@ from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Mapping, Points, Solver
 
 COARSE_FACE_FIT = Fit(bending=1e-2, steps=40, degree=3)  # fit of coarse rounds: stiff, extrapolates into the dark
-FINE_FACE_FIT = Fit(unlit=1e-2)  # fit of fine rounds: points without light keep the coarse slopes
+FINE_FACE_FIT = Fit(unlit=1e-2)  # fit of fine rounds: weak fit to the previous slopes where no light falls
 FINE_ROUNDS = 2  # number of fine rounds: the first has half the cells per side of the last
-# RRMSD, and RMS change of the map in the last round in half widths of the face, above which `follow_aims` is tried.
-# Where more rounds gain nothing, the change is at most 0.016.
+# RRMSD, and RMS change of the map in the last round, above which `follow_aims` is tried.  The unit of the change is
+# half a side of the square around the light (`slope_map.square_grid`).  Where more rounds gain nothing, the change is
+# at most 0.016.
 RETRY_RRMSD, RETRY_CHANGE = 0.25, 0.025
-SETTLED_CHANGE = 0.01  # RMS change of the map, in half widths of the face, below which the coarse rounds end
-MAX_RAY_CELLS = 1026  # largest number of grid cells per side in the slope fit; larger grids fit several points per cell
+SETTLED_CHANGE = 0.01  # RMS change of the map, in the same unit, below which the coarse rounds end
+MAX_RAY_CELLS = 1026  # largest number of rays per side in the slope fit; a finer grid interpolates between rays
 MIN_FLUX_RATIO = 0.9  # smallest accepted flux on the target after `follow_aims`, relative to the flux after the rounds
 AIM_ROUNDS = 5  # number of rounds of `follow_aims`
 SCALAR_EVALUATIONS = 8  # evaluations of the merit in the search for one parameter of the front
 SIMPLEX_EVALUATIONS = 40  # evaluations of the merit in the search for curvature and conic constant together
 MAX_RIM_SINE = 0.5  # sine of the largest slope angle of the front at the rim
-MAX_ELLIPSE, MAX_HYPERBOLA = 0.8, 6.0  # largest (1 + k) c² r² and -(1 + k) c² r² at the rim, below limits of scenes
+MAX_ELLIPSE, MAX_HYPERBOLA = 0.8, 6.0  # largest (1 + k) c² r² and -(1 + k) c² r² at the rim in the search
 UNBOUNDED = (-math.inf, math.inf)
 
 Range = tuple[float, float]
@@ -66,7 +68,7 @@ FrontMerit = Callable[[Lens], float]
 class SlopeRound:
     """State of stage 1 between two rounds."""
 
-    round: int  # number of rounds done
+    round: int  # number of the next round, from 0; skipped rounds count
     lens: Parameters
     slopes: SlopeMap  # map of the last round
 
@@ -86,7 +88,8 @@ PREVIEW_NET, PREVIEW_SEARCH = 17, FrontSearch(cells=32, iterations=40, repeats=1
 def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
     """Yield the steps of stage 1 from a blank, or from a saved state.
 
-    The rounds come first (`follow_slopes`), then `follow_aims` if their result is poor (`is_poor_result`).
+    The rounds come first (`follow_slopes`), then `follow_aims` if their result is poor (`is_poor_result`).  Its lens
+    is used if its RRMSD is smaller and it keeps MIN_FLUX_RATIO of the flux on the target.
     """
     lens = task.heaviest.through(lens)
     if state is None and task.free:
@@ -178,9 +181,9 @@ def _round(task: Task, lens: Lens, previous: SlopeMap | None, turn: int) -> tupl
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     """Return the lens fitted to the map of the paper, from the front to target points, and this map.
 
-    A ray keeps its aim while the sag changes.  So these slope fits converge even if the slopes needed at fixed points
-    of the back depend strongly on the sag: in strong lenses near the source, and in glass of low index.  The part of
-    the map that is not a gradient is lost.
+    The face is fitted to slopes, while the paper minimises |P_i^t - P_i|².  A ray keeps its aim while the sag changes.
+    So these slope fits converge even if the slopes needed at fixed points of the back depend strongly on the sag: in
+    strong lenses near the source, and in glass of low index.  The part of the map that is not a gradient is lost.
     """
     knobs, goal, z = task.knobs, task.goals[0], lens.back.z
     for turn in range(AIM_ROUNDS):

@@ -1,7 +1,8 @@
 """Stages 2 and 3: minimise the error of the traced irradiance, starting from the surface of stage 1.
 
-As in Wang et al. 2023, the merit function of stage 2 is the relative root mean square difference between the target
-irradiance E and the traced irradiance E^s, pixel by pixel (squared, with penalties; merit.py):
+Stage 2 minimises RRMSD² plus penalties on light beside the target and lost light (merit.py), on violated bounds
+(machinability.py) and on total internal reflection (grazing.py).  As in Wang et al. 2023, the RRMSD is the relative
+root mean square difference between the target irradiance E and the traced irradiance E^s over all pixels:
 
     RRMSD = sqrt(Σ_ij |E^s_ij - E_ij|² / Σ_ij E_ij²).
 
@@ -12,7 +13,8 @@ Adam on the heights needs thousands.  A stage consists of rounds with an increas
 
 For a source of finite size, stage 3 replaces stage 2 and also starts from the surface of stage 1.  It traces the light
 of the centre of the source and blurs the picture by the image of the source (source_image.py), in rounds of increasing
-source size.  Only the paper's procedure (baselines/paper.py) first runs its stage 2 for the centre of the source.
+source size; coarse rounds for the centre alone may precede.  The paper's procedure (baselines/paper.py) is an
+exception: it runs stage 2 for the centre of the source, and then stage 3.
 """
 
 from __future__ import annotations
@@ -44,24 +46,27 @@ from bstcad.tailoring.source_image import ExtendedSource
 
 RoundFractions = tuple[tuple[float, float], ...]  # (tubes per side, evaluations) of rounds, relative to the settings
 DENSE_ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # rounds if the last has at least DENSE_TUBES tubes
-# Rounds if the last one has fewer than DENSE_TUBES tubes per control cell along each axis.  The first rounds then
-# distort the net between the tubes, and the last one has to correct this.  (1025 control points, two tubes per cell:
-# the portrait ends at an RRMSD of 0.018, and at 0.020 with DENSE_ROUNDS in the same time.)
+# Rounds if the last one has fewer than DENSE_TUBES tubes per cell of the control net along each axis.  The first rounds
+# then distort the net between the tubes, and the last one has to correct this.  (1025 control points, two tubes per
+# cell: the portrait ends at an RRMSD of 0.018, and at 0.020 with DENSE_ROUNDS in the same time.)
 SPARSE_ROUNDS, DENSE_TUBES = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
 # Rounds for a picture and a wavefront: two nets can distort between the tubes, and so need more of them.
 WAVEFRONT_ROUNDS = ((2 / 3, 0.45), (1.0, 0.35), (4 / 3, 0.2))
 # Rounds for several pictures, and the number of control points per side above which the evaluations are proportional to
-# it: the Hessian in the Sobolev variable then still contains a power of the Laplacian.  (Letters before a portrait, 769
-# points per side: RRMSD 0.057 and 0.062 after 196 evaluations in three rounds, 0.047 and 0.057 after 309 in these two.)
+# it: with LAPLACIAN_POWER = 0.5, the Hessian in the Sobolev variable still contains a power of the Laplacian.  (Letters
+# before a portrait, 769 points per side: RRMSD 0.057 and 0.062 after 196 evaluations in three rounds, 0.047 and 0.057
+# after 309 in these two.)
 PICTURES_ROUNDS, PICTURES_SIDE = ((2 / 3, 1.4), (4 / 3, 0.7)), 513
-# Coarse rounds: (pixels along the longer side, tubes per side, evaluations).  They precede the fine rounds if
-# light has to move far: if the RRMSD exceeds FAR_OFF_RRMSD on LARGE_PIXELS pixels along the longer side, which any net
-# resolves.  The second coarse round is repeated after the first fine round, if other fine rounds follow.
+# Coarse rounds: (pixels along the longer side, tubes per side, evaluations).  They precede the fine rounds if light has
+# to move far: if the RRMSD exceeds FAR_OFF_RRMSD on LARGE_PIXELS pixels along the longer side.  Any net resolves so few
+# pixels, so such an error means that light is in the wrong place.  The second coarse round is repeated after the first
+# fine round, if other fine rounds follow.
 COARSE_ROUNDS = ((32, 256, 60), (64, 384, 60))
 LARGE_PIXELS, FAR_OFF_RRMSD = 16, 0.04
-# Factor of the evaluations of the fine rounds after coarse rounds, and this factor if there is a single fine round.  It
-# comes last, since a stage must not end with few pixels.  (Draft of a plate with at most 2 mm of glass: RRMSD 0.264
-# with a factor of 1.5, 0.236 with 3, but 0.408 if 60 evaluations on 64 pixels come last.)
+# Factor of the evaluations of the fine rounds after coarse rounds, and this factor if there is a single fine round,
+# since the coarse round cannot be repeated before it: a stage must not end with few pixels.  (Draft of a plate with at
+# most 2 mm of glass: RRMSD 0.264 with a factor of 1.5, 0.236 with 3, but 0.408 if 60 evaluations on 64 pixels come
+# last.)
 EVALUATION_FACTOR, SINGLE_ROUND_FACTOR = 1.5, 3.0
 IMAGE_POSITIONS, SECOND_MOMENT_POINTS = 16, 8  # rays per side and source points that give the source image's width
 MIN_EVALUATIONS = 30  # evaluations below which a stage has a single round: each round has to start anew
@@ -78,7 +83,7 @@ TUBES_PER_CELL, TUBES_PER_PIXEL = 2.0, 1.1  # tubes of stage 3 per control cell 
 class TubeRound:
     """Light, tubes and evaluations of one round of stage 2 or 3."""
 
-    task: Task  # task whose channels are the light of this round
+    task: Task  # task; its channels sample the whole source
     tubes: int  # tubes per side in the sheet of each channel
     evaluations: int  # largest number of evaluations
     stage: str = "stage 2"  # name of the stage
@@ -88,7 +93,7 @@ class TubeRound:
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """Light that the tubes carry; for a source of finite size, the light of its centre."""
+        """Channels that are traced; for a source of finite size, those of its centre."""
         return self.task.channels if self.source is None else self.source.centre
 
     @property
@@ -142,7 +147,7 @@ class SearchPosition:
     round: int  # number of the round, from 0
     done: int  # evaluations of the stage before this search
     round_end: int  # evaluations of the stage at the end of this round
-    goal_by_tubes: float  # RRMSD by tubes below which rays check whether the accuracy is reached
+    goal_by_tubes: float  # RRMSD with tubes at which the search stops for a check with rays; lowered if rays disagree
     sheet_from: Parameters  # lens for which the tubes were launched
     search_from: Parameters  # lens from which this search started
 
@@ -169,10 +174,11 @@ def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Steps:
 
 
 def coarse_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
-    """Return rounds with few pixels, tubes and control points, or () if the lens after stage 1 is close to its target.
+    """Return rounds with few pixels, tubes and control points; () if the light is nearly in place or for several goals.
 
     If the map has not settled, as for a lamp or a wall close to the lens, light has to move far.  This needs many
-    evaluations, but each takes a thirtieth of the time, and the tubes need not resolve the cells of the full net.
+    evaluations, but each takes a thirtieth of the time of a full one, and the tubes need not resolve the cells of the
+    full net.
     """
     limit = min(max(task.goals[0].receiver.shape) - 1, task.knobs.side // 2)  # pixels that the net can resolve
     rounds = [TubeRound(task, tubes, count, pixels=pixels) for pixels, tubes, count in COARSE_ROUNDS if pixels <= limit]
@@ -212,7 +218,7 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
     """Yield the steps of a stage, round by round, from its start or from a saved state.
 
     The stage ends when its evaluations are used up, on a plateau of the last round, or when the RRMSD by rays
-    (`Task.rrmsd`) reaches tailoring.accuracy with the light of the last round.
+    (`Task.rrmsd`) reaches tailoring.accuracy with the source at its full size.
     """
     accuracy, given = rounds[0].task.knobs.accuracy or 0.0, Parameters.of(lens)  # 0: no accuracy is required
     first = SearchPosition(0, 0, 0, accuracy, sheet_from=given, search_from=given)

@@ -1,4 +1,6 @@
-"""Stage 1 of a lens with two freeform faces: the front sends the light to points of the back, which deflects it.
+"""Stage 1 of a lens with two freeform faces: the front sends each ray to a prescribed point of the back.
+
+The back deflects the ray into its prescribed direction.
 
 The rays behind the lens are known (light_behind.py): the ray through a point t of a target, traced backwards, meets the
 back at b(t).  The front has to send the light of t to b(t).  This is a transport problem in slope coordinates as in
@@ -75,7 +77,7 @@ def steps(task: Task, lens: Lens, state: stage1.SlopeRound | None = None) -> Ste
 
 
 def follow_rays(task: Task, lens: Lens, state: FrontRound | None) -> Steps:
-    """Yield a step per round; all except the last FINE_PAIR_ROUNDS are coarse, and end once the map has settled."""
+    """Yield a step per round: coarse rounds until the map has settled, then FINE_PAIR_ROUNDS fine ones."""
     task = task.with_imaged_receivers(lens)
     knobs, z = task.knobs, lens.back.z
     near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
