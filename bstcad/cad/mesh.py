@@ -161,8 +161,8 @@ def _has_plane_front(lens: Lens) -> bool:
 def fit_mesh(lens: Lens, tolerance: float, max_triangles: int | None = None) -> tuple[int, Mesh]:
     """Return nearly the smallest number of cells per side that meets a chordal tolerance (mm), and the mesh.
 
-    If `max_triangles` (default DEFAULT_MAX_TRIANGLES) do not suffice, the finest mesh of at most DEFAULT_MAX_TRIANGLES
-    is returned, or of at most `max_triangles` if this number is smaller.
+    If `max_triangles` (default DEFAULT_MAX_TRIANGLES) do not suffice, the finest mesh of at most that many triangles is
+    returned, but of at most DEFAULT_MAX_TRIANGLES.
     """
     allowed = DEFAULT_MAX_TRIANGLES if max_triangles is None else max_triangles
     cells, last, goal = MIN_MESH_CELLS, max_cells(lens, allowed), chordal_error_goal(lens, tolerance)

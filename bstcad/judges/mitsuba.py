@@ -2,13 +2,11 @@
 
 Mitsuba's particle tracer sends photons from the source, reflects or transmits each at random (Fresnel reflectance), and
 images a matt screen through a pinhole.  Therefore the light has photon noise, and the losses of uncoated faces even if
-the scene requests none.  Mirrors are lossless.
+the scene requests none.  Mirrors are lossless.  With a library of LLVM 16 or later, Mitsuba is several times faster.
 
 The wall of the lens and a plate around its front stop the light that bstcad counts as lost: through the sides, and past
 the lens.  A parallel beam starts from a plate of the aperture's shape with normals along the beam; a cone of uniform
 radiant intensity is a spot; any other point source is a projector, whose slide is its irradiance over the lens.
-
-With a shared library of LLVM 16 or later, which is optional, Mitsuba is several times faster.
 """
 
 from __future__ import annotations

@@ -104,7 +104,7 @@ def _largest_difference(read: np.ndarray, designed: np.ndarray, name: str) -> tu
 def measure_checks(
     stated: ValidationProperties, shape: MassProperties | None, outline: Outline, name: str = SOURCE
 ) -> Iterator[Check]:
-    """Check the stated properties against those of the shape (None if none are stated); outline: of the lens."""
+    """Check the stated properties against the shape's (None: none stated); outline: scales the centroid's tolerance."""
     if stated.of_shape:
         assert shape is not None
         measures = ("area", "mm²", stated.areas, shape.area), ("volume", "mm³", stated.volumes, shape.volume)
