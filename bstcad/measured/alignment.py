@@ -271,7 +271,7 @@ def _neighbour_planes(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compare some points with the planes through their neighbours, fitted with Cauchy weights.
 
-    Return each point's distance from its plane, the neighbours' spread about it (mm), and how many are equally far.
+    Return each point's distance from its plane, the neighbours' spread about it (mm), and how many are similarly far.
     """
     positions = tree.data[part]
     _, near = tree.query(positions, NEIGHBOURS + 1)
