@@ -68,7 +68,7 @@ class Preview:
 
     scene: Scene  # reduced scene
     lens: Lens
-    pictures: tuple[tuple[np.ndarray, np.ndarray], ...]  # (target, irradiance) per target, both (rows, columns)
+    pictures: tuple[tuple[np.ndarray, np.ndarray], ...]  # (target, irradiance) per target, each (rows, columns)
     flux: dict[str, float]  # ledger of the light: fractions that sum to 1
     shape: dict[str, float | None]  # shape of the lens, by the keys of report.json
     source_images: tuple[Blur | None, ...]  # image of the source on each target; None for a point

@@ -43,7 +43,7 @@ MAX_CORNERS = 5_000_000  # largest number of corners of a mesh
 MAX_FACET_SHIFT = 0.007  # largest shift of light by facets (RMS, pixels); 0.02 changes a picture by 0.8 %
 TEXELS = 1024  # number of texels of a slide along each side
 TEXEL_CENTRES = (2 * np.arange(TEXELS) + 1) / TEXELS - 1  # centres of texels, from -1 to 1
-FIELD_MARGIN = 1.01  # ratio of a projector's field to that of the lens
+FIELD_MARGIN = 1.01  # ratio of a projector's field to the field that the lens covers
 SPOT_EDGE = 1e-5  # width of a spot's edge, relative to its cone
 PROJECTOR_FLUX = math.pi  # ratio of the flux of Mitsuba's projector to the irradiance of its slide
 
