@@ -51,7 +51,7 @@ def test_a_run_whose_process_was_killed_is_stopped_and_can_be_gone_on_with(tmp_p
     run.folder.mkdir(parents=True)
     State("running", process=2**22 + 1).put(run.folder)
     assert run.state.state == "stopped" and run.state.sentence == design_runs.PROCESS_LOST
-    with pytest.raises(ValueError, match="start a new one"):
+    with pytest.raises(ValueError, match="start a new run"):
         run.go_on()
 
 
