@@ -1,4 +1,4 @@
-"""Designs for scripts and notebooks: made from a scene or opened from a folder, then verified and written.
+"""Designs for scripts and notebooks: made from a scene or opened from a folder, then written and verified.
 
 design = bstcad.design("templates/thu.toml")
 report = design.write("outputs/thu")
@@ -45,7 +45,7 @@ from bstcad.tailoring.merit import PictureError
 from bstcad.tailoring.run import Hooks
 from bstcad.transport.mapping import TransportMap
 
-RELATIVE_TOLERANCE = 1e-9  # relative difference of equal indices; difference of equal ends of nets, in net widths
+RELATIVE_TOLERANCE = 1e-9  # largest relative difference of equal indices, and of ends of equal nets in net widths
 PREVIEW_TUBES = 521  # flux tubes per side for a picture that is not verified
 AnyPath = str | os.PathLike[str]  # path of a file or of a folder
 
@@ -53,11 +53,11 @@ AnyPath = str | os.PathLike[str]  # path of a file or of a folder
 def design(
     scene: Scene | AnyPath, *, progress: bool = True, device: str = "auto", merit: PictureError | None = None
 ) -> Design:
-    """Design the lens for a scene or for a scene file.  SceneError names the fault of a scene.
+    """Design the lens for a scene or a scene file.  SceneError states the fault of an invalid scene.
 
-    progress: show a bar in a terminal or a notebook.  device: "auto", "cpu" or "cuda" (see pipeline.device_for).
-    merit: function of the picture and the target, tensors (rows, columns) of flux, that stage 2 minimises in place of
-    RRMSD².  It must be differentiable and of the magnitude of RRMSD².  The verification still states RRMSD.
+    progress: show a progress bar in a terminal or notebook.  device: "auto", "cpu" or "cuda" (pipeline.device_for).
+    merit: function of picture and target, tensors (rows, columns) of flux, that stage 2 minimises instead of RRMSD².
+    It must be differentiable and of the magnitude of RRMSD².  The verification still reports the RRMSD.
 
     On Linux the process keeps up to 2 GB of freed memory for its next design (bstcad.runs.processes.keep_freed).
     """
@@ -73,14 +73,14 @@ def design(
 
 
 def open(folder: AnyPath) -> Design:
-    """Open the design in a folder that `Design.write` or `bstcad generate` wrote, exact from its files; SceneError."""
+    """Read the exact design from a folder of `Design.write` or `bstcad generate`.  SceneError if it cannot be read."""
     folder = Path(folder).expanduser()
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder; give a design's folder, such as outputs/thu")
     made = commands.read(folder)
     try:
         contents = record.read(folder / "report.json")
-    except ValueError:  # missing or damaged; verify writes it again
+    except ValueError:  # report.json is missing or damaged; verify writes it again
         return Design(made, None, folder)
     return Design(made, Report(contents, folders.read_irradiances(folder, made.scene)), folder)
 
@@ -88,13 +88,13 @@ def open(folder: AnyPath) -> Design:
 class Design:
     """A lens, its scene, and the report of its verification.
 
-    A design remembers the folder to which it was last written, whose files `verify` reads.
+    `verify` reads the files of the folder to which the design was last written.
     """
 
     def __init__(self, made: Made, report: Report | None = None, folder: Path | None = None) -> None:
         self._made = made
         self.report = report  # report of the last verification; None: not verified yet
-        self.folder = folder  # folder of its files; None: not written yet
+        self.folder = folder  # folder of the design's files; None: not written yet
 
     @property
     def scene(self) -> Scene:
@@ -103,31 +103,31 @@ class Design:
 
     @property
     def lens(self) -> Lens:
-        """Lens with both faces, outline and index; lens.back.control_points() is (m, n, 3) in mm."""
+        """Lens with front, back, outline and index; lens.back.control_points() is (m, n, 3) in mm."""
         return self._made.lens
 
     @property
     def target(self) -> np.ndarray:
-        """Required flux per pixel of target[0], (rows, columns) of sum 1; row 0 is y max, column 0 is x min."""
+        """Required flux per pixel of target[0], (rows, columns), sum 1; row 0 is y max, column 0 is x min."""
         return self._made.goals[0].picture
 
     @property
     def transport(self) -> TransportMap | None:
-        """Transport map of stage 1: points of the target, and the points of the face from which their light comes (mm).
+        """Transport map of stage 1: points of the target, and the points of the face that send light to them (mm).
 
         None for your own lens (with_lens, with_heights) and for a folder of an earlier version.  With several spectral
-        lines it is the map of the line with most light; for an extended source it is that of a point source.
+        lines, the map of the line with most light; for an extended source, the map for its centre.
         """
         return self._made.transport
 
     def with_lens(self, lens: Lens) -> Design:
         """Return a design with another lens for the same source and target, to verify and to write.
 
-        lens: has the outline and the index (at the main wavelength) of the scene, is a mirror if the scene has one, and
-        has a net as wide as the scene's with the same number of points; it is converted to float64 on the CPU.  A
-        different front or number of control points goes into the scene of the new design; losses remain those of the
-        scene's [[effects]].  The new design has no stages, no history and no transport map, and its report states
-        "changed by hand".  SceneError names the property of a lens that does not fit.
+        lens: must have the outline and the index (at the main wavelength) of the scene, be a mirror if the scene has a
+        mirror, and have a net as wide as the net of the scene; it is converted to float64 on the CPU.  A different
+        front or number of control points is stored in the scene of the new design; losses remain those of [[effects]].
+        The new design has no stages, history or transport map, and its report states "changed by hand".  SceneError
+        names the property of a lens that does not fit.
         """
         scene, lens = _adapted(lens, self._made.scene, self.lens.front)
         made = replace(self._made, scene=scene, lens=scene.as_mounted(lens), making=DesignCourse(stopped=BY_HAND))
@@ -136,8 +136,8 @@ class Design:
     def with_heights(self, heights: Any) -> Design:
         """Return a design with other control heights of the back.
 
-        heights: (m, n) in mm, a numpy array or a tensor, x along the first axis, y along the second, in the order of
-        lens.back.heights and relative to z = lens.back.z, like these.
+        heights: (m, n) in mm, a numpy array or a tensor, with x along the first axis and y along the second; relative
+        to z = lens.back.z, as lens.back.heights.
         """
         try:
             found = np.asarray(heights.detach().cpu() if isinstance(heights, torch.Tensor) else heights)
@@ -159,11 +159,11 @@ class Design:
     ) -> Any:
         """Return the exact solid, a cadquery.Solid for Workplane chains and assemblies.
 
-        trim: closed plane cadquery.Wire inside the lens to which it is cut; its x and y are used.  holes: such wires,
-        or (x, y, diameter) in mm.  Walls are along z.  The faces of the design are not changed, only their boundaries,
-        which takes a second; a boolean with a large net takes half a minute.  body: cadquery solid, such as a flange,
-        that is joined to the lens, see bstcad.mounted.  draft: draft angle of the walls around the lens in degrees,
-        from 0.1 mm below the back's rim, or from the body, inwards to the front.  bevel: height along z in mm of a
+        trim: closed plane cadquery.Wire inside the lens, to which the lens is cut; the z of the wire is ignored.
+        holes: such wires, or (x, y, diameter) in mm.  Walls are along z.  Only the boundaries of the designed faces
+        change, which takes a second; a boolean with a large net takes half a minute.  body: cadquery solid, such as a
+        flange, that is joined to the lens, see bstcad.mounted.  draft: draft angle (degrees) of the walls around the
+        lens, from 0.1 mm below the back's rim, or from the body, inwards to the front.  bevel: height along z (mm) of a
         bevel at 45 degrees on the edge between walls and front.  SceneError if a wire is open, crosses itself or
         another wire, or leaves the lens, if the body does not fit, or if walls would meet.
         """
@@ -175,8 +175,8 @@ class Design:
     ) -> Path:  # fmt: skip
         """Write the `solid` of these arguments as STEP, with named faces and the scene's [part]; return the path.
 
-        All digits of the control points are written; cadquery's own export rounds them.  The file states area, volume
-        and centroid, unless the body has freeform faces, for which OCC would take minutes.
+        The control points are written with all digits, which cadquery's own export rounds.  The file states area,
+        volume and centroid, unless the body has freeform faces, for which OCC would take minutes.
         """
         from bstcad.cad import solid_properties, step_writing
 
@@ -199,19 +199,19 @@ class Design:
     def preview(self, control_points: int = 33) -> Any:
         """Return a coarse copy of the solid for viewers: CQ-editor's show_object, a notebook's cell.
 
-        It is a cadquery.Solid whose back has this number of control points along its longer side.  It is for display
-        only, not for manufacture.
+        control_points: number of control points along the longer side of its back.  The copy is a cadquery.Solid for
+        display only, not for manufacture.
         """
         from bstcad.cad.solid import coarse_copy, lens_solid
 
         if control_points < 17:
-            raise SceneError(f"control_points: {control_points} is too few for a preview; give 17 or more")
+            raise SceneError(f"control_points: {control_points} is too small for a preview; give 17 or more")
         return lens_solid(coarse_copy(self.lens, control_points))
 
     def part(self) -> Any:
         """Return the lens with the scene's [mount], in the frame of its datum, as in part.step.
 
-        It is a cadquery.Solid.  SceneError if the scene has no mount, or flange and lens do not fit.
+        Returns a cadquery.Solid.  SceneError if the scene has no mount, or flange and lens do not fit.
         """
         from bstcad.cad import mounting
 
@@ -223,8 +223,8 @@ class Design:
     def export(self, *kinds: str, points: int | None = None) -> list[Path]:
         """Write additional files, by names such as "zemax", into the folder of the design; return their paths.
 
-        points: number of points along the wider side of grids (default: that of the control points; for OpticStudio
-        that of the knots).  SceneError if a name is unknown or the design has not been written.
+        points: number of grid points along the wider side (default: number of control points; for OpticStudio, of
+        knots).  SceneError if a name is unknown or the design has not been written.
         """
         return commands.export(self._own_folder(), kinds, points).paths
 
@@ -232,17 +232,17 @@ class Design:
         self, folder: AnyPath, *, progress: bool = True, effort: Effort | None = None,
         checks: Sequence[OwnCheck] = (), sections: Sequence[OwnSection] = (),
     ) -> Report:  # fmt: skip
-        """Write the folder of `bstcad generate` in place of an earlier one, verify its files, and return the report.
+        """Write the folder as `bstcad generate` does, replace an earlier one, verify its files, and return the report.
 
-        checks: functions of the proof (bstcad.verify.checks.Proof: lens, light, shape …) and of the folder that return
-        bstcad.Check records, which become part of the verdict.  sections: functions of the report's record that return
-        a heading and HTML for report.html.  SceneError if the folder has anything but a design.
+        checks: functions of the verification's results (bstcad.verify.checks.Proof: lens, light, shape …) and of the
+        folder that return bstcad.Check records, which become part of the verdict.  sections: functions of the report's
+        record that return (heading, HTML) for report.html.  SceneError if the folder contains other files.
         """
         folder = Path(folder).expanduser()
         files.check_free(folder)
         folder.parent.mkdir(parents=True, exist_ok=True)
         with files.exclusive(folder), progresses.for_script(progress) as shown:
-            limit = self.scene.tailoring.max_time if self.report is None else None  # for a new design only
+            limit = self.scene.tailoring.max_time if self.report is None else None  # limit for a new design only
             self._made = self._made.with_report_data()
             options = ProofOptions(effort, checks=checks, sections=sections, limit=limit)
             self.report = commands.write(self._made, folder, options, shown)
@@ -254,12 +254,12 @@ class Design:
         against: Sequence[Any] = (), progress: bool = True, effort: Effort | None = None,
         checks: Sequence[OwnCheck] = (), sections: Sequence[OwnSection] = (),
     ) -> Report:  # fmt: skip
-        """Verify the design from its files and write its report again; a design without files uses temporary ones.
+        """Verify the design from its files and write its report again; without files, temporary files are used.
 
-        measured: file of points of a made part (CSV, PLY or STL; mm) that is verified too, see Report.measured.
-        folder: folder for the report, figures and deviation map only; the files of the design are not changed.
-        against: independent programs that trace the design too, "batoid" and "mitsuba", or your own judge
-        (bstcad.judges.comparison.OwnJudge).  All three need a design that was written.  checks, sections: see `write`.
+        measured: file of points of a made part (CSV, PLY or STL; mm), which is also verified, see Report.measured.
+        folder: folder for the report, figures and deviation map alone; the files of the design are not changed.
+        against: independent programs that also trace the design, "batoid" and "mitsuba", or your own judge
+        (bstcad.judges.comparison.OwnJudge).  All three need a written design.  checks, sections: see `write`.
         """
         options = ProofOptions(effort, checks=checks, sections=sections)
         cloud, place = (Path(path).expanduser() if path else None for path in (measured, folder))
@@ -282,8 +282,8 @@ class Design:
         """Study the tolerances of manufacture, mounting and source; write tolerance.json and return its entries.
 
         grade: "moulded", "diamond-turned" or "precise", for errors without a tolerance in the scene.  wanted: yield
-        (0 to 1) that the loosest tolerances must reach.  workers: number of processes for the traces; a script must
-        call with it below `if __name__ == "__main__":`.  scheduler: address of a dask cluster whose workers are used.
+        (0 to 1) for which the loosest tolerances are computed.  workers: number of processes for the traces; a script
+        that uses it needs `if __name__ == "__main__":`.  scheduler: address of a dask scheduler whose workers trace.
         """
         from bstcad.tolerance.study import StudySettings  # loaded late, as in commands.tolerance
 
@@ -293,18 +293,18 @@ class Design:
             return commands.tolerance(folder, settings, workers, scheduler).facts()
 
     def show(self, png: AnyPath | None = None) -> None:
-        """Draw the lens with rays and screen in a PNG file, or in a window until it is closed."""
+        """Draw the lens with rays and screen, in a PNG file or in a window; return once the window is closed."""
         commands.show(self._own_folder(), None if png is None else Path(png).expanduser())
 
     def picture(self, png: AnyPath | None = None, *, target: int = 0) -> np.ndarray:
         """Return the light on a target as a viewer at target.seen_from sees it: sRGB grey (rows, columns), uint8.
 
-        Each pixel of the target is a pixel of the picture; white is the end of the report's scale.  The light is that
-        of the verification, or of a trace with fewer flux tubes.  png: file to write.  target: its number, from 0.
+        Each pixel of the target is a pixel of the picture; white is the end of the report's scale.  The light is from
+        the verification, or before it from a trace with fewer flux tubes.  png: file to write.  target: index, from 0.
         """
         wanted = self._made.goals
         if not 0 <= target < len(wanted):
-            raise SceneError(f"target: there is no target[{target}], the last is target[{len(wanted) - 1}]; give one")
+            raise SceneError(f"target: there is no target[{target}]; give a number from 0 to {len(wanted) - 1}")
         view = View.of(self.scene, target)
         seen = view.picture(view.tones(self._irradiance(target), wanted[target].picture))
         grey = np.ascontiguousarray(seen)
@@ -313,14 +313,14 @@ class Design:
         return grey
 
     def _has_files(self) -> bool:
-        return self.folder is not None and (self.folder / "lens.step").exists()  # a folder may have the design only
+        return self.folder is not None and (self.folder / "lens.step").exists()  # it may contain only the design
 
     def _own_folder(self) -> Path:
         """Return the folder with the files of this design; SceneError if there is none."""
         if self.folder is None or not self._has_files():
-            raise SceneError(f"{self.scene.name}: the design has no files yet; write it to a folder first")
+            raise SceneError(f"{self.scene.name}: this design has no files yet; write it to a folder first")
         if not self._made.is_lens_of(folders.read_nominal(self.folder)[1]):
-            raise SceneError(f"{self.folder}: the folder has another design now; write this one to another folder")
+            raise SceneError(f"{self.folder}: the folder now contains another design; write this one elsewhere")
         return self.folder
 
     def __repr__(self) -> str:
@@ -328,7 +328,7 @@ class Design:
         return f"Design {self.scene.name!r}{title}\n  {self._dimensions()}\n  {self._quality()}"
 
     def _repr_html_(self) -> str:
-        """Return HTML for a notebook: the three lines of the text, each target and the irradiance on it."""
+        """Return HTML for a notebook: the text of `repr`, each target, and the irradiance on it."""
         lines = "<br>".join(html.escape(line.strip()) for line in repr(self).splitlines())
         shown = ""
         for k, goal in enumerate(self._made.goals):
@@ -358,7 +358,7 @@ class Design:
         return f"RRMSD {number(values[-1])} as tailored; not verified yet" if values else "not verified yet"
 
     def _irradiance(self, number: int = 0) -> np.ndarray:
-        """Return the flux per pixel of a target (rows, columns), scaled to the target's sum: verified, or a preview."""
+        """Return the flux per pixel on a target (rows, columns), verified or a preview, scaled to the target's sum."""
         if self.report is not None:
             return self.report.irradiances[number]
         goal = self._made.goals[number]
@@ -369,7 +369,7 @@ class Design:
 def _adapted(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
     """Return (scene, lens): the scene with the front and the net of a user's lens, and the lens in float64 on the CPU.
 
-    front: front of the current lens, with which the scene is not changed.  SceneError if the lens does not fit.
+    front: front of the current lens; with an equal front the scene is unchanged.  SceneError if the lens does not fit.
     """
     if not (isinstance(lens, Lens) and isinstance(getattr(lens.back, "heights", None), torch.Tensor)):
         given = type(lens.back if isinstance(lens, Lens) else lens).__name__
@@ -393,14 +393,14 @@ def _adapted(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
         lens = lens.with_front(_on_net(lens.front_net, flat.front_net, "front"))
     elif not same_front(lens.front, front):
         scene = scene.changed({"lens.front": lens.front})
-        lens = lens.with_front(scene.lens.front_surface)  # the scene fits a net to a user's surface
+        lens = lens.with_front(scene.lens.front_surface)  # the scene fits a net to a surface class of the user
     return scene, scene.assembled(replace(lens, back=back, index=scene.index))
 
 
 def _on_net(face: BSplineSurface, net: BSplineSurface, name: str) -> BSplineSurface:
-    """Return a face with the ends of the scene's net; SceneError for heights that are not finite, or another net."""
+    """Return a face with the exact ends of the scene's net; SceneError if heights are not finite or ends differ."""
     if not bool(torch.isfinite(face.heights).all()) or not math.isfinite(face.z):
-        raise SceneError(f"with_lens: heights of the {name} are not finite; give finite numbers in mm")
+        raise SceneError(f"with_lens: the {name} has heights that are not finite; give finite numbers in mm")
     for axis, own, theirs in (("x", face.x, net.x), ("y", face.y, net.y)):
         if not np.allclose(own, theirs, rtol=0, atol=RELATIVE_TOLERANCE * (theirs[1] - theirs[0])):
             _check_same(f"extent of the {name}'s net along {axis} (mm)", own, theirs)
@@ -409,19 +409,19 @@ def _on_net(face: BSplineSurface, net: BSplineSurface, name: str) -> BSplineSurf
 
 def _check_same(name: str, own: Any, theirs: Any) -> None:
     if own != theirs:
-        raise SceneError(f"with_lens: the {name} is {own}, and in the scene it is {theirs}; give that of the scene")
+        raise SceneError(f"with_lens: the {name} is {own}, and in the scene it is {theirs}; give the scene's value")
 
 
 def mounted(
     body: Any, placed: Sequence[tuple[Design | Lens, Sequence[float]]], *, trim: Any = None, holes: Sequence[Any] = (),
     draft: float = 0.0, bevel: float = 0.0,
 ) -> Any:  # fmt: skip
-    """Return one cadquery.Solid of a body with lenses: an array on a plate, a lens with its flange.
+    """Return one cadquery.Solid of a body with lenses: an array on a plate, or a lens with its flange.
 
-    body: cadquery solid, or a Workplane with one; the shape of each lens is cut out of it.  Around each lens it must
-    be a plate between two planes z = const.  placed: pairs of a design (or bstcad.Lens) and the position of its
-    scene's origin in the body, (x, y) or (x, y, z) in mm.  trim, holes, draft, bevel: of each lens, see Design.solid.
-    SceneError if the body does not surround a lens, or a plane cuts the rim of a face.
+    body: cadquery solid, or a Workplane with one solid, from which the shape of each lens is cut.  Around each lens it
+    must be a plate between two planes z = const.  placed: pairs of a design (or bstcad.Lens) and the position of the
+    origin of its scene in the body, (x, y) or (x, y, z) in mm.  trim, holes, draft, bevel: for each lens, as in
+    Design.solid.  SceneError if the body does not surround a lens, or a plane cuts the rim of a face.
     """
     from bstcad.cad import mounting
     from bstcad.cad.walls import Draft

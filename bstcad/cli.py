@@ -39,13 +39,13 @@ if TYPE_CHECKING:
     from bstcad.scene.scene import Scene
     from bstcad.sweep.batch import BatchScene
 
-START_TIME = time.perf_counter()  # before the heavy libraries load, whose time counts as the command's
-INTERRUPTED, INTERNAL_ERROR = 130, 70  # exit codes of Ctrl-C and of a fault of bstcad
-NOTHING_KEPT = "there was no lens yet, and nothing is kept"  # sentence of generate after Ctrl-C
-NOTHING_MORE = "nothing more is written"  # sentence of the other commands after Ctrl-C
-TERMINAL_INTERVAL, FILE_INTERVAL = 1.0, 30.0  # seconds between lines of a sweep's progress, on a terminal or in a file
+START_TIME = time.perf_counter()  # before the large libraries load, since their time counts
+INTERRUPTED, INTERNAL_ERROR = 130, 70  # exit codes after Ctrl-C and after a fault of bstcad
+NOTHING_KEPT = "there was no lens yet, and nothing is kept"  # message of generate after Ctrl-C
+NOTHING_MORE = "nothing more is written"  # message of the other commands after Ctrl-C
+TERMINAL_INTERVAL, FILE_INTERVAL = 1.0, 30.0  # interval of a sweep's progress lines (s)
 EXPORT_NAMES = ", ".join(files.EXPORTS)
-COMMAND_SYNONYMS = {  # word: the command that it suggests
+COMMAND_SYNONYMS = {  # wrong word -> command to suggest
     **dict.fromkeys(("design", "make", "run", "build", "create", "optimise", "optimize"), "generate"),
     **dict.fromkeys(("check", "prove", "test", "report", "measure"), "verify"),
     **dict.fromkeys(("view", "draw", "render", "display"), "show"),
@@ -53,11 +53,11 @@ COMMAND_SYNONYMS = {  # word: the command that it suggests
 
 
 class Interrupted(Exception):
-    """The command was interrupted by Ctrl-C; the text of the error follows the word "stopped"."""
+    """Interruption of a command by Ctrl-C; its text is printed after the word "stopped"."""
 
 
 class _Commands(typer.core.TyperGroup):
-    """Group of the commands, with a hint for a user who types another word or only a file."""
+    """Group of the commands, with a hint if the user types another word or only a file."""
 
     def invoke(self, context: Any) -> Any:
         """Run the command; for Ctrl-C typer would keep only the exit code."""
@@ -68,7 +68,7 @@ class _Commands(typer.core.TyperGroup):
             raise Interrupted(f"; {note(error) or lost}") from error
 
     def resolve_command(self, context: Any, arguments: list[str]) -> Any:
-        """Return the command that the first argument names."""
+        """Return the command that the first argument names, or fail with a suggestion."""
         word = arguments[0]
         if word not in self.commands:
             kind = {".toml": "generate", ".step": "verify", ".stp": "verify"}.get(Path(word).suffix.lower())
@@ -126,7 +126,7 @@ def load_commands() -> ModuleType:
 
 
 def user_path(path: str | Path) -> Path:
-    """Return a path with ~ expanded, which the shell does not do in -o=~/x.  SceneError for a name not in UTF-8."""
+    """Return a path with ~ expanded, since the shell does not expand -o=~/x.  SceneError for a name not in UTF-8."""
     path = Path(os.path.expanduser(path))
     try:
         str(Path(os.getcwd(), path)).encode()  # libraries need a working folder even for absolute paths
@@ -144,7 +144,7 @@ def design_folder(path: str | Path) -> Path:
 
 
 def load_scene(path: Path, settings: list[str] | None, quality: str | None = None) -> Scene:
-    """Load a scene with the changes of the command line."""
+    """Load a scene with the changes from --set and --quality."""
     from bstcad.scene.scene import load
 
     return load(path, overrides(settings, quality))
@@ -162,7 +162,7 @@ def overrides(settings: list[str] | None, quality: str | None) -> dict[str, Any]
 
 
 def warn(scene: Scene, where: str = "") -> None:
-    """Print the warnings of a scene on stderr, each with the prefix `where`."""
+    """Print the warnings of a scene on stderr, each after the prefix `where`."""
     for warning in scene.warnings():
         note_on_stderr(f"warning: {where}{warning}")
 
@@ -174,7 +174,7 @@ def note_on_stderr(line: str) -> None:
 
 @contextlib.contextmanager
 def slow_progress() -> Iterator[progress.ProgressFunction]:
-    """Show the progress of a sweep; an unchanged text is repeated every TERMINAL_INTERVAL, or FILE_INTERVAL."""
+    """Show the progress of a sweep, at least once every TERMINAL_INTERVAL on a terminal, FILE_INTERVAL in a file."""
     terminal = Console(stderr=True)
     with progress.watch(terminal) as watched:
         yield progress.Throttled(watched, TERMINAL_INTERVAL if terminal.is_terminal else FILE_INTERVAL)
@@ -223,12 +223,12 @@ SceneFile = argument(Path, "SCENE", "Scene file (TOML); see templates/.", parser
 Folder = argument(Path, "DIR", "Folder of a design.", parser=design_folder)
 Output = path_option("DIR", "Folder for the files (default: a folder in outputs/).", "--output", "-o")
 Settings = option(list[str] | None, "KEY=VALUE", "Replace one value of the scene: --set target.pixels=128.", "--set")
-Quality = option(str | None, "Q", "draft, standard, fine or paper: from fast to accurate.")
+Quality = option(str | None, "Q", "draft, standard or fine (from fast to accurate), or paper (Wang et al. 2023).")
 Verbose = option(bool, None, "List every check with its value and limit.", "--verbose")
 Workers = option(int | None, "N", "Distribute the work over N processes on this machine.")
-Scheduler = option(str | None, "URL", "Distribute the work over the workers of this dask scheduler.")
+Scheduler = option(str | None, "URL", "Distribute the work over the workers of the dask scheduler at this address.")
 Device = option(str, "D", "Device for the design: auto, cpu or cuda.")
-Resume = option(bool, None, "Continue the design that was stopped or killed in this folder.", "--resume")
+Resume = option(bool, None, "Continue the design of this folder that was stopped or killed.", "--resume")
 AsJson = option(bool, None, "Print the result as JSON, for programs.", "--json")
 Name = argument(str | None, "NAME", "Name of the scene; NAME.toml is written.")
 Picture = option(Path | None, "FILE", "Picture that the plate projects on a wall.")
@@ -241,24 +241,24 @@ Opened = argument(Path | None, "SCENE|DIR", "Scene file, folder of a design, or 
 Port = option(int, "N", "Port on this machine (0: any free port).", min=0, max=65535)
 Browser = option(bool, None, "Open the page in the browser.", "--browser/--no-browser")
 Written = argument(Path, "DIR|STEP", "Folder of a design, or a single STEP file.", parser=design_folder)
-Measured = path_option("CLOUD", "Measured points of a made part, which is also judged.")
-Report = path_option("DIR", "Write the report of the made part only to this folder.", "--output", "-o")
+Measured = path_option("CLOUD", "Measured points (CSV, PLY, STL) of a made part, which is also verified.")
+Report = path_option("DIR", "Write the report of the made part to this folder only.", "--output", "-o")
 Against = option(str | None, "NAMES", "Also trace the lens with other programs: batoid, mitsuba, or batoid,mitsuba.")
 Grade = option(
-    str | None, "G", "moulded, diamond-turned or precise: grade of tolerances without a [\\[tolerance]] in the scene."
+    str | None, "G", "Grade of errors without a [\\[tolerance]] in the scene: moulded, diamond-turned or precise."
 )
-Yield = option(float | None, "P", "Find the loosest tolerances with this yield, in percent.", "--yield")
+Yield = option(float | None, "P", "Find the loosest tolerances with this yield (percent of lenses that pass).", "--yield")
 Seed = option(int, "N", "Seed of the random trials.", min=0)
 Trial = option(int | None, "N", "Write only the lens of this trial, as trial-N.step.", min=0)
 Kinds = option(str | None, "NAMES", f"Kinds of files, separated by commas: {EXPORT_NAMES}.", "--as")
 Points = option(int | None, "N", "Points along the longer side of a grid (default: control points; zemax: its knots).")
 Png = path_option("FILE", "Picture to write.", "--png", "-o")
-ReachPng = path_option("FILE", "Draw the target and the area that light can reach; a second target in FILE_2.", "--png")
+ReachPng = path_option("FILE", "Picture of the target and of the area that light can reach (target 2: FILE_2).", "--png")
 Budget = option(
     float,
     "S",
-    "Seconds for all runs together, judging included, on all machines. A run that is predicted to exceed them is not "
-    "started; a run that exceeds them by a tenth is ended. The first run always runs to its end.",
+    "Seconds for all runs together, on all machines, including verification. A run that is predicted to exceed this "
+    "budget is not started; a run that exceeds it by a tenth is ended. The first run is never ended.",
 )
 Scenes = argument(list[str], "SCENES...", "Scene files (TOML), or patterns such as 'scenes/*.toml'.")
 Topic = argument(
@@ -305,7 +305,7 @@ def generate(
 
 @app.command(epilog=examples("plan templates/thu.toml", "plan my-lens.toml --png reach.png"))
 def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False, png: ReachPng = None) -> int:
-    """Predict time, error and memory of a design; list the effects that are left out and what light cannot reach."""
+    """Predict time, error and memory of a design; list neglected effects and the part of the target without light."""
     with loading():
         wanted = load_scene(scene, settings)
         from bstcad import folder as folders
@@ -427,9 +427,9 @@ def tolerance(
 
 @app.command(epilog=examples("export outputs/thu --as zemax,dxf", "export outputs/thu --as points --points 1001"))
 def export(folder: Folder, kinds: Kinds = None, points: Points = None) -> int:
-    """Write files for a shop: sag tables, points, Zemax grid sag, turning data, outlines, previews, the data sheet."""
+    """Write files for a workshop: sag tables, points, Zemax grid sag, turning data, outlines, previews, data sheet."""
     if kinds is None:
-        raise SceneError(f"--as: is missing; give the kinds of files: {EXPORT_NAMES}")
+        raise SceneError(f"--as: is missing; give one or more kinds of files: {EXPORT_NAMES}")
     written = load_commands().export(folder, split_names(kinds), points)
     print(*written.notes, "Files: " + ", ".join(map(str, written.paths)), sep="\n")
     return 0
@@ -462,7 +462,7 @@ def tradeoff(
     scene: SceneFile, budget: Budget = 600.0, output: Output = None, settings: Settings = None, quality: Quality = None,
     scheduler: Scheduler = None,
 ) -> int:  # fmt: skip
-    """Compare time and accuracy: design a scene with one setting varied at a time; resumes if it was stopped."""
+    """Measure accuracy against time: design a scene with one setting varied at a time; continue a stopped sweep."""
     if not 0 < budget < 1e7:
         raise SceneError(f"--budget {budget:g}: is not between 0 and 1e7; give the seconds for all runs, such as 600")
     with loading():
@@ -503,13 +503,13 @@ def batch(
 
 
 def scene_paths(patterns: list[str]) -> list[Path]:
-    """Return the scene files that the patterns match, each once."""
+    """Return the scene files that the patterns match, without repetitions."""
     found: dict[Path, Path] = {}
     for pattern in patterns:
         path = user_path(Path(pattern))
         paths = [path] if path.exists() else [Path(name) for name in sorted(glob.glob(str(path), recursive=True))]
         if not paths and glob.has_magic(pattern):
-            raise SceneError(f"{pattern}: matches no file; give scene files, such as templates/*.toml")
+            raise SceneError(f"{pattern}: matches no file; give scene files, such as 'templates/*.toml'")
         for each in paths or [path]:
             found.setdefault(each.resolve(), each)
     return list(found.values())
@@ -559,9 +559,9 @@ def keys(key: KeyName = None) -> int:
 
 @app.command(epilog=examples("schema > scene.schema.json", "schema | less"))
 def schema() -> int:
-    """Print the JSON schema of a scene, with which editors complete and check its keys.
+    """Print the JSON schema of scenes, with which editors complete and check the keys.
 
-    Save it beside a scene file and begin that file with the line: #:schema scene.schema.json
+    Save the schema beside a scene file, whose first line is then: #:schema scene.schema.json
     """
     from bstcad.scene.schema import FILE
 
@@ -615,11 +615,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):  # the terminal may be gone
             stream.flush()
-    os._exit(code)  # after a signal: Python would wait for threads that still compute
+    os._exit(code)  # after a signal, Python would wait for threads that still compute
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit code; an error of the input is one sentence on stderr."""
+    """Run the command and return its exit code; an error of the input prints one sentence on stderr."""
     try:
         with signals.raise_terminated():
             code = app(args=arguments, prog_name="bstcad", standalone_mode=False) or 0

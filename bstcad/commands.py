@@ -1,7 +1,7 @@
 """The commands for a lens, one function each: generate, verify, tolerance, export, show.
 
-`generate` designs, writes and proves a lens; `verify` proves it again from its files.  The command line and `Design`
-only call these functions.
+`generate` designs, writes and verifies a lens; `verify` verifies it again from its files.  The command line and
+`Design` only call these functions.
 """
 
 from __future__ import annotations
@@ -63,24 +63,24 @@ from bstcad.verify.verdict import Check, verdict
 if TYPE_CHECKING:
     from bstcad.tolerance.study import StudySettings
 
-# Seconds of a run with a time limit that are reserved for the report, and the least time for the proof's rays.
+# Seconds reserved for the report in a run with a time limit, and smallest time for the rays of the verification.
 REPORT_TIME, MIN_RAY_TIME = 2.0, 0.5
 
-Drawing = Callable[..., Pictures]  # called with (scene, submit); NoPictures draws no figures
-# Additions of a script to a report: checks, from a proof and the folder of its files; (heading, HTML without scripts).
+Drawing = Callable[..., Pictures]  # class of drawings, called with (scene, submit); NoPictures draws no figures
+# Additions of a script to a report: checks, from a proof and the folder of its files; section (heading, HTML).
 OwnCheck = Callable[[Proof, Path], Iterable[Check]]
 OwnSection = Callable[[Contents], tuple[str, str]]
 
 
 @dataclass(frozen=True)
 class ProofOptions:
-    """Options of a proof and of its report."""
+    """Options of a verification and of its report."""
 
-    effort: Effort | None = None  # effort of the proof; None: measure.FULL
+    effort: Effort | None = None  # effort of the verification; None: measure.FULL
     drawing: Drawing | None = None  # draws the figures of the report; None: Pictures
     checks: Sequence[OwnCheck] = ()  # additional checks
     sections: Sequence[OwnSection] = ()  # additional sections of report.html
-    limit: float | None = None  # seconds that design and proof may take together (`write` only); None: no limit
+    limit: float | None = None  # largest time of design and verification together (s; `write` only); None: no limit
 
 
 # --- generate ---------------------------------------------------------------------------------------------------------
@@ -90,12 +90,12 @@ def generate(
     scene: Scene, folder: Path, options: ProofOptions = ProofOptions(), hooks: Hooks = NO_HOOKS, *,
     device: str = "auto", resume: bool = False, began: float | None = None,
 ) -> Report:  # fmt: skip
-    """Design a lens, write it to `folder` and prove it from the written files.
+    """Design a lens, write it to `folder` and verify the written files.
 
-    hooks: functions that are called while it runs; `save` and `interrupted` are replaced by those of this command.
+    hooks: functions that are called during the design; this command uses its own `save` and `interrupted`.
     began: start of the times in the report and of tailoring.max_time (time.perf_counter(); default: now).
     During the design a checkpoint is written beside the folder at intervals; with `resume` the design continues from
-    it.  After a Ctrl-C the best lens so far is written, never over an earlier finished design: see `output_folder`.
+    this checkpoint.  After a Ctrl-C the best lens so far is written to `output_folder`.
     """
     scene = with_default_net(scene, lambda line: hooks.progress("control points", 1, 1, line))
     path, say = files.beside(folder, "checkpoint"), lambda text: hooks.progress("checkpoint", 0, 0, text)
@@ -108,7 +108,7 @@ def generate(
         if resume and state is None:
             keeper.say("there is no checkpoint; the design starts from the beginning")
         if not resume and keeper.path.exists():
-            keeper.say("a stopped design is here; it starts from the beginning, since --resume is not given")
+            keeper.say("a stopped design is here; the design starts from the beginning, since --resume is not given")
         with _checkpoint_on_error(keeper, refused=(SceneError,)), signals.stop_on_interrupt() as wished:
             hooks = replace(hooks, save=keeper, interrupted=wished)
             found = design(scene, device=device, hooks=hooks, began=began, start=state)
@@ -123,7 +123,7 @@ def generate(
 
 
 def with_default_net(scene: Scene, say: Callable[[str], None] = lambda line: None) -> Scene:
-    """Return the scene with its net, or with a chosen one if it states none; `say` gets a line on that choice."""
+    """Return the scene with its net, or with a chosen net if it states none; `say` receives a line on the choice."""
     scene, choice = with_net(scene)
     if choice is not None:
         say(choice.line)
@@ -131,7 +131,7 @@ def with_default_net(scene: Scene, say: Callable[[str], None] = lambda line: Non
 
 
 def output_folder(folder: Path, stopped: str) -> Path:
-    """Return the folder to which a design is written: an unfinished design never replaces a finished one."""
+    """Return the folder to which a design is written: a stopped design never replaces a finished design."""
     if stopped != "interrupt" or not (folder / "report.json").exists():
         return folder
     if record.making(folder / "report.json").stopped == "interrupt":
@@ -141,10 +141,10 @@ def output_folder(folder: Path, stopped: str) -> Path:
 
 
 def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), progress: Progress = no_progress) -> Report:
-    """Write a design to `folder`, replacing an earlier one, and prove it from the written files.
+    """Write a design to `folder`, replacing an earlier design, and verify the written files.
 
-    If the design cannot be written or proved, design.npz and the scene are kept in a folder beside it, which the
-    error's note names.
+    If the design cannot be written or verified, design.npz and the scene are kept in a folder beside `folder`, which a
+    note on the error names.
     """
     processes.begin()
     with (
@@ -173,7 +173,7 @@ def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), prog
 
 
 def prove(made: Made, options: ProofOptions = ProofOptions(), progress: Progress = no_progress) -> Report:
-    """Prove a design from temporary files."""
+    """Verify a design from temporary files."""
     processes.begin()
     with tempfile.TemporaryDirectory(prefix="bstcad-") as folder, _second_process_ended():
         drawn = NoPictures(made.scene, processes.submit)
@@ -185,7 +185,7 @@ def prove(made: Made, options: ProofOptions = ProofOptions(), progress: Progress
 def _write_and_prove(
     made: Made, folder: Path, drawn: Pictures, options: ProofOptions, progress: Progress
 ) -> tuple[Made, Proof]:
-    """Write the geometry and prove it; return the design with these two stages, and its proof."""
+    """Write the geometry and verify it; return the design with the times of these two stages, and its proof."""
     made = replace(made.with_report_data(), stored=None)  # design.npz is written again
     processes.return_freed()  # the second process needs the memory for the solid
     began = time.perf_counter()
@@ -214,7 +214,7 @@ def _write_and_prove(
 
 
 def _prove_files(made: Made, folder: Path, drawn: Pictures, options: ProofOptions, progress: Progress) -> Proof:
-    """Prove the files in a folder and start drawing the pictures of the light."""
+    """Verify the files in a folder and start drawing the pictures of the light; return the proof."""
     progress("verify", 0, 1, "from the written files")
 
     def draw(light: Light, lines: tuple[SpectralLine, ...], number: int) -> None:
@@ -248,7 +248,7 @@ def _checkpoint_on_error(keeper: Keeper, refused: tuple[type[Exception], ...] = 
 
 @contextlib.contextmanager
 def _second_process_ended() -> Iterator[None]:
-    """End the second process after an error, since it may still write to a folder that is about to be removed."""
+    """End the second process after an error, since this process may still write to a folder that will be removed."""
     try:
         yield
     except BaseException:
@@ -272,21 +272,21 @@ def verify(
     path: Path, options: ProofOptions = ProofOptions(), *, against: Sequence[Any] = (), measured: Path | None = None,
     place: Path | None = None, progress: Progress = no_progress,
 ) -> Report | Examined:  # fmt: skip
-    """Prove a design again from the files of its folder and rewrite its report; or examine a single STEP file.
+    """Verify a design again from the files of its folder and rewrite its report; or examine a single STEP file.
 
-    against: other programs that also trace the lens, by their names (judges.comparison.JUDGES) or as objects with the
-    three functions of a judge.
-    measured: cloud of measured points of a made part, which is also judged.  Its report is written to `place`, and the
-    design's folder does not change; without `place`, to the design's folder and its subfolder measured/CLOUD, which
-    only a verification of the same cloud rewrites.
+    against: other programs that also trace the lens, as names (judges.comparison.JUDGES) or as objects with the three
+    functions of a judge.
+    measured: file of measured points of a made part, which is also verified.  With `place` its report is written there
+    and the design's folder does not change.  Without `place` it is written to the design's folder and to its subfolder
+    measured/CLOUD, which only a verification of the same file rewrites.
     """
     against = comparison.choose_judges(against)
     if path.is_file():
         if against or measured:
-            raise SceneError(f"{path}: a STEP file states no light by which to judge it; give the design's folder")
+            raise SceneError(f"{path}: a STEP file states no light, so it has no picture; give the design's folder")
         return examine(path)
     if place is not None and measured is None:
-        raise SceneError(f"{place}: is for the report of a made part; give its points with --measured CLOUD")
+        raise SceneError(f"{place}: is for the report of a made part; give the part's points with --measured CLOUD")
     with folders.amending(path, place) as amended:
         made = read(path)
         with scene_errors():  # before the slow steps
@@ -330,7 +330,7 @@ def verify(
 
 
 def examine(path: Path) -> Examined:
-    """Examine a single STEP file: its checks and its part, without a design."""
+    """Examine a single STEP file: checks and dimensions of the solid, without a design."""
     beginning.check(path)
     with scene_errors(f"{path}: "):
         found = checks.examine(path, processes.submit)
@@ -344,20 +344,20 @@ def examine(path: Path) -> Examined:
 
 
 def read(folder: Path) -> Made:
-    """Read the design in a folder, with its history from report.json."""
+    """Read the design in a folder, with stages and history from report.json."""
     scene, nominal = folders.read_nominal(folder)
     making, sent = record.making(folder / "report.json"), folders.read_transport(folder, scene)
     return Made(scene, nominal.lens, nominal.goals, making, transport=sent, stored=nominal.stored)
 
 
 def _name_of(cloud: Cloud, folder: Path) -> str:
-    """Return the folder in measured/ of a design for a cloud: the name of its file, with a number if it is taken."""
+    """Return the subfolder of measured/ for a cloud: the name of its file, numbered if another has this name."""
     stem = re.sub(r"[^\w.-]", "_", cloud.path.stem).strip(".") or "cloud"
     for k in itertools.count(1):
         name = stem if k == 1 else f"{stem}-{k}"
         if not (path := folder / "measured" / name).exists():
             return name
-        with contextlib.suppress(ValueError):  # raised if the report is missing or damaged
+        with contextlib.suppress(ValueError):  # raised if report.json is missing or damaged
             if (record.read(path / "report.json").measured or {}).get("sha256") == cloud.sha256:
                 return name
     raise AssertionError("itertools.count ended")
@@ -367,7 +367,7 @@ def _name_of(cloud: Cloud, folder: Path) -> str:
 
 
 def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Contents:
-    """Return the contents of report.json.  estimates: estimates of the effects that are left out."""
+    """Return the contents of report.json.  estimates: estimates of the neglected effects."""
     scene = made.scene
     alone, goal = scene.single_target_scenes()[proof.worst], made.goals[proof.worst]
     diagnosed, facts = diagnosis(alone, made.making, proof, goal.picture), circumstances(made.device)
@@ -379,12 +379,12 @@ def _left_out(made: Made, proof: Proof) -> tuple[LeftOut, ...]:
 
 
 def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
-    """Return the order for a shop of the design in a folder.  shape: shape of the lens as in report.json."""
+    """Return the data for ordering the lens of a design in a folder.  shape: shape of the lens as in report.json."""
     mount, path = made.scene.mount, (folder / folders.PART).absolute()
     try:
         job = mount and path.is_file() and processes.submit(prescription.measured, path)
         found = processes.result(job, checks.time_limit(path)) if job else None
-    except (BrokenExecutor, ValueError, processes.Overdue):  # a damaged part, which a check reports: order the lens
+    except (BrokenExecutor, ValueError, processes.Overdue):  # damaged part, see its check: order the lens
         found = None
     return prescription.order_of(made.scene, made.lens, shape, folder, found=found)
 
@@ -392,7 +392,7 @@ def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
 def _sheet(
     made: Made, proof: Proof | Contents, figures: Sequence[GoalFigures], irradiance: np.ndarray, *, order: Order
 ) -> DataSheet:
-    """Return the data sheet of a design from its proof or its report; it shows the light on the first target."""
+    """Return the data sheet of a design from its proof or report, with the light on the first target."""
     light: dict[str, Any] = {"target": made.goals[0].picture, "irradiance": irradiance, "figures": figures}
     found: dict[str, Any] = {"shape": proof.shape, "passed": proof.passed, "version": bstcad.__version__}
     return DataSheet(scene=made.scene, designed=made.lens, order=order, **light, **found)
@@ -403,7 +403,7 @@ def _write_report(
 ) -> None:
     """Write the report as JSON, HTML and JUnit XML, with prescription.txt and figures/.
 
-    lens: the lens as read back.  studied: HTML of the page's section on tolerances.
+    lens: the lens as read back.  studied: HTML of the report's section on tolerances.
     """
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     pictures = drawn.result()
@@ -440,7 +440,7 @@ def tolerance(
 ) -> Tolerances:
     """Study how accurately a lens must be made, mounted and lit; write tolerance.json and return its record.
 
-    workers: number of processes for the traces.  scheduler: address of a dask scheduler, whose workers do them instead.
+    workers: number of processes for the traces.  scheduler: address of a dask scheduler whose workers trace instead.
     """
     from bstcad.tolerance import tolerancing  # loaded late, since the other commands do not need it
 
@@ -474,14 +474,14 @@ def _sheet_again(made: Made, folder: Path) -> DataSheet:
     with scene_errors():
         known = record.read(folder / "report.json")
     if known.shape is None or not (folder / "lens.step").is_file():
-        raise SceneError(f"{folder}: its report or lens.step is missing or damaged; run bstcad verify, or generate")
+        raise SceneError(f"{folder}: report.json or lens.step is missing or damaged; run bstcad verify or generate")
     irradiances, order = folders.read_irradiances(folder, made.scene), _order(made, known.shape, folder)
     return _sheet(made, known, known.goals, irradiances[0], order=order)
 
 
 def show(folder: Path, png: Path | None) -> None:
-    """Draw a lens with its rays and its picture: write it to `png`, or open a window and wait until it is closed."""
-    on_linux = sys.platform.startswith("linux")  # on Linux the environment tells if there is a display
+    """Draw a lens with rays and picture to the file `png`, or in a window, and wait until the window is closed."""
+    on_linux = sys.platform.startswith("linux")  # only on Linux the environment states whether there is a display
     if png is None and on_linux and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
         raise MachineError("this machine has no display for a window; give --png FILE to write a picture")
     path = light_path_in(folder)
@@ -497,10 +497,10 @@ def show(folder: Path, png: Path | None) -> None:
 
 
 def light_path_in(folder: Path) -> LightPath:
-    """Return the lens of a folder, rays through it and their pictures.  SceneError if no light arrives."""
+    """Return the lens in a folder, rays through this lens, and their pictures.  SceneError if no light arrives."""
     scene, nominal = folders.read_nominal(folder)
     wanted, irradiances = (goal.picture for goal in nominal.goals), folders.read_irradiances(folder, scene)
     path = light_path_of(scene, nominal.lens, [*zip(wanted, irradiances, strict=True)])
     if path is None:
-        raise SceneError(f"{folder}: no light reaches the target; there is nothing to show")
+        raise SceneError(f"{folder}: no light reaches the target, so there is nothing to show; see report.html")
     return path

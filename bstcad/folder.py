@@ -1,7 +1,7 @@
 """The folder of a design: written completely or not at all, and read back to the last bit.
 
-A new folder is built under a temporary name beside the old one and flushed to disk; then the two are exchanged in one
-step.  The old folder stays intact until then.
+A new folder is built under a temporary name beside the old folder and flushed to disk.  Then the folders are exchanged
+in one step; until then the old folder stays intact.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ from bstcad.verify import jobs
 from bstcad.verify.checks import Nominal
 
 SCENE, DESIGN, PART = "scene.toml", "design.npz", "part.step"
-FRONT_KNOTS = ("front_knots_x", "front_knots_y")  # names in design.npz for a tailored front
-PROVEN = (SCENE, DESIGN, "lens.step", "lens.stl", PART, NET_FILE)  # the files that a verification reads
+FRONT_KNOTS = ("front_knots_x", "front_knots_y")  # names in design.npz of the knots of a tailored front
+PROVEN = (SCENE, DESIGN, "lens.step", "lens.stl", PART, NET_FILE)  # files that a verification reads
 REMEDY = "generate the design again"
 
 
@@ -55,9 +55,9 @@ class Made(Nominal):
     """Designed lens as a folder stores it: on the CPU, with goals restricted to the pixels that light can reach."""
 
     making: DesignCourse = DesignCourse()  # stages, history and machine, for the report
-    device: str = "cpu"  # device of the design: "cpu" or "cuda"
-    transport: TransportMap | None = None  # map of stage 1; None for a lens of the user's own, or if unknown
-    # Returns `making` with the comparison of float32 and float64 that the report prints; None if there is none to make.
+    device: str = "cpu"  # device on which the lens was designed: "cpu" or "cuda"
+    transport: TransportMap | None = None  # transport map of stage 1; None: the user's own lens, or not stored
+    # Function that returns `making` with the comparison of float32 and float64 for the report; None: nothing to add.
     precision_comparison: Callable[[], DesignCourse] | None = None
 
     def with_report_data(self) -> Made:
@@ -66,7 +66,7 @@ class Made(Nominal):
         return self if compare is None else replace(self, making=compare(), precision_comparison=None)
 
     def is_lens_of(self, other: Nominal) -> bool:
-        """Return True if the lens is the same, to the last bit, for the same light and pictures."""
+        """Return True if lens (to the last bit), source and targets are equal to those of another design."""
         return (
             same_front(self.lens.front, other.lens.front)
             and np.array_equal(self.lens.back_net.control_points(), other.lens.back_net.control_points())
@@ -86,15 +86,15 @@ def same_front(one: Surface, other: Surface) -> bool:
 
 # --- estimates of file sizes ------------------------------------------------------------------------------------------
 
-LARGE_STEP = 100e6  # size of lens.step from which on it is printed before a design (bytes)
-BYTES_PER_POINT = 83  # bytes of a control point's statement and of one reference to it, without their two numbers
-OTHER_BYTES = 103_000, 1600  # bytes of all other statements: constant part, and part per control point along a side
+LARGE_STEP = 100e6  # smallest size of lens.step that is printed before a design (bytes)
+BYTES_PER_POINT = 83  # bytes of a control point's STEP statement and of a reference to it, without the two numbers
+OTHER_BYTES = 103_000, 1600  # bytes of all other statements: constant part, and per control point along a side
 
 
 def step_size(scene: scenes.Scene, net: Sides | None = None) -> float:
-    """Return the size of lens.step in bytes, to a few per cent: one statement and one reference per control point.
+    """Return the size of lens.step in bytes, to a few per cent, from one statement and one reference per control point.
 
-    net: control points per side, or along x and along y; None: those of the scene.
+    net: control points per side, or along x and along y; None: as in the scene.
     """
     nets = map(as_pair, scene.lens.nets(net))
     constant, per_side = OTHER_BYTES
@@ -102,7 +102,7 @@ def step_size(scene: scenes.Scene, net: Sides | None = None) -> float:
 
 
 def size_sentence(scene: scenes.Scene) -> str:
-    """Return a sentence on the size of lens.step, now and with half as many control points per side."""
+    """Return a sentence on the size of lens.step with the scene's control points, and with half as many per side."""
     net = scene.lens.back.net
     fewer = scaled(net, 0.5)
     full, half = (f"{step_size(scene, points) / 1e6:.3g} MB" for points in (net, fewer))
@@ -119,7 +119,7 @@ def size_sentence(scene: scenes.Scene) -> str:
 @contextlib.contextmanager
 def replacing(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder that replaces `folder` when the block ends without an error."""
-    folder = folder.resolve()  # "." has no name; a link must lead to the new design
+    folder = folder.resolve()  # "." has no name, and a symbolic link must lead to the new design
     folder.parent.mkdir(parents=True, exist_ok=True)
     tidy(folder)
     building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-{os.getpid()}-", dir=folder.parent))
@@ -136,7 +136,7 @@ def replacing(folder: Path) -> Iterator[Path]:
             os.replace(building, folder)
         _flush(folder.parent)
     except OSError as error:
-        if error.filename is None or str(building) in str(error.filename):  # users do not know the temporary name
+        if error.filename is None or str(building) in str(error.filename):  # the user does not know the temporary name
             error.filename = str(folder)
         raise
     finally:
@@ -147,14 +147,14 @@ def replacing(folder: Path) -> Iterator[Path]:
 
 
 def _exchange(one: Path, other: Path) -> bool:
-    """Exchange two folders in one step; return False if the system cannot (Linux can, by renameat2)."""
+    """Exchange two folders in one step; return False if the system cannot (Linux can, with renameat2)."""
     at, swap = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
     rename = getattr(ctypes.CDLL(None), "renameat2", None)
     return rename is not None and rename(at, os.fsencode(one), at, os.fsencode(other), swap) == 0
 
 
 def tidy(folder: Path) -> None:
-    """Remove the temporary folders of killed processes beside `folder`; restore a design that one had moved."""
+    """Remove temporary folders of killed processes beside `folder`; restore a design that such a process had moved."""
     folder = folder.resolve()
     with contextlib.suppress(OSError):
         files.beside(folder, "checkpoint.new").unlink()
@@ -180,8 +180,8 @@ def _flush(path: Path) -> None:
 def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
     """Yield a temporary folder whose files are moved to a design's folder when the block ends without an error.
 
-    place: folder for the report of a made part, which the temporary folder replaces instead; SceneError if it contains
-    other files.  SceneError, and nothing is written, if the design in `folder` has changed meanwhile.
+    place: folder for the report of a made part; then the temporary folder replaces this folder instead, and SceneError
+    if it contains other files.  SceneError, and nothing is written, if the design in `folder` has changed meanwhile.
     """
     if place is not None:
         files.check_free(place, files.MADE_PART_FILES, "a made part's")
@@ -193,7 +193,7 @@ def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
             if _stamps(folder) == before:
                 raise
         if _stamps(folder) != before:
-            changed = "its design was replaced during the verification, so nothing is written"
+            changed = "the design was replaced during the verification, so nothing is written"
             raise SceneError(f"{folder}: {changed}; verify it again")
         for path in sorted(Path(building).rglob("*")) if place is None else ():
             if path.is_dir():
@@ -232,8 +232,8 @@ def hash_of(contents: Mapping[str, bytes]) -> str:
 def write_geometry(design: Made, folder: Path, submit: Submit = run_here) -> Callable[[], None]:
     """Write lens.step, lens.stl, part.step of a mount, and the scene with the files that it names.
 
-    Return the function that writes lens.3mf.  The proof does not read that file, so a thread can write it later.
-    submit: with bstcad.runs.processes.submit the second process writes STEP, while this one writes the meshes.
+    Return the function that writes lens.3mf.  The verification does not read lens.3mf, so a thread can write it later.
+    submit: with bstcad.runs.processes.submit the second process writes STEP, while this process writes the meshes.
     """
     scene, lens = design.scene, design.lens
     stated = scene.name, scene.part.of(scene.lens)
@@ -255,14 +255,14 @@ def write_geometry(design: Made, folder: Path, submit: Submit = run_here) -> Cal
 
 
 def label(scene: scenes.Scene) -> Label:
-    """Return name, title, material and colour for a mesh of the scene's lens."""
+    """Return name, title, material and colour for the mesh files of the scene's lens."""
     if not scene.lens.passes.enters:
         return Label(scene.name, scene.title, "mirror", MIRROR_RGBA)
     return Label(scene.name, scene.title, scene.lens.material or "glass")
 
 
 def _write_scene(design: Made, folder: Path) -> None:
-    """Write scene.toml, with the designed parameters of the front, and the files that it names."""
+    """Write scene.toml, with the designed parameters of the front, and the files that scene.toml names."""
     contents = scene_files(design.scene) | {SCENE: scene_text(design.scene, design.lens).encode()}
     for name, data in contents.items():
         (folder / name).write_bytes(data)
@@ -271,13 +271,13 @@ def _write_scene(design: Made, folder: Path) -> None:
 def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) -> None:
     """Write design.npz: the optimised surfaces, the pictures, and the scene's text.
 
-    irradiances: one (rows, columns) per target; () if they are not traced.  The arrays of the second target are
+    irradiances: traced irradiance (rows, columns) per target; () if not traced.  The arrays of the second target are
     target_2, irradiance_2, reachable_2, and so on.  reachable (rows, columns) is 1 in the pixels that light can reach;
-    it is absent if light reaches all pixels that are to be lit.
-    The transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target, and
-    transport_back or transport_entrance (c, r, 2), the points x, y (mm) at which the light for them meets the last
-    tailored face (the back; the front if it alone is tailored, or for a mirror behind glass), or the plane of the
-    first vertex.
+    it is absent if light can reach all bright pixels.
+    Transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target, and transport_back
+    or transport_entrance (c, r, 2), the points x, y (mm) where the light for (transport_x, transport_y) meets the last
+    tailored face (the back; the front if only the front is tailored, or for a mirror behind glass), or the plane of
+    the first vertex.
     """
     lens, sent = design.lens, design.transport
     (m, n), front = lens.back_net.shape, lens.front
@@ -302,16 +302,16 @@ def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) 
 
 @contextlib.contextmanager
 def kept_if_unwritten(design: Made, folder: Path) -> Iterator[None]:
-    """Keep a design that cannot be written to `folder`: in a folder beside it, or else among temporary files.
+    """Keep a design that cannot be written to `folder` in a folder beside it, or else in the system's temporary folder.
 
-    The scene and design.npz are kept, without the irradiance, which is not traced.  The error's note names the folder.
+    The scene and design.npz are kept, without irradiance.  A note on the error names the folder.
     """
     try:
         yield
     except Exception as error:
         with contextlib.suppress(OSError, MemoryError):  # no space anywhere: the original error matters more
             kept = _keep(design, folder)
-            error.add_note(f"the finished design is kept in {kept}; bstcad.open and bstcad export can read it")
+            error.add_note(f"the finished design is kept in {kept}; bstcad.open and bstcad export can read this folder")
         raise
     for path in itertools.takewhile(Path.exists, _spare_folders(folder)):
         if _contains(path, design):
@@ -319,7 +319,7 @@ def kept_if_unwritten(design: Made, folder: Path) -> Iterator[None]:
 
 
 def _keep(design: Made, folder: Path) -> Path:
-    """Write a design to a folder beside its own, or else among temporary files; return that folder.  OSError."""
+    """Write a design to a folder beside `folder`, or else to the system's temporary folder; return its path."""
 
     def write_to(path: Path) -> Path:
         with replacing(path) as building:
@@ -335,7 +335,7 @@ def _keep(design: Made, folder: Path) -> Path:
 
 
 def _spare_folders(folder: Path) -> Iterator[Path]:
-    """Iterate over the folders beside `folder` for designs that could not be written to it."""
+    """Yield paths beside `folder` for designs that could not be written to `folder`."""
     folder = folder.resolve()
     for k in itertools.count(1):
         yield folder.with_name(f"{folder.name}-unwritten{'' if k == 1 else f'-{k}'}")
@@ -370,22 +370,22 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
         goals.append(goal.restricted(None if part is None else part > 0))
         stored.append(found[numbered("target", k)])
         if not stored[k].sum() > 0 or not goals[k].picture.sum() > 0:
-            raise SceneError(f"{folder / DESIGN}: the {goal.key} is all black; {REMEDY}")
+            raise SceneError(f"{folder / DESIGN}: the picture of {goal.key} is all black; {REMEDY}")
     return scene, Nominal(scene, _lens(scene, found), tuple(goals), stored=tuple(stored))
 
 
 def read_irradiances(folder: Path, scene: scenes.Scene) -> tuple[np.ndarray, ...]:
-    """Return the irradiance through the written lens on each target.  SceneError if design.npz is damaged."""
+    """Return the irradiance (rows, columns) of the written lens on each target; SceneError if design.npz is damaged."""
     shapes = {numbered("irradiance", k): target.columns_rows[::-1] for k, target in enumerate(scene.targets)}
     arrays = _arrays(folder, shapes, scene)
     found = tuple(arrays[name] for name in shapes)
     if not all(each.min() >= 0 and each.sum() > 0 for each in found):
-        raise SceneError(f"{folder / DESIGN}: its irradiance is zero or negative; {REMEDY}")
+        raise SceneError(f"{folder / DESIGN}: the irradiance in this file is zero or has negative values; {REMEDY}")
     return found
 
 
 def read_transport(folder: Path, scene: scenes.Scene) -> TransportMap | None:
-    """Return the transport map of a design; None if design.npz has none.  SceneError if it is damaged."""
+    """Return the transport map of a design; None if design.npz has none.  SceneError if design.npz is damaged."""
     columns, rows = (nodes(n).size for n in scene.target.columns_rows)
     names = files.names(folder / DESIGN)
     for plane in ("back", "entrance"):
@@ -400,17 +400,17 @@ def _arrays(folder: Path, shapes: Mapping[str, tuple[int, ...]], scene: scenes.S
     path, pixels = folder / DESIGN, sum(math.prod(target.columns_rows) for target in scene.targets)
     points = sum(math.prod(as_pair(net)) for net in scene.lens.nets())
     try:
-        found = files.arrays(path, shapes, 25 * points + 17 * pixels + 3_000_000)  # with arrays not read here
+        found = files.arrays(path, shapes, 25 * points + 17 * pixels + 3_000_000)  # limit in bytes
     except Exception as error:  # numpy, zipfile, zlib and tokenize raise various errors for a damaged file
         raise SceneError(f"{path}: cannot be read ({files.first_line(error)}); {REMEDY}") from None
     for name, shape in shapes.items():
         if not np.isfinite(found[name]).all():
-            raise SceneError(f"{path}: {name} is not an array of {shape} finite numbers; {REMEDY}")
+            raise SceneError(f"{path}: the array {name} of shape {shape} has values that are not finite; {REMEDY}")
     return found
 
 
 def _numbers(front: Surface) -> dict[str, float]:
-    """Return the parameters of an analytic front by their names in design.npz."""
+    """Return the parameters of an analytic front under their names in design.npz."""
     return {f"front_{name}": value for name, value in front.plain().parameters().items() if isinstance(value, float)}
 
 
@@ -427,7 +427,7 @@ def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
 
 
 def _surface(net: np.ndarray, z: float) -> BSplineSurface:
-    """Return the surface of a control net (m, n, 3) in mm, to the last bit, with heights from z if possible."""
+    """Return the surface of a control net (m, n, 3) in mm, to the last bit; heights from z if exact, else from 0."""
     if not np.array_equal(z + (net[..., 2] - z), net[..., 2]):  # rounding would change the control points
         z = 0.0
     return BSplineSurface.from_control_points(net, z)

@@ -55,7 +55,7 @@ def test_rays_go_to_the_furthest_target_and_light_each_picture_on_their_way(two)
 def test_each_target_has_a_picture_and_a_figure_in_a_notebook(two):
     assert [two.design.picture(target=k).shape for k in (0, 1)] == [(16, 16), (18, 24)]
     assert np.array_equal(two.design.picture(), two.design.picture(target=0))
-    with pytest.raises(bstcad.SceneError, match=r"^target: there is no target\[2\], the last is target\[1\]; give one"):
+    with pytest.raises(bstcad.SceneError, match=r"^target: there is no target\[2\]; give a number from 0 to 1"):
         two.design.picture(target=2)
     assert two.design._repr_html_().count("data:image/png;base64,iVBOR") == 2
     first, second = (figures.rrmsd for figures in two.design.report.goals)

@@ -132,7 +132,7 @@ def test_the_command_and_the_scene_write_every_kind_and_the_design_still_proves(
     "arguments, words",
     [
         (["--as", "iges"], "'iges' cannot be exported; give one of sag, points"),
-        ([], "--as: is missing; give the kinds of files"),
+        ([], "--as: is missing; give one or more kinds of files"),
         (["--as", "sag", "--points", "2"], "points = 2 is not possible; give a number from 3 to 4097"),
         (["--as", "datasheet"], "report.json: cannot be read"),  # whose figures it quotes
     ],

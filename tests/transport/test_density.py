@@ -62,7 +62,7 @@ def test_lifting_reaches_the_floor_of_the_mean():
     ("picture", "sentence"),
     [
         (np.zeros((8, 8)), "black everywhere"),
-        (-np.ones((8, 8)), "not negative"),
+        (-np.ones((8, 8)), "are negative"),
         (np.full((8, 8), np.nan), "finite"),
         (np.ones((8, 8, 3)), "rows x columns"),
     ],
