@@ -247,13 +247,13 @@ Against = option(str | None, "NAMES", "Also trace the lens with other programs: 
 Grade = option(
     str | None, "G", "Grade of errors without a [\\[tolerance]] in the scene: moulded, diamond-turned or precise."
 )
-Yield = option(float | None, "P", "Find the loosest tolerances with this yield (percent of lenses that pass).", "--yield")
+Yield = option(float | None, "P", "Find the loosest tolerances with this yield (percentage that passes).", "--yield")
 Seed = option(int, "N", "Seed of the random trials.", min=0)
 Trial = option(int | None, "N", "Write only the lens of this trial, as trial-N.step.", min=0)
 Kinds = option(str | None, "NAMES", f"Kinds of files, separated by commas: {EXPORT_NAMES}.", "--as")
 Points = option(int | None, "N", "Points along the longer side of a grid (default: control points; zemax: its knots).")
 Png = path_option("FILE", "Picture to write.", "--png", "-o")
-ReachPng = path_option("FILE", "Picture of the target and of the area that light can reach (target 2: FILE_2).", "--png")
+ReachPng = path_option("FILE", "Picture of the target and of the area that light can reach (second: FILE_2).", "--png")
 Budget = option(
     float,
     "S",

@@ -1,7 +1,7 @@
 """Set the limits of all errors, from three grades of manufacture and alignment and from the [[tolerance]] tables.
 
 The grades are round numbers of the magnitude that manufacturers state for moulded plastic, diamond-turned and precision
-optics of some 20 mm.  They follow no standard and no particular shop; replace them by your own.
+optics of some 20 mm.  They follow no standard and no particular manufacturer; replace them with your own limits.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from bstcad.scene.quality import FORM, NONE, RIPPLE, TWO_FACE_ERRORS, Tolerance,
 from bstcad.tolerance.perturbations import Kind, Perturbation, Setup, form_error, kinds, ripple
 
 DEFAULT_GRADE: Final = "diamond-turned"
-FORM_MODES = 3  # number of independent random fields, with normal amounts, whose sum is the form error of a trial
+FORM_MODES = 3  # number of independent random fields with normally distributed amounts that form error sums
 
 
 @dataclass(frozen=True)
 class ToleranceGrade:
     """Limits (±) of all errors; RMS for form and ripple."""
 
-    words: str
+    words: str  # name in reports
     decentre: float  # shift of lens, front and source across and along the axis, mm
     tilt: float  # tilt, clocking and wedge, degrees
-    screen: float  # shift of the screen relative to its width, and along the axis relative to its distance
+    screen: float  # shift of the screen / width across, / distance along the axis
     thickness: float  # thickness at the centre, mm
     index: float  # refractive index
     front_power: float  # sag of the front at its rim, mm
     scale: float  # relative size of the lens
-    temperature: float  # K
-    wavelength: float  # nm
+    temperature: float  # difference from the design temperature, K
+    wavelength: float  # difference from the design wavelength, nm
     source: float  # size and cone angle of the source, relative
     form: float  # form error, mm RMS
     form_length: float  # correlation length of the form error relative to the width of the lens
@@ -75,7 +75,7 @@ def grade_limit(kind: Kind, grade: ToleranceGrade, setup: Setup) -> float:
 
 
 def graded_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[Tolerance, ...]:
-    """Return the tables of a scene, preceded by one with the grade; `grade` overrides the grade that they state."""
+    """Return the tables of a scene after a table with the grade; `grade` overrides the grade stated in the scene."""
     if grade is None:
         return Tolerance(grade=DEFAULT_GRADE), *table
     if grade not in GRADES:
@@ -85,14 +85,14 @@ def graded_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[
 
 
 def base_grade(table: Sequence[Tolerance]) -> str:
-    """Return the grade of the errors that a graded table does not name; "none" if they are zero."""
+    """Return the grade of the errors that are not named in a graded table; "none" if these errors are zero."""
     return settings_of([entry for entry in table if entry.name is None], "")["grade"]
 
 
 def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None = None) -> tuple[Perturbation, ...]:
-    """Return all errors of the setup, sized by a graded table.
+    """Return all errors of the setup, with limits from a graded table.
 
-    Errors that need a finer net than the lens has are left out unless the table names them.  Errors of one face
+    Errors that need a finer net than that of the lens are omitted unless the table names them.  Errors of one face
     relative to the other are included only if the table names them.  Raises SceneError for unknown errors.
     """
     errors = []

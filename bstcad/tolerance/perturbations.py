@@ -1,7 +1,7 @@
 """Errors of manufacture, alignment and illumination: their effect on a setup, their distributions, and random trials.
 
 A setup is traced in the frame of the lens.  Decentres and tilts move one part relative to all others.  A lens tilts
-about its middle, a source about itself, and a screen about its own middle.
+about its centre, a source about its position, and a screen about its centre (`Setup.pivot`).
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ class Setup:
     """Lens, light and screen; lengths in mm, in the frame of the lens."""
 
     lens: Lens
-    channels: tuple[Channel, ...]
-    screen: Screen
-    lens_motion: Motion | None = None  # motion of the lens in the room, in which a wanted wave is fixed; None: none
+    channels: tuple[Channel, ...]  # light of the source
+    screen: Screen  # plane and pixels of the target
+    lens_motion: Motion | None = None  # motion of the lens in the room, where the wave is fixed; None: not moved
 
     def pivot(self, part: str) -> Vector:
         """Return the point about which a part ("lens", "source", "screen") tilts.
 
         Lens: midpoint of the vertices of its faces; mirror in air: its vertex.  Source: weighted mean of its points,
-        or the middle of its aperture.  Screen: its middle.
+        or the centre of its aperture.  Screen: its centre.
         """
         if part == "screen":
             return self.screen.middle
@@ -66,7 +66,7 @@ class Setup:
         return tubes_picture(self.lens, self.channels, self.screen, tubes, over_the_back=True).cpu().numpy()
 
     def moved(self, part: str, motion: Motion) -> Setup:
-        """Return the setup with a part moved.  In the frame of a moved lens, everything else moves inversely."""
+        """Return the setup with a part moved.  In the frame of a moved lens, all other parts move inversely."""
         if part == "lens":
             around = self.moved("source", motion.inverse).moved("screen", motion.inverse)._with_elements(motion.inverse)
             return replace(around, lens_motion=motion if self.lens_motion is None else self.lens_motion.after(motion))
@@ -75,7 +75,7 @@ class Setup:
         try:
             return self.with_sources(lambda source: source.moved(motion, self.lens.entrance.z))
         except NotImplementedError as error:  # a user-defined emitter
-            raise SceneError(f"tolerance: {error}, or name only errors that do not move it") from None
+            raise SceneError(f"tolerance: {error}, or name only errors that do not move the source") from None
 
     def _with_elements(self, motion: Motion) -> Setup:
         """Return the setup with the faces of windows and mirrors moved; their rims stay about the axis of the lens."""
@@ -99,7 +99,7 @@ class Setup:
         return replace(self, lens=replace(self.lens, index=change(self.lens.index)), channels=channels)
 
     def with_lens_scaled(self, factor: float) -> Setup:
-        """Return the setup with its lens scaled by a factor about its pivot."""
+        """Return the setup with its lens scaled by a factor about the pivot of the lens."""
         lens, (_, _, about) = self.lens, self.pivot("lens")
         lens = lens.with_front(lens.front.scaled(factor, about)).with_back(lens.back.scaled(factor, about))
         clear = lens.clear and (lens.clear[0].scaled(factor), lens.clear[1].scaled(factor))
@@ -108,7 +108,7 @@ class Setup:
 
 # --- distributions and trials -----------------------------------------------------------------------------------------
 
-CUTOFF_SIGMAS = 2.0  # limit of a truncated normal distribution, in standard deviations before truncation
+CUTOFF_SIGMAS = 2.0  # limit of a truncated normal distribution / standard deviation before truncation
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class Kind:
     name: str  # name in scene files, such as "lens.decentre_x"
     words: str  # name in reports
     unit: str  # unit of its amounts; "" for a ratio
-    apply: Callable[[Setup, float], Setup]  # (setup as designed, amount) -> setup with the error
+    apply: Callable[[Setup, float], Setup]  # function (setup as designed, amount) -> setup with the error
 
 
 @dataclass(frozen=True)
@@ -126,16 +126,16 @@ class Perturbation:
     """One kind of error with its distribution about zero."""
 
     kind: Kind
-    limit: float  # limit (±) in the unit of the kind; mean RMS of a random field
+    limit: float  # limit (±) in the unit of the kind; for a random field its mean RMS
     distribution: Literal["normal", "uniform", "field"] = "normal"
     cost: float = 1.0  # cost of keeping the limit, relative to the other errors
 
     @property
     def sigma(self) -> float:
-        """Standard deviation.
+        """Standard deviation σ, in the unit of the kind.
 
-        normal: truncated at L = a s, a = 2: σ² = s² (1 - 2 a φ(a) / (2 Φ(a) - 1)).  field: one mode of a random field,
-        normal and not truncated.
+        normal: truncated at the limit L = a s, a = 2, so that σ² = s² (1 - 2 a φ(a) / (2 Φ(a) - 1)).  field: one mode
+        of a random field, normal and not truncated.
         """
         cut = 1 - 2 * CUTOFF_SIGMAS * norm.pdf(CUTOFF_SIGMAS) / (2 * norm.cdf(CUTOFF_SIGMAS) - 1)
         ratios = {"uniform": 1 / math.sqrt(3), "field": 1.0, "normal": math.sqrt(cut) / CUTOFF_SIGMAS}
@@ -152,7 +152,7 @@ class Perturbation:
 
 
 def trials(perturbations: Sequence[Perturbation], seed: int, numbers: Iterable[int]) -> np.ndarray:
-    """Return the amounts (trials, n) of numbered trials, in the kinds' units; they depend only on seed and number."""
+    """Return the amounts (trials, n) of numbered trials, in the units of the kinds, from seed and number alone."""
     uniform = [np.random.default_rng((seed, number)).random(len(perturbations)) for number in numbers]
     return draws(perturbations, np.stack(uniform))
 
@@ -163,7 +163,7 @@ def draws(perturbations: Sequence[Perturbation], uniform: np.ndarray) -> np.ndar
 
 
 def perturb(setup: Setup, perturbations: Sequence[Perturbation], amounts: Sequence[float]) -> Setup:
-    """Apply amounts (n,), in the order of the perturbations, to a setup; errors of shape before motions."""
+    """Apply amounts (n,), in the order of the perturbations, to a setup; errors of shape come before motions."""
     pairs = [(p.kind, float(a)) for p, a in zip(perturbations, amounts, strict=True) if a]
     motions = ("lens.decentre", "lens.tilt", "lens.axial", "lens.clocking", "source.", "screen.", "front.decentre")
     for kind, amount in sorted(pairs, key=lambda pair: pair[0].name.startswith(motions)):
@@ -173,7 +173,7 @@ def perturb(setup: Setup, perturbations: Sequence[Perturbation], amounts: Sequen
 
 # --- the kinds with one amount ----------------------------------------------------------------------------------------
 
-INDEX_MARGIN = 20.0  # distance (nm) on each side of a line within which the material's index must be known
+INDEX_MARGIN = 20.0  # distance (nm) from a spectral line within which the index of the material must be known
 # Thermal expansion (1/K) and dn/dT (1/K) at room temperature.
 # PMMA: Baeumer, Handbook of Plastic Optics (2nd ed. 2010), table 5.1.
 # N-BK7: Schott's data sheet (α from -30 to 70 °C; Δn_rel/ΔT at 546 nm, 20 to 40 °C).
@@ -189,7 +189,7 @@ MOTIONS = (  # (error, words, axis, True for a rotation)
 
 
 def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
-    """Return all errors of a setup that have one amount, except those without effect and of an unknown material."""
+    """Return all errors of a setup with one amount, except errors without effect or with unknown material data."""
     every_kind = (*_motions(setup), *_shapes(setup, material), *_lights(setup), *_alignments(setup.lens))
     return {kind.name: kind for kind in every_kind}
 
@@ -197,9 +197,9 @@ def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
 def _motions(setup: Setup) -> Iterator[Kind]:
     sources, without_effect = [channel.source for channel in setup.channels], {"source.clocking"}
     if all(source.is_shift_invariant for source in sources):
-        without_effect.add("source.axial")  # parallel light is the same along the axis
+        without_effect.add("source.axial")  # a shift of collimated light along the axis has no effect
     if not all(source.is_rotation_invariant for source in sources):
-        without_effect.add("lens.clocking")  # without effect in round light; other light cannot be rotated
+        without_effect.add("lens.clocking")  # no effect in rotationally symmetric light; other light cannot be rotated
     for part in ("lens", "source", "screen"):
         name = setup.lens.passes.optic if part == "lens" else part
         for error, words, axis, turns in MOTIONS:
@@ -214,7 +214,7 @@ def _move_part(part: str, axis: int, turns: bool, setup: Setup, by: float) -> Se
 
 
 def _along(axis: int, amount: float) -> Vector:
-    """Return the vector with this component along an axis (0 to 2) and zeros."""
+    """Return the vector with the component `amount` along an axis (0 to 2), else zeros."""
     return (amount, 0.0, 0.0) if axis == 0 else (0.0, amount, 0.0) if axis == 1 else (0.0, 0.0, amount)
 
 
@@ -238,7 +238,7 @@ def _change_thickness(setup: Setup, by: float) -> Setup:
 
 
 def _change_front_power(setup: Setup, by: float) -> Setup:
-    """Raise the rim of the front by an amount (mm): curvature c + 2 by / R², R the largest distance from the axis."""
+    """Raise the rim of the front by `by` (mm): curvature c + 2 by / R², R the largest distance from the axis."""
     front = setup.lens.front
     rim2 = sum(p * p for p in (front.outline or setup.lens.outline).farthest)
     return replace(setup, lens=replace(setup.lens, front=front.bent(2 * by / rim2)))
@@ -250,7 +250,7 @@ def _change_temperature(material: str, setup: Setup, by: float) -> Setup:
 
 
 def _disperses(material: str, setup: Setup) -> bool:
-    """Return True if the material's index is known around each line of the light."""
+    """Return True if the index of the material is known within INDEX_MARGIN of each spectral line."""
     try:
         for nm in {channel.source.main_wavelength for channel in setup.channels}:
             refractive_index(material, nm - INDEX_MARGIN), refractive_index(material, nm + INDEX_MARGIN)
@@ -303,8 +303,8 @@ def _alignments(lens: Lens) -> Iterator[Kind]:
 def _decentre_front(axis: int, setup: Setup, by: float) -> Setup:
     """Shift the front and the rim of the lens (mm); the back stays fixed in the room.
 
-    A lens is traced in the frame of its front.  Therefore the back shifts inversely, and the whole lens moves with the
-    front.  The net is extended linearly to reach the rim; inside, the face does not change.
+    A lens is traced in the frame of its front.  Therefore the back is shifted inversely, and the whole lens moves with
+    the front.  The net of the back is extended linearly to reach the rim; inside, the face does not change.
     """
     back = setup.lens.back_net
     (low, high), pitch = (back.x, back.y)[axis], back.pitch[axis]
@@ -318,10 +318,10 @@ def _decentre_front(axis: int, setup: Setup, by: float) -> Setup:
 
 
 def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
-    """Rotate the back about its vertex v (degrees); front, rim and everything else stay fixed.
+    """Rotate the back about its vertex v by `by` degrees; front, rim and all other parts stay fixed.
 
-    A point p = v + (x, y, ζ) of the rotated face was at v + q before, q = Rᵀ (p - v).  There the face is replaced by
-    its tangent plane at (x, y), with an error of curvature · (angle · sag)², 1 nm at a tenth of a degree:
+    A point p = v + (x, y, ζ) of the rotated face was at v + q before, with q = Rᵀ (p - v).  The unrotated face is
+    replaced by its tangent plane at (x, y), with an error of curvature · (angle · sag)², 1 nm at a tenth of a degree:
     q_z = h - h_v + ∇h · ((q_x, q_y) - (x, y)), linear in ζ.
     """
     back = setup.lens.back_net
@@ -329,25 +329,25 @@ def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
     x, y = _control_points(back)
     h, h_x, h_y = back.relative_sag_and_slope(x, y)
     vertex = float(back.from_vertex().z) - back.z
-    level = [row[0] * x + row[1] * y for row in turn]  # q of ζ = 0
+    level = [row[0] * x + row[1] * y for row in turn]  # q for ζ = 0
     rise = h - vertex + h_x * (level[0] - x) + h_y * (level[1] - y) - level[2]
     along = turn[2][2] - h_x * turn[0][2] - h_y * turn[1][2]
     return replace(setup, lens=setup.lens.with_back(_add_heights(back, (vertex + rise / along - h).numpy())))
 
 
 # --- errors of the form of a face, as heights of its control net ------------------------------------------------------
-# A spline whose control points have the values of a field differs from it by (pitch / length)².  A field must therefore
-# be smooth over a few control cells.
+# A spline whose control points have the values of a field differs from the field by about (pitch / correlation
+# length)². A field must therefore be smooth over a few control cells.
 
-FRONT_SEED_OFFSET = 100  # offset of the seeds of the front's form, whose fields differ from those of the back
+FRONT_SEED_OFFSET = 100  # offset of the seeds for the form of the front, so that its fields differ from the back's
 FACE_NET = 513  # control points per side of the net that replaces a plane or a conic with a form error
-FACE_MARGIN = 6  # number of these control points on each side outside a round outline
-FACE_REACH = 1.03  # radius up to which such a net follows its face, in rim radii; the inside is unaffected beyond it
+FACE_MARGIN = 6  # number of control points of this net outside a round outline, on each side
+FACE_REACH = 1.03  # radius up to which this net follows the face, in rim radii; beyond it the rim is unaffected
 CELLS_PER_PERIOD = 4.0  # minimum number of control cells in a correlation length or a period
 
 
 def form_error(lens: Lens, correlation_length: float, seed: int, face: str = "back") -> Kind:
-    """Return a random field on the back or the front as a kind of error; amounts are its RMS (mm)."""
+    """Return a random field on the back or the front as a kind of error; amounts are the RMS of the field (mm)."""
     net, outline = _net(lens, face)
     seed_of_face = seed + FRONT_SEED_OFFSET * (face == "front")
     field = random_field(net, correlation_length, seed_of_face, inside_outline(outline, net))
@@ -356,10 +356,10 @@ def form_error(lens: Lens, correlation_length: float, seed: int, face: str = "ba
 
 
 def ripple(lens: Lens, period: float, pattern: Literal["raster", "spiral"]) -> Kind:
-    """Return tool marks sin(2π s / period) on the back as a kind of error; amounts are their RMS (mm).
+    """Return tool marks sin(2π s / period) on the back as a kind of error; amounts are the RMS of the marks (mm).
 
-    s is x for a raster, and the distance from the axis for the spiral of a diamond tool (whose turns are almost
-    circles).  Raises ValueError if the net is too coarse for the period (mm).
+    s is x for a raster, and the distance from the axis for the spiral of a diamond tool, which is almost a set of
+    circles.  Raises ValueError if the net is too coarse for the period (mm).
     """
     back = lens.back_net
     _require_resolution(back, period, "a ripple's period")
@@ -371,10 +371,10 @@ def ripple(lens: Lens, period: float, pattern: Literal["raster", "spiral"]) -> K
 
 
 def random_field(surface: BSplineSurface, correlation_length: float, seed: int, where: np.ndarray) -> np.ndarray:
-    """Draw a Gaussian random field (m, n) with RMS 1 and mean 0 over `where`, covariance exp(-(r / length)²).
+    """Return a Gaussian random field (m, n), RMS 1 and mean 0 over `where`, covariance exp(-(r / correlation_length)²).
 
-    White noise is smoothed by a Gaussian of standard deviation correlation_length (mm) / 2; the covariance is wider by
-    √2.  Raises ValueError if the net is too coarse.
+    White noise is smoothed with a Gaussian of standard deviation correlation_length (mm) / 2; the covariance is wider
+    by √2.  Raises ValueError if the net is too coarse.
     """
     _require_resolution(surface, correlation_length, "a correlation length")
     cells = [correlation_length / 2 / pitch for pitch in surface.pitch]
@@ -394,8 +394,8 @@ def inside_outline(outline: Outline, net: BSplineSurface) -> np.ndarray:
 def as_net(face: Surface, outline: Outline) -> BSplineSurface:
     """Convert a plane, a sphere or a conic into a net of FACE_NET control points per side; return a net unchanged.
 
-    The net interpolates the face at each control point.  In its end spans a uniform spline follows a curve poorly.  For
-    a round outline these lie outside the rim, where the net becomes level; for a rectangle they lie at its sides.
+    The net interpolates the face at each control point.  A uniform spline approximates a curve poorly in its end spans.
+    For a round outline the end spans lie outside the rim, where the net becomes level; for a rectangle, at its sides.
     """
     if is_net(face):
         return face
@@ -421,7 +421,7 @@ def _add_form(face: str, field: np.ndarray, setup: Setup, by: float) -> Setup:
 
 
 def _net(lens: Lens, face: str) -> tuple[BSplineSurface, Outline]:
-    """Return the optical part of a face as a net, and its outline."""
+    """Return the optical part of a face as a net, and the outline of this part."""
     surface = getattr(lens, face)
     outline = surface.outline or lens.outline
     return as_net(surface.optical, outline), outline
@@ -444,7 +444,7 @@ def _require_resolution(surface: BSplineSurface, length: float, words: str) -> N
     if length < least:
         raise ValueError(
             f"{words} of {length:g} mm is too fine for {size_text(surface.shape)} control points, which can represent "
-            f"{least:.3g} mm or more; give a longer one, or a lens with more control points"
+            f"{least:.3g} mm or more; give a longer one, or raise lens.back.control_points"
         )
 
 

@@ -1,8 +1,8 @@
 """Monte Carlo study of a lens with errors: sensitivities, trials, yield, loosest tolerances, gain by adjustment.
 
 The RRMSD of a trial is computed from superposed pictures.  Near its minimum it is nearly quadratic in the errors, and
-its derivatives mean little, but the derivatives of the picture superpose.  With the amounts z in standard deviations
-and the picture E(z), normalised to the flux of the target,
+its derivatives are of little use, but the derivatives of the picture can be superposed.  With the amounts z in standard
+deviations and the picture E(z), normalised to the flux of the target,
 
     E(z) ≈ E(0) + Σ_k f_k(ξ_k),   ξ = Vᵀ z,
 
@@ -45,16 +45,16 @@ from bstcad.tolerance.grades import DEFAULT_GRADE, GRADES, grade_limit
 from bstcad.tolerance.perturbations import MOTIONS, Perturbation, Setup, draws, kinds, perturb, trials
 
 Progress = Callable[[str, int, int, str], None]
-# Executor: calls work(shared, item) for each item, in this or another process, and yields the results in order.
+# Executor: calls work(shared, item) for each item, in this process or others, and yields the results in order.
 Spread = Callable[[Callable[[Any, Any], Any], Any, Sequence[Any]], Iterator[Any]]
 
-WAVEFRONT_RAYS = 192  # rays per side of the grid from which a wavefront error is computed
+WAVEFRONT_RAYS = 192  # rays per side of the grid for a wavefront error
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
 
 def run_locally(work: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]) -> Iterator[Any]:
-    """Call work(shared, item) in this process, two items at a time, since parts of a trace use a single core."""
+    """Call work(shared, item) in this process, for two items at a time, since parts of a trace use a single core."""
     if not len(items):
         return
     yield work(shared, items[0])
@@ -62,7 +62,7 @@ def run_locally(work: Callable[[Any, Any], Any], shared: Any, items: Sequence[An
     threads = ThreadPoolExecutor(at_once)
     try:
         yield from threads.map(work, repeat(shared), items[1:])
-    finally:  # Ctrl-C does not wait for a trace, which may take ten seconds
+    finally:  # after Ctrl-C do not wait for a trace, which may take ten seconds
         threads.shutdown(wait=False, cancel_futures=True)
 
 
@@ -80,7 +80,7 @@ class TargetPictures:
 
     setup: Setup
     perturbations: tuple[Perturbation, ...]
-    target: np.ndarray  # desired picture (rows, columns), of any sum
+    target: np.ndarray  # required picture (rows, columns), of any sum
     tubes: int  # flux tubes per side and channel
 
     figure = "RRMSD"  # name of the norm of `vector`
@@ -91,7 +91,7 @@ class TargetPictures:
         return (self.light(amounts).ravel() - target) / _norm(target)
 
     def light(self, amounts: Sequence[float]) -> np.ndarray:
-        """Return the picture (rows, columns) with these amounts, normalised to the sum of the target."""
+        """Return the picture (rows, columns) with these amounts, scaled to the sum of the target."""
         picture = perturb(self.setup, self.perturbations, amounts).picture(self.tubes)
         total = picture.sum()
         return picture * (self.target.sum() / total) if total > 0 else picture
@@ -99,16 +99,16 @@ class TargetPictures:
 
 @dataclass(frozen=True, eq=False)
 class Wavefronts:
-    """Wavefront errors of a setup with errors, in waves of the main wavelength, that of its first channel.
+    """Wavefront errors of a setup with errors, in waves of the main wavelength, which the first channel has.
 
     The OPD of a ray, as a function of its position before the lens, is nearly linear in the errors, and its RMS is a
-    norm.  Hence the model that superposes pictures also superposes wavefronts.  The desired wave is fixed in the room.
-    Piston and tilt are removed for each lens separately, so a lens may deflect its light.
+    norm.  Hence the model that superposes pictures also superposes wavefronts.  The required wave is fixed in the room.
+    Piston and tilt are removed for each lens separately, so that a lens may deflect its light as a whole.
     """
 
     setup: Setup
     perturbations: tuple[Perturbation, ...]
-    wave: Wave  # desired wave
+    wave: Wave  # required wave
     wavelength: float  # main wavelength, nm
     rays: int = WAVEFRONT_RAYS  # rays per side of the grid
 
@@ -125,7 +125,7 @@ class Wavefronts:
 
     @property
     def design_rms(self) -> float:
-        """RMS (waves) of the setup without errors, by as many rays as in a report."""
+        """RMS (waves) of the setup without errors, with as many rays as in a report."""
         return wavefront_error(*_main_channel(self.setup), self.wave).without_tilt.rms
 
 
@@ -150,31 +150,31 @@ def _norm(vector: np.ndarray) -> float:
 
 # --- the model of superposed pictures ---------------------------------------------------------------------------------
 
-DERIVATIVE_STEP = 0.5  # step of the central difference by each perturbation, in standard deviations
-# Nodes ξ, in standard deviations, along the principal directions from a given index on.  A picture that moves by more
-# than its detail is not a polynomial of ξ.
+DERIVATIVE_STEP = 0.5  # step of the central difference for each perturbation, in standard deviations
+# (index of the first principal direction, nodes ξ in standard deviations).  A picture that moves by more than its
+# detail is not a polynomial of ξ.
 SPLINE_NODES = ((0, (-3.0, -2.0, -1.2, -0.5, 0.5, 1.2, 2.0, 3.0)), (4, (-2.5, -1.0, 1.0, 2.5)), (8, (-1.0, 1.0)))
-NONLINEAR_DIRECTIONS = 12  # number of strongest directions with nodes; along the others pictures are linear
-MIN_STRENGTH = 1e-3  # change of the picture relative to the strongest direction, below which it is also linear
+NONLINEAR_DIRECTIONS = 12  # number of strongest directions with nodes; along weaker directions pictures are linear
+MIN_STRENGTH = 1e-3  # change of the picture, relative to the strongest direction, below which it is also linear
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
     """Model of the RRMSD as a function of the errors, by superposed pictures."""
 
-    sigmas: np.ndarray  # standard deviations (n,), in the perturbations' units
+    sigmas: np.ndarray  # standard deviations (n,), in the units of the perturbations
     first: np.ndarray  # derivatives of the picture (n, pixels), per standard deviation
     directions: np.ndarray  # principal directions V (n, n), orthonormal columns, the strongest first
-    nodes: tuple[tuple[float, ...], ...]  # ξ of the pictures traced along each of the first directions
+    nodes: tuple[tuple[float, ...], ...]  # ξ of the pictures traced along each direction with nodes
     gram: np.ndarray  # Gram matrix (1 + j, 1 + j): nominal, pictures at the nodes, derivatives along other directions
 
     @property
     def rrmsd(self) -> float:
-        """RRMSD of the design without errors, by the same tubes."""
+        """RRMSD of the design without errors, with the tubes of the model."""
         return float(np.sqrt(self.gram[0, 0]))
 
     def rrmsds(self, amounts: np.ndarray) -> np.ndarray:
-        """Return the RRMSD (…) for amounts (…, k) of the first k perturbations; the others are zero."""
+        """Return the RRMSD (…) for amounts (…, k) of the first k perturbations; further perturbations are zero."""
         k = amounts.shape[-1]
         phi = self._weights(product(amounts / self.sigmas[:k], self.directions[:k]))
         return np.sqrt(np.maximum(np.sum(product(phi, self.gram) * phi, axis=-1), 0.0))
@@ -247,10 +247,10 @@ def principal_axes(symmetric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 # --- the study --------------------------------------------------------------------------------------------------------
 
 MODEL_TRIALS = 10_000  # default number of trials by the model
-WORST_SHOWN = 5  # number of the worst trials that are reported
+WORST_SHOWN = 5  # number of reported worst trials
 SCREEN_ADJUSTMENTS = {f"screen.{motion}" for motion, *_ in MOTIONS}
 ADJUSTMENT_RANGE = 8.0  # range of adjustments of the screen, in standard deviations
-ADJUSTMENT_FACTOR = 10.0  # limit of an adjustment that is not an error of the study, relative to the default grade
+ADJUSTMENT_FACTOR = 10.0  # limit, relative to the default grade, of an adjustment that is not an error of the study
 QUOTIENT_STEP = 1e-4  # step of the difference quotients, in standard deviations
 INDEPENDENT_SEED = 7919  # offset of the seed of independent trials
 
@@ -261,11 +261,11 @@ Yield = tuple[float, float, float]  # fraction of the trials within a limit: low
 class StudySettings:
     """Settings of a study; its results do not depend on `progress` and `spread`."""
 
-    grade: str | None = None  # grade that replaces the one in the scene; None: that in the scene
-    wanted: float | None = None  # yield (0 … 1) for which the loosest tolerances are sought; None: they are not sought
+    grade: str | None = None  # grade that replaces the grade in the scene; None: grade in the scene
+    wanted: float | None = None  # yield (0 … 1) for which the loosest tolerances are computed; None: not computed
     seed: int = 0  # seed of the trials
     trials: int = MODEL_TRIALS  # number of trials by the model
-    full: int = 200  # number of these that are also traced in full
+    full: int = 200  # number of the first trials that are also traced in full
     tubes: int = 1031  # flux tubes per side and channel; their numerical error is the same in every trial
     progress: Progress = lambda *event: None  # receives the progress of the traces
     spread: Spread = run_locally  # executor of the traces
@@ -273,11 +273,11 @@ class StudySettings:
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Result of a Monte Carlo study of a setup.  For a wavefront each RRMSD is its RMS in waves."""
+    """Result of a Monte Carlo study of a setup.  For a wavefront goal each RRMSD is an RMS in waves."""
 
     perturbations: tuple[Perturbation, ...]
     model: Model  # model of the perturbations, followed by further adjustments of the screen
-    sensitivities: tuple[Sensitivity, ...]  # sensitivities, the worst first
+    sensitivities: tuple[Sensitivity, ...]  # sensitivities, the largest first
     limit: float  # maximum RRMSD; infinite: every lens passes
     seed: int
     rrmsd: float  # RRMSD of the setup without errors
@@ -291,7 +291,7 @@ class Study:
         return np.abs(self.linear[: len(self.full)] / self.full - 1)
 
     def change_of(self, error: str) -> float:
-        """Return the change of the RRMSD by one standard deviation of an error."""
+        """Return the change of the RRMSD for one standard deviation of an error."""
         return next(s.rrmsd_change for s in self.sensitivities if s.name == error)
 
     @property
@@ -300,12 +300,12 @@ class Study:
         return np.argsort(self.full)[::-1][:WORST_SHOWN].tolist()
 
     def fraction_within(self, rrmsds: np.ndarray) -> Yield:
-        """Return the fraction of these trials within the limit."""
+        """Return the fraction of trials, with these RRMSDs, that are within the limit."""
         return estimate_yield(rrmsds <= self.limit)
 
     @property
     def bias(self) -> float:
-        """Excess of the squared RRMSD in the traces of the study, relative to independent rays: a numerical error."""
+        """Numerical error of the study's traces: squared RRMSD minus the squared RRMSD by independent rays."""
         return self.model.rrmsd**2 - self.rrmsd**2
 
     def within_limit(self, amounts: np.ndarray) -> np.ndarray:
@@ -320,9 +320,10 @@ def estimate_yield(good: np.ndarray) -> Yield:
 
 
 def worst_of(studies: Sequence[Study]) -> Study:
-    """Combine studies of several targets by the same trials and limit: each figure is that of the worst target.
+    """Combine studies of several targets with equal trials and limit: each figure is that of the worst target.
 
-    The contributions of the errors (`share`) are to the mean square of all pictures, each divided by its target's norm.
+    The contributions of the errors (`share`) are relative to the mean square of all pictures, each divided by the norm
+    of its target.
     """
     first, *others = studies
     if not others:
@@ -342,7 +343,8 @@ def study(pictures: TracedGoal, limit: float, rrmsd: float, settings: StudySetti
     """Return sensitivities and trials of a setup with errors.
 
     limit: maximum figure of merit (RRMSD, or RMS in waves).  rrmsd: figure of the design by independent rays.  The
-    square of the tubes' numerical error is subtracted from each RRMSD², so that the trials are comparable with it.
+    square of the numerical error of the tubes is subtracted from each RRMSD², so that trials and `rrmsd` are
+    comparable.
     """
     perturbations = pictures.perturbations
     with_adjustments = (*perturbations, *adjustments(pictures.setup, perturbations))
@@ -366,7 +368,7 @@ def _unbiased(rrmsds: np.ndarray, bias: float) -> np.ndarray:
 
 
 def _sensitivities(superposed: Model, perturbations: Sequence[Perturbation], bias: float) -> tuple[Sensitivity, ...]:
-    """Return the effect of one standard deviation of each error, the mean of both signs, the worst first."""
+    """Return the effect of one standard deviation of each error, as a mean of both signs, the largest first."""
     n = len(perturbations)
     sigmas = np.diag(superposed.sigmas[:n])
     mean_rrmsds = (_unbiased(superposed.rrmsds(sigmas), bias) + _unbiased(superposed.rrmsds(-sigmas), bias)) / 2
@@ -381,7 +383,7 @@ def _sensitivities(superposed: Model, perturbations: Sequence[Perturbation], bia
 
 
 def adjustments(setup: Setup, errors: Sequence[Perturbation]) -> tuple[Perturbation, ...]:
-    """Return shift, focus, tilt and clocking of the screen, except those among the errors."""
+    """Return shift, focus, tilt and clocking of the screen, except for motions that are among the errors."""
     known, grade = {error.kind.name for error in errors}, GRADES[DEFAULT_GRADE]
     missing = [kind for name, kind in kinds(setup).items() if name in SCREEN_ADJUSTMENTS - known]
     return tuple(Perturbation(kind, ADJUSTMENT_FACTOR * grade_limit(kind, grade, setup)) for kind in missing)
@@ -390,7 +392,7 @@ def adjustments(setup: Setup, errors: Sequence[Perturbation]) -> tuple[Perturbat
 def adjusted_rrmsd(superposed: Model, perturbations: Sequence[Perturbation], amounts: np.ndarray) -> float:
     """Minimise the RRMSD of the model by shift, focus, tilt and clocking of the screen.
 
-    perturbations: perturbations of the model.  amounts: amounts (k,) of the first k.
+    perturbations: perturbations of the model.  amounts: amounts (k,) of the first k perturbations.
     """
     free = [k for k, p in enumerate(perturbations) if p.kind.name in SCREEN_ADJUSTMENTS]
     amounts = np.pad(amounts, (0, len(perturbations) - len(amounts)))
@@ -415,12 +417,12 @@ def adjusted_rrmsd(superposed: Model, perturbations: Sequence[Perturbation], amo
 def loosest_limits(study: Study, wanted: float, others: Sequence[Study] = ()) -> tuple[tuple[Perturbation, ...], Yield]:
     """Return the loosest tolerances with the `wanted` yield (0 … 1), and their yield by independent trials.
 
-    others: studies of the other goals by the same trials.  A lens passes if it keeps all limits; the squares q_i of
+    others: studies of the other goals with the same trials.  A lens passes if it meets all limits; the squares q_i of
     all goals, relative to the limits, are added.
 
     To keep error i within u_i times its limit costs c_i / u_i and adds q_i u_i² to the mean square of the picture.  For
-    a given sum of the latter the cost is minimal at u_i ∝ (c_i / q_i)^(1/3).  A common factor then sets the yield, by
-    the model.
+    a given sum Σ q_i u_i² the cost is minimal at u_i ∝ (c_i / q_i)^(1/3).  A common factor is then chosen such that the
+    model has the yield.
     """
     perturbations, goals = study.perturbations, (study, *others)
     added = sum(

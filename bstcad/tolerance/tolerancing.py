@@ -29,16 +29,16 @@ from bstcad.tolerance.perturbations import Kind, Setup, perturb, trials
 from bstcad.tolerance.study import Study, StudySettings, TargetPictures, TracedGoal, Wavefronts, Yield, estimate_yield
 from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Nominal
 
-TRACED_SOURCE_POINTS = 64  # number of points by which an extended source is sampled
+TRACED_SOURCE_POINTS = 64  # number of points that sample an extended source
 
 
 def tolerance(folder: Path, settings: StudySettings) -> Tolerances:
-    """Study the design in a folder by the [[tolerance]] tables of its scene; return the record of tolerance.json."""
+    """Study the design in a folder with the [[tolerance]] tables of its scene; return the record of tolerance.json."""
     with folders.amending(folder) as amended:
         scene, nominal = read_nominal(folder)
         if scene.ghost is not None:
             raise SceneError(
-                "[[effects]] ghost: tolerances do not include stray light yet; remove that table from scene.toml"
+                "[[effects]] ghost: tolerances do not include stray light yet; remove this table from scene.toml"
             )
         pictures, limit = _pictures(scene, nominal, settings), scene.accept.rrmsd or DEFAULT_RRMSD_LIMIT
         goals: list[tuple[str, TracedGoal, float, float]]  # key of the limit, goal, limit, figure of the design
@@ -51,7 +51,7 @@ def tolerance(folder: Path, settings: StudySettings) -> Tolerances:
             if not designed < allowed:
                 raise SceneError(
                     f"{key}: the design itself has {designed:.4f}, which is not below {allowed:g}, so no tolerances "
-                    "give that yield; improve the design, or raise the limit in scene.toml"
+                    "give this yield; improve the design, or raise the limit in scene.toml"
                 )
         results = [studies.study(goal, allowed, designed, settings) for _, goal, allowed, designed in goals]
         study = studies.worst_of(results[: len(pictures)])
@@ -105,7 +105,7 @@ def _grade(scene: Scene, grade: str | None) -> Grade:
 
 
 def _record(scene: Scene, settings: StudySettings, study: Study, goals: Sequence[Study]) -> Tolerances:
-    """Return the record; study: worst target; goals: studies of each target and, if one is stated, the wavefront."""
+    """Return the record; study: worst target; goals: studies of each target and of a stated wavefront."""
     count = len(scene.targets)
     each, wave = goals[:count], goals[count] if len(goals) > count else None
     change = wave.change_of if wave else lambda error: None
