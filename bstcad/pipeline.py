@@ -92,7 +92,7 @@ class Stage1Result:
 class DesignState:
     """State from which a design can be continued; a checkpoint stores it under the names of its fields."""
 
-    record: DesignRecord  # times and history so far
+    record: DesignRecord  # stage times and history so far
     first: Stage1State | None = None  # state of stage 1; None: it has ended
     followed: Stage1Result | None = None  # result of stage 1; None: it has not ended
     second: Stage2State | None = None  # state of stage 2 or 3; None: it has not begun, or it has ended

@@ -1,8 +1,8 @@
 """Command `bstcad batch`: design many scenes, each in its own process and folder, and continue if one fails.
 
-A design is finished if batch.json lists it with the same scene and the same version of bstcad, and its folder still
-contains it.  A design that was interrupted on this machine continues from its checkpoint.  batch.json has the entries
-of Batch; batch.csv has one line per design, with the columns BATCH_COLUMNS.
+A design is finished if batch.json lists it with an equal scene and this version of bstcad, and its folder still
+contains the design.  A design that was interrupted on this machine continues from its checkpoint.  batch.json has the
+entries of Batch; batch.csv has one line per design, with the columns BATCH_COLUMNS.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from rich.console import Group
 
 REFUSED, BROKEN, STOPPED = "refused", "broken", "not done"
-STATUS_STYLES = {"passed": "green", "passed with remarks": "yellow", NO_LIMIT: "cyan"}  # colours; others: red
-KILLED_CODE = -9  # exit code of a process that was killed by a person, or by the system when memory ran out
+STATUS_STYLES = {"passed": "green", "passed with remarks": "yellow", NO_LIMIT: "cyan"}  # colours; all others are red
+KILLED_CODE = -9  # exit code of a process killed by a user, or by the system when memory ran out
 CORES_PER_DESIGN = 2  # number of cores that one design uses
 
 
@@ -51,15 +51,15 @@ class BatchEntry(StoredRecord):
     scene: str  # path of the scene file, as given by the user
     name: str = ""  # name of the scene and of the design's folder
     status: str = STOPPED  # verdict (verify.verdict.VERDICTS), REFUSED, BROKEN or STOPPED
-    rrmsd: float | None = None  # RRMSD of the report; this and the next three: on the worst of several targets
+    rrmsd: float | None = None  # RRMSD of the report; with several targets, the worst target here and in the next three
     rrmsd_noise: float | None = None  # standard error of rrmsd
     leak: float | None = None  # fraction of the light on the target that falls where the target is dark
     light_on_target: float | None = None  # fraction of the source's light that falls on the target
     checks_failed: tuple[str, ...] = ()  # names of the failed checks
     seconds: float = 0.0  # time until the lens was verified
     report: str = ""  # path of report.html, relative to the batch's folder
-    where: str = ""  # "here", or the address of a worker
-    reason: str = ""  # sentence that states why there is no lens
+    where: str = ""  # "here", or the address of a worker; "": not run
+    reason: str = ""  # sentence that states why there is no lens; "": there is a lens
     key: str = ""  # hash of the scene with its pictures, and version of bstcad
     design: str = ""  # SHA-256 of design.npz
 
@@ -87,18 +87,18 @@ class Batch(StoredRecord):
 class BatchScene:
     """Scene file of a batch, with its scene or the reason why it is not valid."""
 
-    path: str
+    path: str  # path as given by the user
     scene: Scene | None  # None: the file is not valid
-    reason: str = ""  # sentence that states why it is not valid
+    reason: str = ""  # sentence that states why the file is not valid
 
 
 # --- one design, in a process of its own ------------------------------------------------------------------------------
 
 
 def design(contents: SceneFiles, folder: Path, variables: Mapping[str, str], tick: Tick = lambda: None) -> ExitStatus:
-    """Design a scene into a folder, starting from a checkpoint of the same design if there is one.
+    """Design a scene into a folder, from a checkpoint of this design if there is one; return how the process ended.
 
-    variables: environment variables of the process.  A process that was killed is started once more.
+    variables: environment variables of the process.  A process that was killed is started a second time.
     """
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         scene = unpack_scene(contents, Path(place))
@@ -135,10 +135,10 @@ def batch(
     scenes: Sequence[BatchScene], folder: Path, *, workers: int | None = None, cluster: Cluster | None = None,
     progress: Progress = no_progress, say: Callable[[str], None] = lambda sentence: None,
 ) -> list[BatchEntry]:  # fmt: skip
-    """Design each scene into folder/NAME; return an entry for each, in their order.
+    """Design each scene into folder/NAME; return an entry per scene, in the order of the scenes.
 
     workers: number of simultaneous designs on this machine; None: as many as its cores and memory allow.
-    cluster: machines that design instead.  say: receives a sentence before the work begins.
+    cluster: machines that make the designs instead.  say: receives a sentence before the work begins.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with files.exclusive(folder / "batch.json"), contextlib.ExitStack() as stack:
@@ -163,7 +163,7 @@ def batch(
                 _design_all(rows, remaining, folder, machines, progress=progress)
             except BaseException as error:
                 finished = f"{sum(row.finished for row in rows[:count])} of {count} designs are finished in {folder}"
-                error.add_note(f"{finished}; the same command continues with the others")
+                error.add_note(f"{finished}; the same command continues with the other designs")
                 raise
         write(rows, folder)
     return rows[:count]
@@ -179,7 +179,7 @@ def _initial_entries(scenes: Sequence[BatchScene], folder: Path, earlier: Sequen
         name, key = each.scene.name, f"{folders.hash_of(folders.scene_files(each.scene))} {environment.version()}"
         row, reason = BatchEntry(scene=each.path, name=name, key=key), ""
         if same := path_of.get(name):
-            reason = f"name: {name!r} is also the name of {same}, but a folder holds only one design; give another name"
+            reason = f"name: {name!r} is also the name of {same}, but a folder contains one design; give another name"
         path_of.setdefault(name, each.path)
         try:
             files.check_free(folder / name)
@@ -196,8 +196,8 @@ def _design_all(
 ) -> None:
     """Design the remaining scenes, update their entries, and write batch.json whenever a design has ended."""
     waiting, local = list(remaining), isinstance(machines, LocalPool)
-    under_way: list[int] = []  # indices of the designs that are being made
-    # The processes share the cores; environment variables that are set already do not change.
+    under_way: list[int] = []  # indices of the running designs
+    # The processes share the cores; environment variables that are already set are not changed.
     threads = environment.threads(machines.capacity)
     variables = {name: value for name, value in threads.items() if name not in os.environ}
 
@@ -245,7 +245,7 @@ def _finished_entry(row: BatchEntry, answer: Answer, folder: Path, local: bool) 
 
 
 def _store_design(contents: SceneFiles, folder: Path) -> None:
-    """Write a design from another machine into its folder, replacing an earlier design."""
+    """Write the files of a design from another machine into its folder, replacing an earlier design."""
     with files.exclusive(folder), folders.replacing(folder) as building:
         for name, data in contents.items():
             path = building / name
@@ -291,7 +291,7 @@ def exit_code(rows: Sequence[BatchEntry]) -> int:
 
 
 def summary(rows: Sequence[BatchEntry], folder: Path, verbose: bool = False) -> Group:
-    """Return a line per design, with its figures or the reason of a failure, then the failed checks (verbose: all)."""
+    """Return a line per design, with figures or the reason of a failure, then its failed checks (verbose: all)."""
     from rich.console import Group
     from rich.text import Text
 

@@ -1,7 +1,7 @@
 """Run designs in cold processes, measure their time and error, calibrate this machine, and store records on disk.
 
-The time of a run is that of the whole command: imports, picture, tailoring, writing and proof.  All lenses are judged
-by one reference: stratified rays on the pixels of the base scene.
+The time of a run is the time of the whole command: imports, picture, tailoring, writing and verification.  The RRMSD of
+all lenses is measured with one reference: stratified rays on the pixels of the base scene.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ from bstcad.tailoring.stage2 import Problem
 
 # --- records ----------------------------------------------------------------------------------------------------------
 
-MAX_RECORD_SIZE = 100_000_000  # bytes
-SIGNIFICANT_DIGITS = 6  # default of round_numbers
+MAX_RECORD_SIZE = 100_000_000  # largest size of a record's file (bytes)
+SIGNIFICANT_DIGITS = 6  # default number of digits of `round_numbers`
 SceneFiles = Mapping[str, bytes]  # contents of a scene file and its pictures, by file name
 
 
@@ -145,12 +145,12 @@ KERNEL_TUBES, KERNEL_PIXELS = 1024, 512  # flux tubes and pixels per side
 KERNEL_NET, KERNEL_INDEX = 257, 1.49  # control points per side; refractive index
 KERNEL_WIDTH, KERNEL_THICKNESS = 20.0, 5.0  # mm
 KERNEL_SCREEN_Z = 200.0  # distance of the screen from the front, mm
-WAVE_HEIGHT, WAVE_PERIODS = 0.003, 3  # amplitude of the back, mm, and its number of periods across the width
-KERNEL_REPEATS = 3  # number of evaluations, of which the fastest counts
+WAVE_HEIGHT, WAVE_PERIODS = 0.003, 3  # amplitude of the waves of the back (mm), number of periods across the width
+KERNEL_REPEATS = 3  # number of evaluations; the time of the fastest is used
 
 
 def measure_seconds(work: Callable[[], object]) -> float:
-    """Return the seconds that some work takes."""
+    """Return the time (s) of a call of `work`."""
     start = time.perf_counter()
     work()
     return time.perf_counter() - start
@@ -158,7 +158,7 @@ def measure_seconds(work: Callable[[], object]) -> float:
 
 @cache
 def calibration_kernel(tubes: int = KERNEL_TUBES) -> Callable[[], Any]:
-    """Return the evaluation of merit and gradient by flux tubes through a fixed small lens, set up once per process."""
+    """Return a function that evaluates merit and gradient by flux tubes through a fixed small lens; made once."""
     u = torch.linspace(-math.pi * WAVE_PERIODS, math.pi * WAVE_PERIODS, KERNEL_NET, dtype=torch.float64)
     outline, span = Rectangle(KERNEL_WIDTH, KERNEL_WIDTH), (-KERNEL_WIDTH / 2, KERNEL_WIDTH / 2)
     back = BSplineSurface(KERNEL_THICKNESS, WAVE_HEIGHT * u.cos()[:, None] * u.cos(), span, span)
@@ -177,12 +177,12 @@ Value = int | float | str | tuple[int, int]
 Settings = tuple[tuple[str, Value], ...]  # (dotted key of the scene, value), sorted by key; (): the base scene
 
 DONE, FAILED, NOT_RUN = "done", "failed", "not run: budget"
-REFERENCE_EFFORT = Effort(witness=False)  # effort of the reference: rays only, by which no lens was tailored
-WARM_UP_CHANGES = {  # settings of a run whose time does not count; it compiles kernels and loads libraries
+REFERENCE_EFFORT = Effort(witness=False)  # effort of the reference: rays only, which no design uses for tailoring
+WARM_UP_CHANGES = {  # settings of the first run, which compiles kernels and loads libraries and is not timed
     "lens.back.control_points": 33, "tailoring.quality": "draft", "tailoring.rays": 96,
     "tailoring.transport_grid": 64, "tailoring.levels": None,
 }  # fmt: skip
-WARM_UP_PIXELS = 64  # pixels per side of each target in that run
+WARM_UP_PIXELS = 64  # pixels per side of each target in the warm-up run
 
 
 def sorted_settings(entries: Mapping[str, Value]) -> Settings:
@@ -205,41 +205,41 @@ StoredSettings = Annotated[Settings, BeforeValidator(_from_json), PlainSerialize
 
 
 class HistoryPoint(TypedDict):
-    """RRMSD of a design by its own tubes at one time."""
+    """RRMSD of a design at one time, by the tubes used for tailoring."""
 
     seconds: float  # time since the start of the design
     rrmsd: float | None  # RRMSD; null: not finite
 
 
 class ColdRun(StoredRecord):
-    """Result of one run; times are those of the machine that it ran on, and null if it was not run."""
+    """Result of one run; times are in seconds on the machine of the run, and null if it was not run."""
 
     settings: StoredSettings  # changes relative to the base scene
     status: str  # DONE, FAILED or NOT_RUN
     reason: str = ""  # reason of the failure
     label: str = ""  # description, such as "Flux tubes per side: 768"
-    knobs: tuple[str, ...] = ()  # keys of the knobs that have these settings as a point; "base" for the base scene
+    knobs: tuple[str, ...] = ()  # keys of the knobs with a point at these settings; "base" for the base scene
     where: str = THIS_MACHINE  # "here", or the address of a worker; "": not run
     seconds: float | None = 0.0  # wall time of the whole command
     cpu_seconds: float | None = 0.0  # CPU time of the command and of all processes that it started
     kernel_seconds: float | None = 0.0  # time of the calibration kernel before this run
     units: float | None = None  # seconds / kernel_seconds
-    cost_seconds: float | None = 0.0  # time charged to the budget, including judging and calibration
+    cost_seconds: float | None = 0.0  # time charged to the budget, including the reference and the calibration
     predicted_seconds: float | None = None  # time predicted for the budget before the run
-    peak_memory_gb: float | None = None  # peak memory of both its processes together
-    rrmsd: float | None = None  # RRMSD by the reference; the largest of several targets
+    peak_memory_gb: float | None = None  # peak memory of the two processes together (GB)
+    rrmsd: float | None = None  # RRMSD by the reference; for several targets the largest
     rrmsd_noise: float | None = None  # standard error of rrmsd
     rays: int | None = None  # number of rays of the reference
-    rrmsd_reported: float | None = None  # RRMSD by the proof of the design, on its own pixels
+    rrmsd_reported: float | None = None  # RRMSD by the verification of the design, on the pixels of the run
     rrmsd_noise_reported: float | None = None  # standard error of rrmsd_reported
-    passed: bool | None = None  # true if every check of the proof passed
+    passed: bool | None = None  # true if every check of the verification passed
     net: str = ""  # SHA-256 of the control net; equal nets are equal lenses to the last bit
-    stages: tuple[dict[str, Any], ...] = ()  # stages with name, seconds and the rrmsd after them (null: not measured)
+    stages: tuple[dict[str, Any], ...] = ()  # stages: name, seconds and rrmsd at the end (null: not measured)
     on_front: bool = False  # true if the run is on the Pareto front of the sweep
     # not in tradeoff.json
-    allowed_seconds: float | None = None  # time limit at which the run was ended; null: it ended by itself
+    allowed_seconds: float | None = None  # time limit at which the run was stopped; null: the run ended by itself
     history: tuple[HistoryPoint, ...] = ()  # convergence curve of the run
-    machine: dict[str, Any] = {}  # machine that ran it
+    machine: dict[str, Any] = {}  # machine of the run
     versions: dict[str, str] = {}  # versions of the libraries, by name
     version: str = ""  # version of bstcad, with a hash of its sources
 
@@ -256,14 +256,14 @@ class ColdRun(StoredRecord):
 
     @property
     def comparable(self) -> bool:
-        """True if its time is comparable with others: runs on this machine follow each other."""
+        """True if the time is comparable: the run was done on this machine, where only one run is active at a time."""
         return self.done and self.where == THIS_MACHINE
 
 
 def run_and_judge(
     contents: SceneFiles, point: Settings, limit: float, effort: Effort, tick: Tick = lambda: None
 ) -> ColdRun:
-    """Run the command for a base scene with these settings, for at most `limit` seconds, and judge its lens."""
+    """Run the command for a base scene with these settings, for at most `limit` seconds, and measure its RRMSD."""
     start = time.perf_counter()
     unit = min(measure_seconds(calibration_kernel()) for _ in range(KERNEL_REPEATS))
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
@@ -277,7 +277,7 @@ def run_and_judge(
 
 
 def warm_up(contents: SceneFiles, tick: Tick) -> None:
-    """Do a small run that does not count, so that the first run that counts starts under the same conditions."""
+    """Do a small run that is not timed, so that the first timed run has the same conditions as later runs."""
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         base = load(unpack_scene(contents, Path(place)))
         try:
@@ -294,7 +294,7 @@ def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick:
     process = processes.run(["generate", str(scene), "-o", str(folder), *changes], limit, tick)
     times: dict[str, Any] = {"settings": point, "seconds": process.seconds, "cpu_seconds": process.cpu_seconds}
     if process.seconds >= limit and process.code < 0:
-        reason = f"ended after {process.seconds:.0f} s, because its time in the budget was used up"
+        reason = f"stopped after {process.seconds:.0f} s, because its share of the budget was used up"
         return ColdRun(status=FAILED, reason=reason, allowed_seconds=limit, **times)
     if process.code not in (0, 1) or not (folder / "report.json").is_file():
         return ColdRun(status=FAILED, reason=process.reason, **times)

@@ -1,8 +1,8 @@
 """Estimate the effects that a design neglects, and diagnose a finished design.
 
-Before a design the effects are estimated (analysis.neglected_effects) on a coarse lens, made from two transport maps
-and slope fits in a second or two; most are accurate within a factor of two.  Reports state them for the finished lens.
-The diagnosis of a finished design uses its picture and the history of the run.
+Before a design the effects are estimated (analysis.neglected_effects) with a coarse lens, made from two transport maps
+and slope fits in a second or two; most estimates are accurate within a factor of two.  Reports state estimates for the
+finished lens.  The diagnosis of a finished design uses its picture and the history of the run.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def _downsample(picture: np.ndarray, limit: int) -> np.ndarray:
 
 
 def _central_channel(scene: Scene, *more: Effect) -> Channel:
-    """Return the channel from the middle of the source at its main wavelength, with further effects."""
+    """Return the channel from the centre of the source at its main wavelength, with further effects."""
     source = scene.source.central
     loss_factors = losses((*scene.effects, *more), scene.lens, source.main_wavelength)
     return Channel(source, scene.index, losses=loss_factors, around=scene.around(source.main_wavelength))
@@ -84,11 +84,11 @@ def _central_channel(scene: Scene, *more: Effect) -> Channel:
 # --- neglected effects ------------------------------------------------------------------------------------------------
 
 VISIBLE_BAND = (400.0, 700.0)  # band of white light, nm
-SUN_ANGLES = (0.5, 0.56)  # range of divergence (degrees) that is taken for sunlight, whose mean is 0.53
+SUN_ANGLES = (0.5, 0.56)  # range of divergence (degrees) treated as sunlight; the mean of the sun is 0.53
 LINE_WIDTH = 10.0  # assumed width (nm) of a spectral line; LEDs have 20 to 40, lasers less than 1
 DEFAULT_DIAMETER = 0.1  # assumed diameter of a point source, mm
 DEFAULT_DIVERGENCE = 0.1  # assumed divergence of parallel light, degrees
-# Assumed sizes by Emitter.size_key.
+# Assumed sizes for each Emitter.size_key: (size, shape, unit).
 DEFAULT_SIZES = {"diameter": (DEFAULT_DIAMETER, "disc", "mm"), "divergence": (DEFAULT_DIVERGENCE, "cone", "degrees")}
 LINE_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # (half widths, weight) of a uniform line
 DISC_POINTS = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # (x, y in radii, weight) of a disc
@@ -96,9 +96,9 @@ FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = 
 
 
 def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ...]:
-    """Return the effects that the scene neglects, with the change of the picture by each, the largest change first.
+    """Return the neglected effects with the change of the picture by each effect, the largest change first.
 
-    picture: flux in each pixel (rows, columns), of the target or of the lens.
+    picture: flux in each pixel (rows, columns), from the target or the traced lens.
     """
     points = math.prod(as_pair(scene.lens.back.net))
     reference = Reference.of(lens, _central_channel(scene), scene.target.screen, picture=picture, control_points=points)
@@ -197,13 +197,14 @@ def _entry(kind: str, change: Change | None, detail: str = "", simulate_by: str 
 
 # --- the diagnosis of a finished design -------------------------------------------------------------------------------
 
-SIZE_STAGE_PREFIX = "stage 3, "  # beginning of the names of stages that are for one size of the source each
+SIZE_STAGE_PREFIX = "stage 3, "  # beginning of the names of stages with one size of the source each
 
 
 def diagnosis(scene: Scene, making: DesignCourse, proof: Proof, target: np.ndarray) -> dict[str, Any]:
     """Return the entries convergence, remaining_error and bounds of report.json (record.Contents).
 
-    scene: scene with the one target on which the proof found the largest RRMSD.  target: its picture (rows, columns).
+    scene: scene with only the target of the largest RRMSD in the proof.  target: picture of this target (rows,
+    columns).
     """
     sizes = [k for k, stage in enumerate(making.stages) if stage.name.startswith(SIZE_STAGE_PREFIX)]
     curve = ending(

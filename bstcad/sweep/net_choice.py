@@ -1,11 +1,11 @@
 """Choose the number of control points of the back if the scene states none.
 
 If the light of k cells of the net falls on a pixel, the lens has k degrees of freedom for that pixel.  The flux that a
-pixel needs, divided by the flux density of the source's light where it crosses the back, is the area of the back that
-lights the pixel.  Dark pixels are lit by few cells.  The RRMSD of a net follows from the detail of the picture that is
-finer than its cells, and than cells twice as wide.  Its size determines time and memory (prediction.py).
+pixel needs, divided by the flux density of the source's light at the back, is the area of the back that lights the
+pixel.  Dark pixels are lit by few cells.  The RRMSD of a net follows from the detail of the picture that is finer than
+its cells, and finer than cells twice as wide.  The size of the net determines time and memory (prediction.py).
 
-Among the nets that memory, tailoring.max_time and the tool radius allow, the smallest one is chosen for which each
+Among the nets that memory, tailoring.max_time and the tool radius allow, the smallest net is chosen for which each
 larger net would reduce the RRMSD by less than a fifth, or by less than half in three times the time.
 tests/benchmarks/test_net_choice.py compares the choice with designs of every net.
 """
@@ -34,44 +34,44 @@ from bstcad.sweep.estimates import coarse_lens
 from bstcad.sweep.prediction import REMAINING_BLUR, blur_rrmsd, memory_gb, typical_seconds
 
 NET_KEY = "lens.back.control_points"
-SQUARE_NETS = (65, 129, 257, 513, 1025)  # control points per side of the candidates, or as many in square cells
-MAX_SQUARE_ASPECT = 1.25  # maximum aspect ratio of a plate that gets a square net
-# Factors (reduction of the RRMSD, increase of the time): a larger net with less gain for more time is rejected.
+SQUARE_NETS = (65, 129, 257, 513, 1025)  # control points per side of candidates, or as many in square cells
+MAX_SQUARE_ASPECT = 1.25  # largest aspect ratio of an outline with a square net
+# (reduction of the RRMSD, increase of the time), as factors: a larger net with less reduction in more time is rejected.
 MIN_GAINS = ((1.25, 1.0), (2.0, 3.0))
 MEMORY_FRACTION = 0.8  # fraction of the machine's memory that a design may use
-DENSITY_TUBES = 256  # flux tubes per side by which the flux density is found
-# Coefficients of the error bound (ControlCells.floor) of the net, and of a net with half as many cells each way.
+DENSITY_TUBES = 256  # flux tubes per side for the flux density
+# Coefficients of the error bound (ControlCells.floor) of the net, and of a net with half as many cells per side.
 FLOOR_FACTOR, HALVED_FACTOR = 0.68, 0.43
 QUALITY_TERMS = {"draft": (1.5, 0.012), "standard": (1.0, 0.002), "fine": (0.7, 0.004)}  # (factor, offset) of the RRMSD
 MIN_SEAM_SHIFT = 7.0  # seam shift (pixels) below which cells are finer than the tool can use
-# Cells per pixel above which a finer net reduces the RRMSD only once more, by at most this factor.
+# Cells per pixel above which finer nets reduce the RRMSD further by at most a factor, and this factor.
 SUFFICIENT_CELLS, MAX_FURTHER_GAIN = 5.0, 1.4
-MIN_RRMSD_RATIO = 0.43  # lowest known ratio of RRMSD by a finer net: the portrait with 1025 instead of 513 points
-MIN_RELATIVE_FLUX = 1e-3  # flux of a tile, relative to the mean, below which the mean density is used
+MIN_RRMSD_RATIO = 0.43  # smallest known ratio of RRMSDs by a finer net: portrait with 1025 instead of 513 points
+MIN_RELATIVE_FLUX = 1e-3  # flux of a tile / mean flux below which the mean density is used
 
 
 @dataclass(frozen=True)
 class Candidate:
     """Net with its estimated RRMSD, time and memory."""
 
-    net: Sides
-    rrmsd: float
+    net: Sides  # control points per side, or along x and along y
+    rrmsd: float  # estimated RRMSD
     seconds: float  # time on two cores of pace 1
-    memory_gb: float
-    seam_shift: float = math.inf  # shift by the narrowest valley, pixels; see the function seam_shift
+    memory_gb: float  # peak memory of the two processes (GB)
+    seam_shift: float = math.inf  # shift by the narrowest valley (pixels), see the function `seam_shift`
 
     def relative_to(self, other: Candidate) -> tuple[float, float]:
-        """Return RRMSD and time relative to those of another candidate; absolute values are less accurate."""
+        """Return (RRMSD, time) divided by those of another candidate; the ratios are more accurate than the values."""
         return self.rrmsd / other.rrmsd, self.seconds / other.seconds
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Chosen net among all possible ones."""
+    """Chosen net among all possible nets."""
 
     possible: tuple[Candidate, ...]  # possible nets, from coarse to fine
-    index: int  # index of the chosen one
-    limit: str = ""  # limit that rules out a larger net, in words; "": none
+    index: int  # index of the chosen net
+    limit: str = ""  # limit that excludes larger nets, in words; "": none
 
     @property
     def net(self) -> Sides:
@@ -80,7 +80,7 @@ class Choice:
 
     @property
     def line(self) -> str:
-        """Line that states the choice, and the effect of more and of fewer control points."""
+        """Line that states the chosen net, and RRMSD and time with more or fewer control points."""
         chosen, around = self.possible[self.index], []
         for step, word in ((1, "more"), (-1, "fewer")):
             if 0 <= self.index + step < len(self.possible):
@@ -102,7 +102,7 @@ class Choice:
 
 
 def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
-    """Return the scene with its net or a chosen one, and the choice or None; SceneError if the back gets no light."""
+    """Return the scene and None, or with a chosen net and the choice; SceneError if no light meets the back."""
     if scene.lens.back.control_points is not None:
         return scene, None
     levels = scene.tailoring.levels
@@ -113,7 +113,7 @@ def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
 
 
 def choose_net(scene: Scene) -> Choice:
-    """Choose a net for a scene without one; of several targets, the target that needs the finest net decides."""
+    """Choose a net for a scene that states none; with several targets, the target that needs the finest net decides."""
     choices = map(_choose_for_target, scene.single_target_scenes())
     return max(choices, key=lambda choice: math.prod(as_pair(choice.net)))
 
@@ -140,7 +140,7 @@ def _choose_for_target(scene: Scene) -> Choice:
 
 
 def rrmsd_ratio(scene: Scene, finer: Scene, lenses: Sequence[Lens]) -> float:
-    """Return the ratio of the RRMSD with a finer net to that of the scene, for the target that gains least.
+    """Return the ratio of the RRMSD with a finer net to the RRMSD of the scene, for the target that improves least.
 
     lenses: a coarse lens for each target.
     """
@@ -174,10 +174,10 @@ def _affordable(scene: Scene, candidates: list[Candidate]) -> tuple[tuple[Candid
 
 
 def seam_shift(scene: Scene) -> float:
-    """Return the shift of light on the target across a cell in the narrowest valley of the tool, pixels; inf: any tool.
+    """Return the shift (pixels) of light on the target across a cell in the tool's narrowest valley; inf: any tool.
 
-    p L (n - 1) / R for a cell of pitch p, a throw L and a tool radius R; a mirror turns light by twice its slope.  At
-    a seam, where light separates, the valley is as wide as the tool, and finer cells do not make it narrower.
+    It is p L (n - 1) / R for cells of width p, a throw L and a tool radius R; a mirror deflects light by twice its
+    slope.  At a seam, where light separates, the tool limits the width of the valley, whatever the cells.
     """
     radius, target = scene.lens.tool_radius, scene.target
     if radius is None:
@@ -188,7 +188,7 @@ def seam_shift(scene: Scene) -> float:
 
 
 def candidate_nets(scene: Scene) -> list[Sides]:
-    """Return the candidate nets from coarse to fine; those of an oblong lens have square cells."""
+    """Return the candidate nets from coarse to fine; for an oblong lens they have square cells."""
     half_x, half_y = scene.lens.outline.half_extent
     if max(half_x, half_y) <= MAX_SQUARE_ASPECT * min(half_x, half_y):
         return list(SQUARE_NETS)
@@ -199,7 +199,7 @@ def candidate_nets(scene: Scene) -> list[Sides]:
 def area_cells(scene: Scene, lens: Lens) -> ControlCells:
     """Return the area (mm²) of the back that lights each pixel, as cells of 1 mm².
 
-    lens: a coarse lens for the scene.  Its light has the flux density at the back for each part of the target.
+    lens: coarse lens for the scene, whose light gives the flux density at the back for each part of the target.
     """
     light = max(scene.with_source_scaled(0.0).channels(), key=lambda channel: channel.weight)
     lens, screen, target = light.through(lens), scene.target.screen, scene.target.irradiance()
@@ -224,7 +224,7 @@ def area_cells(scene: Scene, lens: Lens) -> ControlCells:
 
 
 def net_rrmsd(light: ControlCells, scene: Scene, image: float = 0.0) -> float:
-    """Estimate the RRMSD of a scene with its net: detail finer than its cells, detail near that limit, and an offset.
+    """Estimate the RRMSD of a scene with its net, from detail finer than its cells or near this limit, and an offset.
 
     image: RRMSD of the target blurred by the image of the source.  The estimate is fitted to designs in standard
     quality: half of them are within a factor of 1.3, and nine of ten within 2.  Other qualities are less accurate.

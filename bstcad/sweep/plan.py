@@ -35,19 +35,19 @@ CAVEAT = "Estimates assume one target and one tailored face; with several, the l
 def plan(scene: Scene, text: str = "", keys: Sequence[str] = (), tick: Tick = lambda: None) -> Iterator[dict[str, Any]]:
     """Yield the entries of `plan --json`: first the effects, then the predictions.
 
-    simulated: effects that are simulated.  goals: for each target its key, left_out (neglected effects by change of the
-    RRMSD), blur and unreachable.  Those of the target with the largest blur are also entries of the plan itself.
+    simulated: effects that are simulated.  goals: for each target its key, left_out (neglected effects, ordered by
+    change of the RRMSD), blur and unreachable.  The plan repeats the entries of the target with the largest blur.
 
     unreachable: part of the target that light cannot reach (optics.reach.unreached); None: light reaches all of it.
 
-    blur: width (in its unit, and in pixels) of the image of an extended source through the coarse lens, and the RRMSD
-    of the target convolved with this image; None: a point source or parallel light.
+    blur: width (in the target's unit and in pixels) of the image of an extended source through the coarse lens, and the
+    RRMSD of the target convolved with this image; None: point source or collimated light.
 
     caveat: sentence that states how the lens of the estimates differs from the scene's; only if it differs.
 
-    verdict: {kind, sentence}; it comes with the effects if they determine it, see `verdict`.
+    verdict: {kind, sentence}; yielded with the effects if they determine the verdict, see `verdict`.
 
-    text: text of the scene file, whose lines are stated.  keys: keys that the command line overrides.  tick: called
+    text: text of the scene file, for line numbers.  keys: keys that the command line overrides.  tick: called
     regularly; an exception from it ends the plan.
     """
     at, scenes = toml_positions(text), scene.single_target_scenes()
@@ -113,7 +113,7 @@ def _goal_effects(scene: Scene, lens: Lens, key: str) -> dict[str, Any]:
 
 
 def reach_drawn(scene: Scene) -> tuple[bytes, ...]:
-    """Draw each target and the part of it that light can reach, as PNG; raise SceneError for a tailored front."""
+    """Draw each target and the part that light can reach, as PNG; raise SceneError for a tailored front."""
     from bstcad.report.drawing import png
     from bstcad.report.light_figures import View, reach_picture
 

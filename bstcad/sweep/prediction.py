@@ -1,9 +1,10 @@
 """Predict time, RRMSD and memory of a design from a pilot: a small version of the same design, run on this machine.
 
 Net, pixels, flux tubes and transport cells of a pilot are those of the scene divided by one factor.  A pixel therefore
-has as many control cells and tubes as in the scene, and the search makes as many evaluations.  The pilot includes
-everything in the scene (faces, goals, losses, wavelengths, bounds).  How the time of each stage scales with its sizes
-is known from the method.  A pilot contains no detail finer than its pixels; that part is measured on the picture.
+has as many control cells and tubes as in the scene, and the search as many evaluations.  The pilot includes all faces,
+goals, losses, wavelengths and bounds of the scene.  How the time of each stage scales with its sizes
+is known from the method.  A pilot contains no detail finer than its pixels; the error of this detail is estimated from
+the picture.
 
 tests/benchmarks/test_prediction.py compares predictions with designs of the templates and of the gallery.
 """
@@ -33,7 +34,7 @@ from bstcad.tailoring.run import RRMSD_SECONDS, Hooks, Task
 from bstcad.tailoring.slope_map import SUBCELLS
 from bstcad.tailoring.stage2 import round_shares, sheet_sizes, stage3_sheet_sizes
 
-Interval = tuple[float, float, float]  # low, likely, high
+Interval = tuple[float, float, float]  # (low, likely, high); nine of ten designs lie between low and high
 QUALITIES = ("draft", "standard", "fine")
 PILOT_QUALITIES = ("draft", "standard")  # qualities with a pilot; "fine" uses that of "standard"
 INTERVAL_FACTORS = {"seconds": 1.5, "rrmsd": 1.5, "memory_gb": 1.25}  # factors within which nine of ten designs lie
@@ -42,11 +43,11 @@ INTERVAL_FACTORS = {"seconds": 1.5, "rrmsd": 1.5, "memory_gb": 1.25}  # factors 
 
 PILOT_LIMITS = 128, 193, 512  # maximum pixels, control points and tubes per side of a pilot
 MIN_PILOT_POINTS = 65  # minimum control points per side of a pilot, unless its scene has fewer
-MIN_PILOT_TUBES = 16  # minimum tubes per side
+MIN_PILOT_TUBES = 16  # minimum tubes per side of a pilot
 PILOT_CELLS = (16, 256)  # minimum and maximum cells per side of the transport of a pilot
-PILOT_EFFORT = Effort(rays=2048, accuracy=0.02, witness=False)  # effort of its measurement
-SEARCH_STAGES = ("stage 2", "stage 3")  # beginnings of the names of the stages that search
-COARSE_ROUND_TEXT = " pixels, "  # text in the names of search rounds with few pixels, whose number does not scale
+PILOT_EFFORT = Effort(rays=2048, accuracy=0.02, witness=False)  # effort of the measurement of a pilot's RRMSD
+SEARCH_STAGES = ("stage 2", "stage 3")  # beginnings of the names of stages that use the minimiser
+COARSE_ROUND_TEXT = " pixels, "  # text in the names of rounds with few pixels, whose sizes do not scale
 
 
 @dataclass(frozen=True)
@@ -68,12 +69,12 @@ class Pilot:
     """Result of a small design."""
 
     scene: Scene  # scene of the small design
-    seconds: Seconds
+    seconds: Seconds  # times of its parts
     rrmsd: float  # largest RRMSD of all goals
     factor: float  # ratio of the pixels per side of the full scene to those of the pilot
     detail: float  # relative RMS of the detail of the full picture that is finer than the pilot's pixels
     blur: float  # RRMSD by blur of the source in the full scene minus that in the pilot
-    steep: Steepness  # slope that the back needs
+    steep: Steepness  # steepness that the map requires of the back
 
 
 def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
@@ -147,16 +148,16 @@ def blur_rrmsd(scene: Scene, lens: Lens) -> float:
 # --- predictions ------------------------------------------------------------------------------------------------------
 
 PILOT_EXPONENT = -0.6  # exponent by which the RRMSD scales with the factor of the pilot
-DETAIL_FACTORS = {"draft": 0.2, "standard": 0.02, "fine": 0.02}  # ratio of RRMSD to the detail that a pilot lacks
+DETAIL_FACTORS = {"draft": 0.2, "standard": 0.02, "fine": 0.02}  # RRMSD / detail that a pilot lacks, by quality
 FINE_RATIO = 0.7  # ratio of the RRMSD in fine to that in standard quality
 REMAINING_BLUR = 0.5  # fraction of the blur by an extended source that remains after stage 3
 
 
 def predict(scene: Scene, pilots: Mapping[str, Pilot], gain: float = 1.0) -> dict[str, dict[str, Interval]]:
-    """Predict time (seconds), RRMSD and memory (GB, both processes) for each quality from pilots of PILOT_QUALITIES.
+    """Predict time (seconds), RRMSD and memory (GB, two processes) for each quality from pilots of PILOT_QUALITIES.
 
-    The RRMSD does not increase from one quality to the next better one.  gain: ratio of the RRMSD to that of the
-    pilots' net, for a scene with another net.
+    The RRMSD does not increase from a quality to the next better quality.  gain: ratio of the RRMSD of the scene's net
+    to the RRMSD of the pilots' net.
     """
     best, intervals = math.inf, {}
     for quality in QUALITIES:
@@ -170,7 +171,7 @@ def predict(scene: Scene, pilots: Mapping[str, Pilot], gain: float = 1.0) -> dic
 
 
 def predicted_rrmsd(pilot: Pilot, quality: str) -> float:
-    """Return the RRMSD of a full design from that of its pilot and from the detail and blur that the pilot lacks."""
+    """Return the RRMSD of a full design from the RRMSD of its pilot, and detail and blur that the pilot lacks."""
     by_pilot = (FINE_RATIO if quality == "fine" else 1.0) * pilot.factor**PILOT_EXPONENT * pilot.rrmsd
     return by_pilot + DETAIL_FACTORS[quality] * pilot.detail + REMAINING_BLUR * pilot.blur
 
@@ -184,31 +185,31 @@ def predicted_seconds(scene: Scene, pilot: Pilot) -> float:
 
 # --- sizes ------------------------------------------------------------------------------------------------------------
 
-# Sizes (per side, or number of iterations) for which the following times and memory are stated, on two cores of pace 1.
+# Sizes (per side, or iterations) for which the following times (s) and memory (GB) are stated, on two cores of pace 1.
 UNIT_TUBES, UNIT_POINTS, UNIT_PIXELS, UNIT_GRID, UNIT_ITERATIONS = 1024, 513, 512, 256, 40
-KERNEL_SECONDS = 0.115  # cold_run.calibration_kernel
+KERNEL_SECONDS = 0.115  # evaluation of cold_run.calibration_kernel
 ROUND_SECONDS, TRANSPORT_SECONDS, FIT_SECONDS = 0.06, 0.2, 0.6  # stage 1: a round, a transport, a slope fit
 TWO_FACE_TRANSPORT_SECONDS = 2.4  # transport behind two freeform faces, where the light between them is traced
-TWO_FACE_SECONDS = 3.0  # part of stage 1 of two freeform faces that does not scale
+TWO_FACE_SECONDS = 3.0  # part of stage 1 of two freeform faces that is independent of sizes
 AIMING_SECONDS = 1.0  # search for the rays from a point source through UNIT_TUBES² given points
 FRONT_SECONDS = 1.7  # search for a curved front
-EVALUATION_SECONDS, VARIABLE_SECONDS, BLUR_SECONDS = 0.11, 0.046, 0.30  # evaluation: by tubes, control points, pixels
-CALL_SECONDS = 0.01  # part of an evaluation that does not scale
+EVALUATION_SECONDS, VARIABLE_SECONDS, BLUR_SECONDS = 0.11, 0.046, 0.30  # evaluation: tubes, control points, pixels
+CALL_SECONDS = 0.01  # part of an evaluation that is independent of sizes
 IMAGE_SECONDS = 0.7  # images of an extended source, in each round
 ADAM_SECONDS = 0.1  # step of the paper's procedure
 START_SECONDS = 2.8  # imports, and end of the process
-WRITE_SECONDS, NET_SECONDS, PICTURE_SECONDS = 1.5, 2.4, 1.1  # writing, proof and report: fixed, by points, by pixels
-MOUNT_SECONDS = 2.5  # cut and proof of the mounted part
+WRITE_SECONDS, NET_SECONDS, PICTURE_SECONDS = 1.5, 2.4, 1.1  # output: constant, control points, pixels
+MOUNT_SECONDS = 2.5  # cutting and verification of the mounted part
 RAY_SECONDS, DRAFT_RAY_SECONDS = 1.6, 1.0  # rays of a proof, for a target and a wavelength; parallel light
 WITNESS_SECONDS, DRAFT_WITNESS_SECONDS = 6.0, 2.5  # finer flux tubes for a second net, for a target
 LIBRARIES_GB = 1.5  # libraries in both processes
 TUBES_GB, NET_GB, PIXELS_GB = 0.12, 0.27, 0.02  # tubes, control points, pixels
-GOAL_MEMORY_FACTOR = 3.0  # memory of tubes for each of several goals, relative to that for one target
+GOAL_MEMORY_FACTOR = 3.0  # memory of tubes per goal with several goals / memory with one target
 
 
 @cache
 def pace() -> float:
-    """Return the time of this machine for a calibration kernel, divided by KERNEL_SECONDS; 0.5: twice as fast."""
+    """Return the time of the calibration kernel on this machine divided by KERNEL_SECONDS; 0.5: twice as fast."""
     return min(measure_seconds(calibration_kernel()) for _ in range(KERNEL_REPEATS)) / KERNEL_SECONDS
 
 
@@ -249,7 +250,7 @@ def search_rounds(scene: Scene) -> tuple[tuple[int, int], ...]:
 
 
 def memory_gb(scene: Scene) -> float:
-    """Return the peak memory (GB) of both processes of a design together."""
+    """Return the peak memory (GB) of the two processes of a design together."""
     goals = len(scene.targets) + (scene.wavefront is not None)
     by_goals = GOAL_MEMORY_FACTOR * goals if goals > 1 else 1.0
     corners = max(tubes for tubes, _ in search_rounds(scene)) ** 2 / UNIT_TUBES**2 * by_goals
@@ -257,7 +258,7 @@ def memory_gb(scene: Scene) -> float:
 
 
 def proof_seconds(scene: Scene) -> float:
-    """Return the time (seconds) of writing, proof and report on two cores of pace 1; pipeline.reserve is larger."""
+    """Return the time (s) of writing, verification and report on two cores of pace 1; `pipeline.reserve` is larger."""
     wide = not scene.source.parallel or scene.source.extent is not None
     draft = scene.tailoring.quality == "draft"
     rays, witness = (DRAFT_RAY_SECONDS, DRAFT_WITNESS_SECONDS) if draft else (RAY_SECONDS, WITNESS_SECONDS)

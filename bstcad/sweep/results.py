@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 # --- the table --------------------------------------------------------------------------------------------------------
 
-MIN_FRONT_RUNS = 3  # minimum number of runs of a front to which a power law is fitted
+MIN_FRONT_RUNS = 3  # smallest number of runs on a front to which a power law is fitted
 TRADEOFF_COLUMNS = (
     "knobs", "settings", "status", "seconds", "cpu_seconds", "kernel_seconds", "units", "rrmsd", "rrmsd_noise",
     "rrmsd_reported", "peak_memory_gb", "on_front", "predicted_seconds", "cost_seconds", "where", "reason",
@@ -52,7 +52,7 @@ class KnobPoint(StoredRecord):
 
     label: str  # value of the knob in words
     settings: StoredSettings  # settings of the run
-    seconds: float | None  # median time; null: the times are not comparable
+    seconds: float | None  # median time (s); null: times are not comparable
     rrmsd: float  # median RRMSD by the reference
     lowest: float  # lowest RRMSD of all seeds
     highest: float  # highest RRMSD of all seeds
@@ -70,9 +70,9 @@ class TableKnob(StoredRecord):
 class Calibration(StoredRecord):
     """Time of the calibration kernel during the sweep."""
 
-    seconds: float | None  # median
-    lowest: float | None  # minimum
-    highest: float | None  # maximum
+    seconds: float | None  # median (s)
+    lowest: float | None  # minimum (s)
+    highest: float | None  # maximum (s)
     what: str = (
         "merit and gradient of 1024² flux tubes through a fixed lens of 257² control points, 512² pixels; the fastest "
         "of three evaluations, in the process of the sweep, before each run"
@@ -89,7 +89,7 @@ class Preset(StoredRecord):
     """Quality preset that was run."""
 
     name: str  # draft, standard or fine
-    seconds: float | None  # time of its run
+    seconds: float | None  # time of the run (s)
     rrmsd: float  # RRMSD by the reference
 
 
@@ -99,22 +99,22 @@ class TradeoffTable(StoredRecord):
     name: str  # name of the scene
     title: str  # title of the scene
     base: dict[str, Any]  # base scene: quality, control_points, pixels, knobs (tailoring settings with their defaults)
-    budget_seconds: float  # budget
-    spent_seconds: float  # time spent by all runs
+    budget_seconds: float  # budget (s)
+    spent_seconds: float  # time spent by all runs (s)
     errors_alone: bool  # true if all lenses are from other machines, so that there are no times and no front
     version: str  # version of bstcad
     sources: str  # version of bstcad with a hash of its sources
     machine: dict[str, Any]  # machine on which the times were measured
     versions: dict[str, str]  # versions of the libraries, by name
-    reference: dict[str, Any]  # reference that judges all runs: rays (numbers of rays, ascending), what (in words)
-    calibration: Calibration  # speed of the machine
+    reference: dict[str, Any]  # reference for the RRMSD: rays (numbers of rays, ascending), what (in words)
+    calibration: Calibration  # times of the calibration kernel
     runs: tuple[ColdRun, ...]  # runs, the most important first, without PRIVATE_FIELDS
     knobs: tuple[TableKnob, ...]  # knobs that were varied
     front: tuple[StoredSettings, ...]  # settings of the runs on the Pareto front, the fastest first
     front_halving: float | None  # factor of the time that halves the error along the front
     presets: tuple[Preset, ...]  # quality presets, each as a run
     seeds: dict[str, bool | None]  # true if another seed gives another lens, by method; null: not measured
-    history: tuple[HistoryPoint, ...]  # convergence of the run of the base scene, by its own tubes
+    history: tuple[HistoryPoint, ...]  # convergence of the run of the base scene, by the tubes used for tailoring
 
     @property
     def runs_with_lens(self) -> list[ColdRun]:
@@ -201,8 +201,8 @@ KNOB_STYLES = {
 }
 FIGURE_WIDTH, FIGURE_HEIGHT = 10.0, 7.4  # inches
 AXIS_MARGIN = 1.25  # factor between the outermost points and the ends of the axes
-MAX_FLOOR_DISTANCE = 6.0  # maximum factor below the smallest error to which the axis extends for the standard error
-DARK_RRMSD = 1.0  # RRMSD of darkness; axes are not scaled for larger ones
+MAX_FLOOR_DISTANCE = 6.0  # smallest RRMSD / lower end of the axis, at most, to show the standard error
+DARK_RRMSD = 1.0  # RRMSD of a dark picture; axes do not extend to larger RRMSDs
 THIN_LINE: dict[str, Any] = {"lw": 0.9, "zorder": 1}  # style of the convergence and of the standard error
 FRONT_STYLE: dict[str, Any] = {"color": "#f0c80073", "lw": 5.5, "solid_joinstyle": "round", "solid_capstyle": "round"}
 RING_STYLE: dict[str, Any] = {

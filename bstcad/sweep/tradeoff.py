@@ -1,8 +1,8 @@
 """Command `bstcad tradeoff`: measure what accuracy costs in time for a scene, by runs within a budget of seconds.
 
-A run is the base scene with some settings.  One knob is varied at a time, then pairs of knobs.  The budget is the sum
-of the times of all runs of all sweeps in a folder, on any machine.  A run that is predicted to exceed it is not
-started.  A run that takes longer than predicted is ended when it exceeds the budget by MAX_OVERRUN.
+A run is a design of the base scene with some settings changed.  One knob (setting) is varied at a time, then pairs.
+The budget limits the sum of the times of all runs of all sweeps in a folder, on any machine.  A run that is predicted
+to exceed the budget is not started.  A run that takes longer is stopped when it exceeds the budget by MAX_OVERRUN.
 
 The folder contains the base scene (scene/), the record of each run (runs/), and the results (results.py).  A run with a
 record is not repeated, so an interrupted sweep continues, and a larger budget adds runs.
@@ -41,9 +41,9 @@ HALF, SQRT_HALF = 0.5, 0.5**0.5
 POINT_LIMITS = (9, 1025)  # minimum and maximum control points per side
 GRID_LIMITS = (32, 2048)  # minimum and maximum transport cells per side
 PIXEL_LIMITS = (8, 4096)  # minimum and maximum pixels per side
-COUNT_LIMITS = (1, 16_384)  # minimum and maximum of all other numbers
+COUNT_LIMITS = (1, 16_384)  # minimum and maximum of all other varied numbers
 ROUND_COUNTS = (1, 2, 3, 5, 8)  # numbers of rounds of transport and slope fit in stage 1
-ADAM_FRACTIONS = (1 / 8, 1 / 4, 1 / 2, 1.0)  # steps of Wang et al.'s procedure, as fractions of the preset's
+ADAM_FRACTIONS = (1 / 8, 1 / 4, 1 / 2, 1.0)  # steps of the procedure of Wang et al. / steps of the preset
 
 Points = Mapping[str, Settings]  # points of a knob by label ("768"), in the order of increasing work
 
@@ -54,12 +54,12 @@ class Knob:
 
     key: str  # name for programs, such as "tubes"
     title: str  # name in words, such as "Flux tubes per side"
-    points: Points
-    combines: bool = False  # True if it changes several keys at a time
+    points: Points  # values of the setting
+    combines: bool = False  # True if the knob changes several keys at a time
 
 
 def other_seed(scene: Scene, point: Settings) -> Settings:
-    """Return the settings with the seed of the scene plus one."""
+    """Return the settings with another seed: that of the scene plus one."""
     return sorted_settings({**dict(point), "tailoring.seed": scene.tailoring.seed + 1})
 
 
@@ -146,7 +146,7 @@ def _pixels(scene: Scene) -> Points:
 
 
 def _adam_points(own: bool) -> Points:
-    """Return points of Wang et al.'s procedure with fewer steps; the last one is the preset."""
+    """Return points of the procedure of Wang et al. with fewer steps; the last point is the preset."""
     points = {}
     for factor in ADAM_FRACTIONS:
         steps = {name: round(factor * PRESETS["paper"][name]) for name in ("stage1_iterations", "stage2_iterations")}
@@ -174,7 +174,7 @@ def _joint_points(*varied: tuple[str, Any, Sequence[float]]) -> Points:
 
 
 def run_order(scene: Scene, knobs: Sequence[Knob]) -> list[Settings]:
-    """Return all runs, the most important first, so that any budget is well spent.
+    """Return all runs, the most important first, so that any budget gives the most useful runs.
 
     Presets come first, then neighbours of the base, other seeds, further points, and the paper's procedure.
     """
@@ -194,9 +194,9 @@ def run_order(scene: Scene, knobs: Sequence[Knob]) -> list[Settings]:
 
 
 def _neighbour(knob: Knob, steps: int) -> list[Settings]:
-    """Return the point that is so many steps from the base, if there is one.
+    """Return the point that is `steps` steps from the base, or [] if there is none.
 
-    For a knob without the base, the first point counts as the neighbour with less work, the second as that with more.
+    If the base is not a point of the knob, the first point is the neighbour with less work, the second with more work.
     """
     points = list(knob.points.values())
     start = points.index(()) if () in points else 1 if steps == -1 else 0 if steps > 0 else -1
@@ -204,7 +204,7 @@ def _neighbour(knob: Knob, steps: int) -> list[Settings]:
 
 
 def _probes(scene: Scene, knobs: Sequence[Knob]) -> dict[str, tuple[Settings, Settings]]:
-    """Return for each method a fast run, and the same run with another seed."""
+    """Return for each method the settings of a fast run, and these settings with another seed."""
     by_key = {knob.key: knob.points for knob in knobs}
     quick = {"least-squares": by_key["quality"].get("draft"), "adam": next(iter(by_key.get("adam", {}).values()), None)}
     return {method: (point, other_seed(scene, point)) for method, point in quick.items() if point is not None}
@@ -221,9 +221,9 @@ def seed_matters(scene: Scene, knobs: Sequence[Knob], runs: Mapping[Settings, Co
 
 # --- the sweep --------------------------------------------------------------------------------------------------------
 
-SAFETY_FACTOR = 1.1  # ratio of the remaining to the predicted time from which a run is started
+SAFETY_FACTOR = 1.1  # smallest ratio of remaining to predicted time at which a run is started
 MAX_OVERRUN = 0.1  # fraction of the budget by which a run may exceed it
-RETRY_FACTOR = 1.5  # ratio of the available time to the earlier limit from which an ended run is repeated
+RETRY_FACTOR = 1.5  # smallest ratio of available time to the earlier limit at which a stopped run is repeated
 REFERENCE_TEXT = (
     "stratified rays that were not used in tailoring, in independent sets, until the standard error is below {:.2%} of "
     "the RRMSD; {} pixels; the lens as read back from its folder"
@@ -242,8 +242,8 @@ def tradeoff(
 ) -> TradeoffTable:
     """Do the most important runs that the budget allows, and write tradeoff.csv, .json, .png and .html.
 
-    machines: machines of the runs; None: this one.  The csv and json files are written after each run, so that an
-    interrupted sweep has them.
+    machines: machines of the runs; None: this machine.  The csv and json files are written after each run, so that they
+    exist after an interruption.
     """
     scene = scene.changed({"tailoring.accuracy": None, "tailoring.max_time": None})  # these end a design early
     base, _ = with_net(scene)
@@ -262,7 +262,7 @@ def tradeoff(
             if count := len(sweep.runs):
                 runs = "1 run is" if count == 1 else f"{count} runs are"
                 error.add_note(f"{runs} stored in {folder}; the same command continues from there")
-                if isinstance(error, KeyboardInterrupt):  # after Ctrl-C there is time for a figure
+                if isinstance(error, KeyboardInterrupt):  # after Ctrl-C there is still time to draw a figure
                     results.write_page(sweep.table(), base, folder)
             raise
         result = sweep.table()
@@ -281,7 +281,7 @@ def check_free(folder: Path, contents: cold_run.SceneFiles) -> None:
     if stored_scene.is_file() and any(not path.is_file() or path.read_bytes() != data for path, data in paths.items()):
         raise SceneError(
             f"{folder}: contains the sweep of another scene, {stored_scene}; give another folder with -o, or remove "
-            "that one"
+            "this folder"
         )
 
 
@@ -290,14 +290,14 @@ class _Sweep:
         self._base, self._budget, self._folder, self._progress = base, budget, folder, progress
         self._knobs = knobs(base)
         self._order, self._work = run_order(base, self._knobs), cache(partial(predicted_work, base))
-        self._under_way: dict[Settings, tuple[float, float]] = {}  # (start time, predicted seconds) of running runs
+        self._under_way: dict[Settings, tuple[float, float]] = {}  # (start time, predicted seconds) of current runs
         self._file = folder / "runs" / f"{environment.version()}.json"
         self.runs: dict[Settings, ColdRun] = {}  # runs that have ended
         if self._file.is_file():
             stored = cold_run.read_record(RunFile, self._file, "remove it, and its runs are repeated")
             self.runs = {run.settings: run for run in stored.runs}
         for point, run in list(self.runs.items()):
-            if run.allowed_seconds is not None:  # its time was limited; repeat it if there is more time now
+            if run.allowed_seconds is not None:  # the run was stopped at a limit; repeat it if there is more time now
                 left = budget - self._spent() + (run.cost_seconds or 0.0)
                 if left + MAX_OVERRUN * budget >= RETRY_FACTOR * run.allowed_seconds:
                     del self.runs[point]
@@ -326,7 +326,7 @@ class _Sweep:
         failed: dict[str, Any] = {"status": cold_run.FAILED, "reason": answer.reason, "version": environment.version()}
         run = answer.value or ColdRun(settings=answer.key, **failed)
         self.runs[answer.key] = run.model_copy(update={"predicted_seconds": predicted, "where": answer.where})
-        real = (run for run in self.runs.values() if run.cost_seconds)  # runs that were not started are tried again
+        real = (run for run in self.runs.values() if run.cost_seconds)  # runs that were not started may start now
         cold_run.write_record(self._file, RunFile(runs=tuple(real)))
         self.table()
 
@@ -347,7 +347,7 @@ class _Sweep:
         return next((point for point in free if SAFETY_FACTOR * self._predicted(point) <= left), None)
 
     def _predicted(self, point: Settings) -> float:
-        """Predict the seconds of the budget that a run takes: estimate times the measured pace of its method."""
+        """Predict the seconds that a run takes of the budget: the estimate times the measured pace of its method."""
         is_adam, seconds = self._work(point)
         paces: dict[bool, list[float]] = {True: [], False: []}
         for run in filter(lambda run: run.done, self.runs.values()):
@@ -356,7 +356,7 @@ class _Sweep:
         return seconds * statistics.median(paces[is_adam] or paces[not is_adam] or [1.0])
 
     def _left(self) -> float:
-        """Return the seconds of the budget that remain after the predicted end of the running runs."""
+        """Return the seconds of the budget that remain after the predicted end of the current runs."""
         running = sum(predicted for _, predicted in self._under_way.values())
         return self._budget - self._spent() - SAFETY_FACTOR * running
 
@@ -374,11 +374,11 @@ class _Sweep:
 
 # --- predicted seconds of runs ----------------------------------------------------------------------------------------
 
-JUDGING_SECONDS = 2.0  # time of the reference for a lens
+JUDGING_SECONDS = 2.0  # time of the reference for a lens (s)
 
 
 def predicted_work(scene: Scene, point: Settings) -> tuple[bool, float]:
-    """Return True for the paper's procedure, and the seconds on a machine of pace 1; a refused run only starts."""
+    """Return (True for the paper's procedure, seconds on a machine of pace 1); a refused run takes only its start."""
     try:
         changed = scene.changed(dict(point))
     except SceneError:
@@ -391,7 +391,7 @@ def predicted_work(scene: Scene, point: Settings) -> tuple[bool, float]:
 
 
 def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: float = math.inf) -> TradeoffTable:
-    """Return the table of all runs: those that have ended, then those that wait, each in the order of importance."""
+    """Return the table of all runs: runs that have ended, then runs not yet done, each by importance."""
     own, best = scene.lens.back.net, pareto_front(runs)
     comparable = {run.settings: run for run in runs if run.comparable}
     selected = comparable or {run.settings: run for run in runs if run.done}
@@ -446,7 +446,7 @@ def _judged_on(scene: Scene) -> str:
 def knob_points(
     scene: Scene, knob: Knob, runs: Mapping[Settings, ColdRun], timed: bool = True
 ) -> tuple[KnobPoint, ...]:
-    """Return the points of a knob that were run with either seed; timed: True if times are comparable."""
+    """Return the points of a knob that were run, as medians over the seeds; timed: True if times are comparable."""
     averages = []
     for label, point in knob.points.items():
         if done := [runs[each] for each in (point, other_seed(scene, point)) if each in runs and runs[each].done]:
@@ -459,7 +459,7 @@ def knob_points(
 
 
 def _knob_keys(knobs: Sequence[Knob], point: Settings) -> tuple[str, ...]:
-    """Return the keys of the knobs that have these settings as a point, with any seed."""
+    """Return the keys of the knobs with a point at these settings, with any seed."""
     without = tuple(entry for entry in point if entry[0] != "tailoring.seed")
     return tuple(knob.key for knob in knobs if without in knob.points.values()) if without else ("base",)
 
