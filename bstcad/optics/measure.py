@@ -90,7 +90,7 @@ class Witness:
 
     rrmsd: float  # RRMSD of the tubes' picture
     difference: float  # RRMSD between the pictures by tubes and by rays, without bias
-    limit: float  # largest difference allowed: root square sum of tolerance and noise, or error of the tubes if larger
+    limit: float  # largest difference allowed: tolerance and noise in quadrature, or the error of the tubes if larger
     tubes: int  # number of tubes per side
 
 
@@ -108,7 +108,7 @@ class Light:
     witness: Witness | None = None  # None: an extended source, losses, no kernel for this lens, or not requested
     ghost: np.ndarray | None = field(default=None, repr=False)  # ghost's part of the picture; None: no ghost is traced
     leak: Leak | None = None  # leak of the rays' mean picture before smoothing; None: the target has no dark pixel
-    rrmsd_whole: float | None = None  # RRMSD from the whole picture of which the target is a part; None: it is no part
+    rrmsd_whole: float | None = None  # RRMSD from the whole picture if the target is a part of it; None: it is whole
 
     @property
     def efficiency(self) -> float:

@@ -12,7 +12,7 @@ followed: one that lies in one pixel or has no area gives its flux to a pixel, a
 invalid corner gives none.  Their edges get the density 0, so that they do not affect their neighbours.
 
 With G = ∂L/∂I and H(x, y) = ∫_y^∞ G dy the adjoint needs for each edge Φ = ∫ H dx (for ∂L/∂A) and ∫ (1 - s) G ds,
-∫ s G ds (an edge that moves by δ sweeps the area δ · n ds, n its normal).  They are the same for the two triangles.
+∫ s G ds (an edge that moves by δ sweeps the area δ · n ds, n its normal).  These are equal for the two triangles.
 
 All lengths are in pixels, x along columns, y down the rows.  Columns come first in the sums, as x does in a sheet of
 tubes: the rows of tubes of one part reach few columns.
@@ -31,7 +31,7 @@ from torch import Tensor
 from bstcad.optics.kernels import reductions
 from bstcad.optics.kernels.compiling import compiled
 
-MAX_DISTANCE = 1e15  # largest coordinate of a corner (pixels); farther away a pixel is below its rounding
+MAX_DISTANCE = 1e15  # largest coordinate of a corner (pixels); farther away, rounding exceeds a pixel
 NO_BORDER = 1e300  # s of the next border of an edge that crosses no more borders along an axis
 MAX_WIDTH = 1e6  # width of a row of tubes (pixels) above which rounding may reach any column
 ROWS_PER_STRIP = 16  # rows of tubes whose gradient one thread computes at a time
@@ -250,7 +250,7 @@ def _add_to_pixel(sums, i, j, flux):
 
 @inlined
 def _density(sums, thinnest, a, b, c, flux):
-    """Return the flux per area of a triangle; add the flux of one that is not followed to a pixel, and return 0."""
+    """Return the flux per area of a triangle; if it is not followed, add its flux to a pixel and return 0."""
     if misses_screen(a, b, c) or flux == 0.0:
         return 0.0
     i, j, state = a[2], a[3], a[4]

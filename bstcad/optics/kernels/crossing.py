@@ -1,14 +1,14 @@
 """Fused CPU kernels (numba) behind `trace.through` and `trace.behind`: rays across a spline face, and the adjoint.
 
 Rays are processed in blocks (forward.py).  The forward pass stores each ray's path to the face; the adjoint computes
-hit and slopes from it again.
+hit and slopes from this path again.
 
 With the ray x + t d, the face's normal n = (-p, -q, 1) of its slopes p and q, and F(t) = z - sag, the hit X moves by
 
     dX = dx + t dd + d dt,   dt = (dsag - n · (dx + t dd)) / (n · d),   dp = S_xx dX_x + S_xy dX_y, dq likewise,
 
-and the direction behind the face is e = η d + s n, s(p, q, n · d) by the law.  The adjoint is the transpose of this.
-It is computed for the net, and for x and d where these need a gradient.
+and the direction behind the face is e = η d + s n, s(p, q, n · d) by the law.  The adjoint is the transpose of this
+map. It is computed for the net, and for x and d where these need a gradient.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from bstcad.optics.receivers import Receiver
 # Further offsets in `work` for the adjoint: ∂L/∂ of landing or hit and direction, of path and cosine of incidence, and
 # second derivatives of the sag.
 G_X, G_Y, G_PATH, G_COSINE, H_XX, H_XY, H_YY, G_Z, G_DX, G_DY, G_DZ = (WORK + BLOCK * k for k in range(11))
-ADJOINT_WORK = WORK + 11 * BLOCK
+ADJOINT_WORK = WORK + 11 * BLOCK  # length of `work` for the adjoint
 
 
 @njit(error_model="numpy")

@@ -33,7 +33,7 @@ BLOCK = 256  # rays in a block
 # Offset of each quantity in `work`; constants, so that the compiler sees that they do not overlap.
 X, Y, Z, DX, DY, DZ, FLUX, FATE, S, SAG, SLOPE_X, SLOPE_Y, U, V, U_S, V_S = (BLOCK * k for k in range(16))
 COS_FRONT, COS_BACK, PATH = (BLOCK * k for k in range(16, 19))  # offsets used only where there are losses
-WORK = 19 * BLOCK
+WORK = 19 * BLOCK  # length of `work`
 
 
 @njit(error_model="numpy")
@@ -80,7 +80,7 @@ def reflect(turned, count, work):
 
 @njit(error_model="numpy")
 def first_root(net, faces, x, y, z, dx, dy, dz):
-    """Return (s, found): path of a ray steep to the net to its first crossing (interfaces.py); z: over its plane."""
+    """Return (s, found): path of a ray steep to the net to its first crossing (interfaces.py); z: above its plane."""
     last_u, last_v, floor = faces.m - 1.0, faces.n - 1.0, faces.rules.min_derivative
     u, v, u_s, v_s = (x - faces.x) * faces.per_x, (y - faces.y) * faces.per_y, dx * faces.per_x, dy * faces.per_y
     rate = abs(dz) + faces.steepest_x * abs(dx) + faces.steepest_y * abs(dy)
@@ -169,7 +169,7 @@ def search(net, faces, count, work, active):
 
 @njit(error_model="numpy")
 def at_back(faces, count, work):
-    """Move rays to the back face; lose those outside its clear aperture, with the hit behind them or tangent to it."""
+    """Move rays to the back face; lose rays outside its clear aperture, behind their hit or tangent to it."""
     for r in range(count):
         s, dx, dy, dz = work[S + r], work[DX + r], work[DY + r], work[DZ + r]
         x, y = work[X + r] + s * dx, work[Y + r] + s * dy
@@ -525,7 +525,7 @@ def _is_same(one: Lens, other: Lens) -> bool:
 def land(source: Emitter, lens: Lens, plane: Receiver, x: Tensor, y: Tensor) -> Landed:
     """Trace rays through (x, y) of the first vertex's plane, each (n,) float64, to `plane`; flux: density at (x, y).
 
-    It is `trace.trace` of `source.rays(x, y, lens.entrance.z, 1.0)`, except for the fate of rays without flux.
+    Equal to `trace.trace` of `source.rays(x, y, lens.entrance.z, 1.0)`, except for the status of rays without flux.
     """
     scene = *_scene(source, lens, plane), NO_LOSS_TABLES
     landing, flux, fate = np.empty((2, x.numel())), np.empty(x.numel()), np.empty(x.numel(), np.uint8)

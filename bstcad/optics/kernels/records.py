@@ -58,7 +58,7 @@ class Beam(NamedTuple):
     n_y: float = 0.0
     n_z: float = 1.0
     least: float = 0.0  # smallest cosine to the axis at which there is light
-    table: LightTable = NO_TABLE
+    table: LightTable = NO_TABLE  # table of the light
 
 
 class Rules(NamedTuple):
@@ -79,8 +79,8 @@ class Fates(NamedTuple):
 
     missed_front: float  # status of rays that miss the front
     missed_back: float  # status of rays that miss the net
-    reflected: float  # status of rays that the law of the net does not let through
-    turned: float  # status of rays that go away from the screen
+    reflected: float  # status of rays that the law of the net blocks
+    turned: float  # status of rays that lead away from the screen
 
 
 class TiltedScreen(NamedTuple):

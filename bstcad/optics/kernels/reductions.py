@@ -140,7 +140,7 @@ def on_threads(work: Callable[..., None], tasks: Sequence[tuple[Any, ...]]) -> N
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Return the pool of threads; to start threads takes longer than the few rays of a preview."""
+    """Return the pool of threads; starting threads takes longer than tracing the few rays of a preview."""
     return ThreadPoolExecutor(threads)
 
 
