@@ -84,10 +84,10 @@ def ray_map(source: Emitter, lens: Lens, plane: Receiver) -> tuple[np.ndarray, n
 
 # --- clear apertures needed -------------------------------------------------------------------------------------------
 
-NEEDED_RAYS = 513  # rays per side
+NEEDED_RAYS = 513  # rays per side for `needed_apertures`
 ROUND_RATIO = 1.01  # largest ratio of the radius to half width and half height of light that counts as round
 EXTENT_POINTS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # points of an extended source, in half extents
-FULL_APERTURE = 0.99  # extent of the light, relative to the clear aperture, from which on it fills the face
+FULL_APERTURE = 0.99  # smallest extent of the light / clear aperture at which light fills the face
 
 
 def needed_apertures(source: Emitter, lens: Lens) -> dict[str, Outline | None]:
@@ -198,7 +198,7 @@ def _misses_opening(rays: Sequence[Rays], rim: Outline, planes: Iterable[float])
 
 # --- margins of the trace ---------------------------------------------------------------------------------------------
 
-MARGIN_RAYS = 512  # rays per side
+MARGIN_RAYS = 512  # rays per side for `margins`
 
 
 @dataclass(frozen=True)
@@ -255,7 +255,7 @@ class Blur:
     closer to the target than the blurred target is.
     """
 
-    width: float  # diameter of the uniform disc with the same RMS distance from the centroid, in `unit`
+    width: float  # diameter of the uniform disc with the image's RMS distance from the centroid, in `unit`
     pixels: float  # width in pixels
     rrmsd: float  # RRMSD between the target and the target convolved with the mean image
     unit: str = "mm"  # unit of the receiver

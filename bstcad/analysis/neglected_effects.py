@@ -106,7 +106,7 @@ class Reference:
 
     @cached_property
     def spline(self) -> Spline:
-        """Picture as a spline."""
+        """Picture as a spline, for shifts by fractions of a pixel."""
         return Spline.through(self.picture, self._cell_width())
 
     @torch.no_grad()
@@ -164,7 +164,7 @@ class Reference:
 
     @torch.no_grad()
     def ghost(self, channel: Channel) -> Change | None:
-        """Return the change by light reflected twice inside the lens; channel: with the losses at the faces."""
+        """Return the change by light reflected twice inside the lens; channel: one with losses at the faces."""
         if not self.lit:
             return None
         lens, source = channel.through(self.lens), channel.source

@@ -187,7 +187,7 @@ class BSplineSurface(Surface):
     Heights are stored relative to the plane z0 so that float32 resolves nanometres.
     """
 
-    z: float  # z0, the plane the heights are measured from (mm)
+    z: float  # z0, the plane from which the heights are measured (mm)
     heights: Tensor  # heights of the control points (m, n), mm, x along the first axis
     x: tuple[float, float]  # extent of the net in x: first and last control point (mm)
     y: tuple[float, float]  # extent of the net in y (mm)

@@ -32,7 +32,7 @@ NEWTON_STEPS = 20  # maximum number of Newton steps, after which a ray misses; a
 APPROACH_STEPS = 200  # maximum number of steps of the approach, after which a ray misses the face
 SIDE_EXIT_COSINE = 1e-2  # largest |d_z| at which a steep ray leaves through a side
 MIN_NEWTON_DERIVATIVE = 1e-3  # lower bound of |F'| as the divisor of a Newton step; its sign is kept
-STEPS_BEFORE_RIM_CHECK = 3  # Newton steps before rays outside the net are looked for; most rays have converged by then
+STEPS_BEFORE_RIM_CHECK = 3  # Newton steps before rays outside the net are identified; most rays then have converged
 APPROACH_DISTANCE = 1e-5  # distance below the face at which an approach ends, as a fraction of the net's half width
 
 
@@ -54,7 +54,7 @@ class Refract:
 
     @property
     def eta(self) -> float:
-        """Return η = n_in / n_out, the factor of the incident direction in the refracted one."""
+        """Return η = n_in / n_out, the factor of the incident direction in the refracted direction."""
         return self.n_in / self.n_out
 
     def deflection(self, cos_in: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -107,7 +107,7 @@ class Interface:
     outline: Outline  # clear aperture; light that meets the surface outside it is lost
     law: Law
     status_if_missed: Status  # status of rays that do not meet the surface inside the outline
-    losses: tuple[Loss, ...] = ()  # losses in the order of the light; (): the paper's lossless refraction
+    losses: tuple[Loss, ...] = ()  # losses in the order in which light meets them; (): no losses
 
     @property
     def net(self) -> BSplineSurface:
@@ -228,7 +228,7 @@ class NetBounds(NamedTuple):
 
     steepest_x: float  # upper bound of |∂z/∂x| on the surface
     steepest_y: float  # upper bound of |∂z/∂y| on the surface
-    lowest: float  # lower bound of the heights, counted along the light (mm, from the surface's plane)
+    lowest: float  # lower bound of the heights, measured along the light (mm, from the surface's plane)
     tolerance: float  # |F| at or below which the root search stops (mm)
     near: float  # -F at or below which an approach ends (mm)
 

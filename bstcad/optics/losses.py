@@ -176,8 +176,8 @@ class FresnelLoss:
 class Losses:
     """Losses at the faces and in the glass of a lens, for light of one wavelength."""
 
-    fresnel: FresnelLoss | None = None  # reflection at the faces; None: none
-    absorption: AbsorptionLoss | None = None  # absorption in the glass; None: none
+    fresnel: FresnelLoss | None = None  # reflection at the faces; None: no such loss
+    absorption: AbsorptionLoss | None = None  # absorption in the glass; None: no such loss
     own: tuple[CustomLoss, ...] = ()  # losses defined by scripts or packages
 
     def on(self, interfaces: Sequence[Interface]) -> tuple[Interface, ...]:

@@ -565,7 +565,7 @@ def detail_width(source_image: float, pixel: float) -> float:
 
 @torch.no_grad()
 def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMAGE_POINTS_PER_SIDE) -> ImageSamples:
-    """Return the images of the source through the lit points of an n x n grid on the back, at the first line."""
+    """Return the source's images through the lit points of an n x n grid on the back, at the first spectral line."""
     first = channels[0]
     channels = [c for c in channels if (c.source.wavelength, c.index) == (first.source.wavelength, first.index)]
     pixel, flux = landing_pixels(channels, lens, screen, n)

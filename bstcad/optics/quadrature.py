@@ -19,10 +19,10 @@ from bstcad.optics.surfaces import Surface
 
 MIN_SPANS = 128  # minimum parts of an axis of a net; the spans of a coarser net are divided
 GAUSS_POINTS_PER_PART = 3  # Gauss points in each part of a chord or of an edge
-FINE_NET = 400  # control points per side from which on FINE_POINTS keep the area of a lens to 1e-9
+FINE_NET = 400  # smallest number of control points per side at which FINE_POINTS give the area to 1e-9
 FINE_POINTS = 2  # Gauss points in each part of a chord or of an edge of such a net
 CHORD_POINTS = 96  # Gauss points of a chord over a smooth face; exact to rounding up to a half diagonal of 0.95 R
-END_PARTS = 12  # minimum parts of an end span, where x(t) is quadratic and h(x) no polynomial: volumes to 1e-12
+END_PARTS = 12  # minimum parts of an end span, where h(x) is not a polynomial; gives volumes to 1e-12
 BORDER_POINTS_PER_STRIP = 512  # border points evaluated at a time
 MIN_RELATIVE_DX = 1e-14  # largest |dx| / ds of border points that are left out, since they add nothing
 EDGE_PARTS = 256  # minimum number of parts of an edge's curve

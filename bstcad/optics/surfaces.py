@@ -24,7 +24,7 @@ class Surface(ABC):
     """Surface given by its height z over (x, y); lengths in mm.  A subclass is a frozen dataclass."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-    z: float  # height of the vertex on the axis, or for a net of the plane its heights are measured from (mm)
+    z: float  # height of the vertex on the axis, or for a net of the plane from which its heights are measured (mm)
     kind: str
     is_net = False  # True for a B-spline net, which has `heights`
     curvature: float | Tensor  # curvature at the vertex of a surface of revolution (1/mm), > 0 towards +z

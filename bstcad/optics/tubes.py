@@ -30,7 +30,7 @@ from bstcad.optics.trace import behind, from_first_net, is_transmitted, whole_ke
 
 ALL = slice(None)  # all rows or columns
 SHEET_TUBES = 256  # tubes per side of the sheet from which finer sheets are interpolated
-RIM_SHRINK = 1e-9  # relative shrink towards the centre, so that corners on the rim of the light count as lit
+RIM_SHRINK = 1e-9  # relative shrinkage to the centre, so that corners on the rim of the light count as lit
 MAX_BAND_ROWS = 256  # maximum rows of tubes traced at a time for a picture; even, since the diagonals alternate
 MAX_BAND_TUBES = 1 << 19  # maximum tubes traced at a time for a picture, which limits its memory
 MAX_RAYS_PER_BAND = 1 << 17  # maximum rays traced at a time in plain torch: a megabyte per quantity

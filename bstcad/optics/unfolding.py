@@ -23,7 +23,7 @@ from bstcad.optics.surfaces import sag
 from bstcad.optics.tilted import TiltedSurface
 
 NEWTON_ITERATIONS = 8  # Newton steps for the point of a flat face through which light reaches a point of the receiver
-TINY = 1e-300  # smallest divisor
+TINY = 1e-300  # smallest divisor, so that none is zero
 
 
 @dataclass(frozen=True)
