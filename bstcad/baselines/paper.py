@@ -157,7 +157,7 @@ class RaySearch:
 
 
 def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[StageStep]:
-    """Run stage 2, with new random rays in each step; resume from a state."""
+    """Run stage 2, or resume it from `state`, with new random rays in each step."""
     knobs, goal, start = task.knobs, task.goals[0], lens if state is None else state.lens.apply_to(lens)
     target = torch.from_numpy(goal.picture).to(lens.like.device)
     merit = TentMerit.of(task.channels, goal.receiver, target, knobs.overshoot)

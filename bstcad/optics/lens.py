@@ -188,7 +188,7 @@ class Lens:
 
     @property
     def entrance(self) -> Surface:
-        """Surface that light meets first; rays are counted on the plane through its vertex."""
+        """Surface that light meets first; rays are launched through the plane of its vertex."""
         return self.interfaces[0].surface
 
     def unbounded(self) -> Lens:

@@ -176,7 +176,7 @@ class Medium:
 
     @property
     def extinction(self) -> Dispersion | None:
-        """Extinction coefficient k, from its own page or from `page`."""
+        """Extinction coefficient k, from the page `absorption`, or else from `page`."""
         return read(self.absorption or self.page).extinction
 
     @property
@@ -253,7 +253,7 @@ def _page(material: str, expected: tuple[Medium, ...]) -> Medium:
 
 
 def density(material: str) -> float | None:
-    """Return the density (g/cm³) of a material; None if neither page nor maker states it; ValueError as `medium`."""
+    """Return the density (g/cm³) of a material; None if neither page nor maker states it; raises as `medium`."""
     return medium(material).density
 
 
@@ -275,7 +275,7 @@ def extinction_coefficient(material: str, wavelength: float) -> float:
 
 
 def absorption_coefficient(material: str, wavelength: float) -> float:
-    """Return a = 4 π k / λ (1/mm) of a material at a wavelength in nm; ValueError as `extinction_coefficient`."""
+    """Return a = 4 π k / λ (1/mm) of a material at a wavelength in nm; raises as `extinction_coefficient`."""
     return 4 * math.pi * extinction_coefficient(material, wavelength) / (wavelength * 1e-6)
 
 

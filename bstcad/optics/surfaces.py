@@ -134,7 +134,7 @@ class _Revolved(Surface):
         return not isinstance(self.curvature, Tensor) and self.curvature == 0
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; finite, but without meaning, outside the rim.
+        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; finite but meaningless outside the rim.
 
         ∂z/∂x = c x / sqrt(1 - (1 + k) c² r²).
         """
@@ -272,7 +272,7 @@ class Toroid(Surface):
         return cos2, left, left * left - (self.curvature_y * y) ** 2
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; finite, but without meaning, outside the rim.
+        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; finite but meaningless outside the rim.
 
         The form z - z0 = (f (2 - c_y f) + c_y y²) / (1 + sqrt((1 - c_y f)² - c_y² y²)) avoids cancellation.
         """
