@@ -1,6 +1,6 @@
 """Pictures: grey irradiance from a file, an array, a sample or letters.
 
-A photograph's numbers of 8 or 16 bits are sRGB (IEC 61966-2-1): E = c / 12.92 up to c = 0.04045, and
+A photograph's pixel values of 8 or 16 bits are sRGB (IEC 61966-2-1): E = c / 12.92 up to c = 0.04045, and
 E = ((c + 0.055) / 1.055)^2.4 above it, for a channel c and the irradiance E, both from 0 to 1.  Floats are irradiance.
 A statement in the file has priority: cICP, an ICC profile, sRGB or gAMA, in this order, as in PNG.  The grey irradiance
 is the mean over the channels.  The first picture of a file with several is read.
@@ -46,9 +46,9 @@ MAX_TILE = 4096**2  # largest number of pixels of a tile; programs write tiles o
 MAX_PICTURE_SIZE = 400_000_000  # bytes; 64 million pixels of three 16-bit channels
 MAX_PROFILE_SIZE = 10_000_000  # bytes of an ICC profile; profiles of printers have a few millions
 STRIP_ROWS = 256  # rows of a picture that are processed at a time
-INTEGERS = "16 bits or more and no colour tag: its numbers are read as sRGB; with gamma = 1, as irradiance"
+INTEGERS = "16 bits or more and no colour tag: its values are read as sRGB; with gamma = 1, as irradiance"
 FLOATS = "floats and no colour tag: they are read as irradiance; with gamma = 2.2, as brightness on a screen"
-MAX_BLACK = 8 / 255  # largest number that is black; the opacity of a logo in black on transparency is its picture
+MAX_BLACK = 8 / 255  # largest value that is black; of a logo in black on transparency, the opacity is the picture
 MAX_GAMMA = 10.0  # largest exponent that a file may state; the smallest is its inverse
 LINEAR, PQ, HLG = 8, 16, 18  # transfer characteristics of a cICP chunk (ITU-T H.273)
 SWAPPED = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}  # opposite byte order of each order
@@ -63,7 +63,7 @@ UPRIGHT = {number: Image.Transpose[name] for number, name in enumerate(TURNS.spl
 _DECODING = threading.RLock()  # guards the error stream and the filters of warnings, which all threads share
 
 PixelBox: TypeAlias = tuple[int, int, int, int]  # left, top, right, bottom in whole pixels of a picture
-Curve: TypeAlias = Callable[[np.ndarray], np.ndarray]  # function from numbers to irradiance, both from 0 to 1
+Curve: TypeAlias = Callable[[np.ndarray], np.ndarray]  # function from pixel values to irradiance, both from 0 to 1
 Conversion: TypeAlias = Callable[[Image.Image], Image.Image]  # conversion of a picture's colours to sRGB
 
 
@@ -128,7 +128,7 @@ def _array_faults(values: np.ndarray) -> Iterator[str]:
     if values.min() < 0:
         yield "the array has negative values; give irradiance, with 0 for dark"
     if not values.max() > 0:
-        yield "the array is zero everywhere; give one with some light"
+        yield "the array is zero everywhere; give an array with some light"
 
 
 @contextlib.contextmanager
@@ -167,7 +167,7 @@ def _silent() -> Iterator[None]:
 
 def _open_picture(name: str, data: bytes) -> ImageFile.ImageFile:
     """Return the picture with its header read and its pixels not decoded yet."""
-    sizes, kinds = [], f"no {FORMAT_NAMES} picture; save it as one of these"
+    sizes, kinds = [], f"not a {FORMAT_NAMES} picture; save it in one of these formats"
     try:
         if data[4:8] == b"ftyp":  # boxes of a HEIF file, which may show a part of the coded pixels
             if _is_avif(data):
@@ -196,7 +196,7 @@ def _open_picture(name: str, data: bytes) -> ImageFile.ImageFile:
 
 
 def _tags(image: Image.Image) -> Mapping[int, Any]:
-    """Return the tags of a TIFF file by their numbers; none for another file."""
+    """Return the tags of a TIFF file by number; empty for other files."""
     return getattr(image, "tag_v2", {})
 
 
@@ -210,34 +210,34 @@ def _is_avif(data: bytes) -> bool:
 
 
 def from_srgb(value: np.ndarray) -> np.ndarray:
-    """Return the irradiance of sRGB numbers, both from 0 to 1."""
+    """Return the irradiance of sRGB values, both from 0 to 1."""
     value = np.asarray(value, dtype=np.float64)
     return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.0) + 0.055) / 1.055) ** 2.4)
 
 
 def to_srgb(light: np.ndarray) -> np.ndarray:
-    """Return the sRGB numbers with which a screen shows an irradiance, both from 0 to 1."""
+    """Return the sRGB values with which a screen shows an irradiance, both from 0 to 1."""
     light = np.asarray(light, dtype=np.float64)
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0) ** (1 / 2.4) - 0.055)
 
 
 def power(gamma: float) -> Curve:
-    """Return the curve number ** gamma."""
+    """Return the curve (pixel value) ** gamma."""
     return lambda number: number if gamma == 1 else number**gamma
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A decoded picture, upright, with the curve from its numbers to irradiance."""
+    """A decoded picture, upright, with the curve from pixel values to irradiance."""
 
     name: str  # file name, or name of the sample
     image: Image.Image
     curve: Curve
     profile: Conversion | None = None  # the picture's ICC profile; None: the colours are sRGB
     low: Image.Image | None = None  # second bytes of 16-bit colours; Pillow keeps only the first bytes
-    white: float = 1.0  # number that is white, if the numbers have neither 8 nor 16 bits
+    white: float = 1.0  # pixel value of white, for files with neither 8 nor 16 bits
     other_curve: Curve | None = None  # second possible curve of an untagged file of uncommon depth
-    assumed: str = ""  # sentence on the assumed curve of such a file
+    assumed: str = ""  # sentence on the assumed curve of such a file; "": none is assumed
     several: bool = False  # True if the file has further pictures
 
     def part(self, box: PixelBox) -> Photo:
@@ -267,7 +267,7 @@ class Photo:
         return self.curve(alpha)
 
     def numbers(self, box: PixelBox) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return numbers (h, w, channels), integers or floats from 0 to 1, and opacity (h, w) from 0 to 1 or None."""
+        """Return pixel values (h, w, channels), integers or floats from 0 to 1, and opacity (h, w) or None."""
         image, low, alpha = self.image.crop(box), self.low and self.low.crop(box), None
         if image.mode.startswith(("I", "F")):
             return self._one_channel(image)
@@ -284,7 +284,7 @@ class Photo:
         return np.asarray(image.convert("RGB")), alpha
 
     def _one_channel(self, image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return `numbers` of one channel of 16 or 32 bits or floats; a PNG may name one transparent number."""
+        """Return `numbers` of one channel of 16 or 32 bits or floats; a PNG may state one transparent value."""
         values, clear = np.asarray(image), image.info.get("transparency")
         alpha = (values != clear).astype(np.float64) if isinstance(clear, int) else None
         if values.dtype.kind == "u" and values.dtype.itemsize == 2:
@@ -309,9 +309,9 @@ class Photo:
         if clear == 0:
             return False, ""
         if brightest <= MAX_BLACK:
-            return True, "target.image: the picture is black on transparency, and its opaque parts are taken as light"
+            return True, "target.image: the picture is black on transparency, and its opaque parts are read as light"
         percent = 100 * clear / math.prod(self.image.size)
-        return False, f"target.image: transparency is taken as black ({percent:.3g} % of the picture)"
+        return False, f"target.image: transparency is read as black ({percent:.3g} % of the picture)"
 
 
 def strips(box: PixelBox) -> Iterator[PixelBox]:
@@ -327,7 +327,7 @@ def _as_floats(numbers: np.ndarray) -> np.ndarray:
 def photo(given: Picture | str, gamma: float | None = None, invert: bool = False) -> Photo:
     """Return the decoded picture of a file, or one of SAMPLES.
 
-    gamma: irradiance = number ** gamma; None: as the file states.  The numbers of a sample are irradiance, as in the
+    gamma: irradiance = (pixel value) ** gamma; None: as the file states.  Values of a sample are irradiance, as in the
     paper and in other programs, for comparison.  invert: return the negative.
     """
     if isinstance(given, str):
@@ -358,7 +358,7 @@ def photo_size(given: Picture | str) -> tuple[int, int]:
 
 
 def _white(image: Image.Image) -> float:
-    """Return the number that is white: 1 for floats, 65535 for 32 bits, or the largest number if it is larger."""
+    """Return the pixel value of white: 1 for floats, 65535 for 32 bits, or the largest value if it is larger."""
     if image.mode not in ("I", "F"):
         return 1.0
     usual, (_, largest) = 65535.0 if image.mode == "I" else 1.0, image.getextrema()

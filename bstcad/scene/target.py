@@ -97,7 +97,7 @@ class Target(Record):
         given = self._pictures
         if len(given) != 1:
             names = " and ".join(given) or "none"
-            yield f"target: needs exactly one of {', '.join(PICTURE_KEYS)}, and has {names}; keep or add one"
+            yield f"target: needs exactly one of {', '.join(PICTURE_KEYS)}, and has {names}; give exactly one"
         for axis, (low, high) in (("x", self.x), ("y", self.y)):
             if not low < high:
                 yield f"target.{axis}: [{low:g}, {high:g}] is not an interval; write the smaller end first"
@@ -115,20 +115,20 @@ class Target(Record):
                 ends = ", ".join(f"{end:g}" for end in self.crop)
                 yield f"target.crop: [{ends}] is empty; write left, top, right and bottom, such as [0.1, 0, 0.9, 1]"
         if self.invert and self.uniform:
-            yield "target.invert: the negative of a uniform target is dark; remove one of the two"
+            yield "target.invert: the negative of a uniform target is dark; remove this key"
         if self.invert and self.profile:
-            yield "target.invert: a profile has no negative; remove one of the two"
+            yield "target.invert: a profile has no negative; remove this key"
         yield from self._profile_complaints() if self.profile else ()
         for axis, half, size in zip("xy", self.outline.half_extent if self.outline else (), self.size, strict=False):
             if 2 * half > size:
-                yield f"target.outline: is larger than the target along {axis}; make it smaller or widen {axis}"
+                yield f"target.outline: is larger than the target along {axis}; make it smaller, or widen target.{axis}"
 
     def _profile_complaints(self) -> Iterator[str]:
         """Yield complaints about a profile larger than the target, or narrower than a pixel."""
         pixels = (side / n for side, n in zip(self.size, self.columns_rows, strict=True))
         for axis, half, size, pixel in zip("xy", self._half_profile, self.size, pixels, strict=True):
             if 2 * half > size:
-                yield f"target.profile: is larger than the target along {axis}; make it smaller or widen {axis}"
+                yield f"target.profile: is larger than the target along {axis}; make it smaller, or widen target.{axis}"
             if half < pixel:
                 fine = f"half its width along {axis}, {half:g} {self.unit}, is less than a pixel of {pixel:.3g}"
                 yield f"target.profile: {fine} {self.unit}; make it larger, or set more target.pixels"
@@ -214,7 +214,7 @@ class Target(Record):
             yield f"target.z: {where} along {DIRECTIONS[sense]}, as the light travels; move one of them"
 
     def clearance(self, lens: LensBlank, highest: float) -> float:
-        """Return the gap (mm) between the target's plane and a lens up to z = highest (mm); negative if it cuts it."""
+        """Return the gap (mm) between the target's plane and a lens up to z = highest (mm); negative if they cross."""
         return self.screen.plane.clearance(lens.outline, highest)
 
     def grazed(self, lens: LensBlank) -> Iterator[str]:
@@ -222,7 +222,7 @@ class Target(Record):
         plane, vertex = self.screen.plane, (0.0, 0.0, lens.back.z)
         if plane.tilt is None or not isinstance(plane, PlaneReceiver):
             return
-        sine = -plane.height(vertex) / math.dist(plane.middle, vertex)  # the distance is positive
+        sine = -plane.height(vertex) / math.dist(plane.middle, vertex)  # the plane misses the lens: no zero
         if sine < math.sin(math.radians(GRAZING_VIEW)):
             angle = math.degrees(math.asin(max(sine, -1.0)))
             yield (
@@ -231,14 +231,14 @@ class Target(Record):
             )
 
     def unfaced(self, lens: LensBlank) -> Iterator[str]:
-        """Yield complaints about a target that does not face the lens, cuts it, or reaches down to it."""
+        """Yield complaints about a target that does not face the lens, cuts the lens, or reaches down to the lens."""
         screen, plane, back, optic = self.screen, self.screen.plane, lens.back.z, lens.optic
         if plane.is_level:
             return
         tilted = plane if plane.tilt is not None and isinstance(plane, PlaneReceiver) else None
-        key, less = ("target.tilt", "turn it less, or ") if tilted else ("target.z", "")
+        key, less = ("target.tilt", "tilt it less, or ") if tilted else ("target.z", "")
         if tilted and not is_faced(tilted, (0.0, 0.0, back)):
-            yield f"{key}: seen from the {optic}, the target is edge-on or turned away; turn it less, or move it"
+            yield f"{key}: seen from the {optic}, the target is edge-on or turned away; tilt it less, or move it"
         if not self.clearance(lens, back) > 0:
             yield f"{key}: the plane of the target cuts the {optic}; {less}move the target further along +z"
         if tilted is None:
@@ -246,7 +246,7 @@ class Target(Record):
         lowest = min(plane.point(x, y)[2] for x in screen.x for y in screen.y)
         if not lowest > back:
             edge = f"is at z = {lowest:.6g}, not behind the back of the {optic} at z = {back:g}"
-            yield f"{key}: an edge of the target {edge}; turn it less, make it smaller or move it along +z"
+            yield f"{key}: an edge of the target {edge}; tilt it less, make it smaller, or move it along +z"
 
     def metres(self, lens: LensBlank) -> Iterator[str]:
         """Yield a question for each length that looks like metres."""
@@ -308,18 +308,18 @@ def numbered(name: str, k: int) -> str:
 
 
 def coplanar_complaints(targets: tuple[Target, ...]) -> Iterator[str]:
-    """Yield complaints about targets in the plane of an earlier one, or crossing it."""
+    """Yield complaints about targets in the plane of an earlier target, or crossing that target."""
     for k, target in enumerate(targets):
         for i, earlier in enumerate(targets[:k]):
             if _in_one_plane(target.screen, earlier.screen):
                 plane = f"the target is in the plane of target[{i}]"
                 yield f"target[{k}].z: {plane}; move one of them along z, or combine both pictures in one"
             elif _cuts(target.screen, earlier.screen) and _cuts(earlier.screen, target.screen):
-                yield f"target[{k}].z: the target cuts target[{i}]; move one of them along z, or turn it less"
+                yield f"target[{k}].z: the target cuts target[{i}]; move one of them along z, or tilt one of them less"
 
 
 def _in_one_plane(one: Screen, other: Screen) -> bool:
-    """Return True if the corners of each are in the plane of the other; receivers other than planes must be equal."""
+    """Return True if the corners of each screen are in the other's plane; receivers other than planes must be equal."""
     heights = _corner_heights(one, other) + _corner_heights(other, one)
     return max(map(abs, heights)) < PLANE_DISTANCE if heights else one.plane == other.plane
 
@@ -400,7 +400,7 @@ def _curve_remark(photo: picture.Photo, light: np.ndarray, part: Window, pixels:
     if not (light.sum() > 0 and other.sum() > 0):
         return ""
     rrmsd = float(np.linalg.norm(other * (light.sum() / other.sum()) - light) / np.linalg.norm(light))
-    remark = f"target.image: the file has {photo.assumed} (RRMSD between the two: {rrmsd:.2g})"
+    remark = f"target.image: the file has {photo.assumed} (RRMSD between both readings: {rrmsd:.2g})"
     return remark if rrmsd > NOTICEABLE else ""
 
 
@@ -460,7 +460,7 @@ def _fit_remark(shown: Pixels, target: Target) -> str:
     if (right - left, bottom - top) != shown and fit == "pad":
         done = 'shown whole, with dark strips beside it; fit = "crop" fills the target'
     elif (right - left, bottom - top) != shown:
-        done = f'cropped to the middle {right - left:.0f} x {bottom - top:.0f}; fit = "pad" shows it whole'
+        done = f'cropped to the central {right - left:.0f} x {bottom - top:.0f} pixels; fit = "pad" shows it whole'
     elif fit == "stretch" and abs(stretched - 1) * max(width, height) >= 1:
         along, percent = "upwards" if stretched > 1 else "sideways", 100 * (max(stretched, 1 / stretched) - 1)
         done = f'stretched {along} by {percent:.2g} %; fit = "crop" keeps its proportions'

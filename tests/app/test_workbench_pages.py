@@ -58,7 +58,7 @@ def test_a_dropped_picture_is_a_scene_whose_crop_is_dragged_and_moved_by_keys(op
     assert load(shared.folder / "my-sun.toml").source.divergence == 0.53
     shown = base64.b64decode(page.get_attribute(SEEN, "src").partition(",")[2])
     assert np.asarray(Image.open(io.BytesIO(shown))).std() > 10  # there is a picture on it
-    page.wait_for_selector("#remarks li:has-text('cropped to the middle')", timeout=PATIENCE)
+    page.wait_for_selector("#remarks li:has-text('cropped to the central')", timeout=PATIENCE)
     frame = page.locator("#frame")
     frame.scroll_into_view_if_needed()
     box = frame.bounding_box()

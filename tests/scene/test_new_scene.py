@@ -70,7 +70,7 @@ class TestPlate:
         assert scene.target.size == (80 * wide, 60 * wide) and scene.target.screen.shape == (192, 256)
         assert cli.run(["new", "photo", "--picture", str(PHOTO), *sizes]) == 0
         size = f"{80 * wide:g} x {60 * wide:g} mm"
-        assert f"the target is {size}, so the picture of 40 x 40 is cropped to the middle 40" in capsys.readouterr().out
+        assert f"the target is {size}, so the picture of 40 x 40 is cropped to the central" in capsys.readouterr().out
 
     @pytest.mark.parametrize(("size", "given", "made"), [
         ((800, 1200), "photo", (53.33, 80.0)), ((1200, 800), "120xphoto", (120.0, 80.0)),

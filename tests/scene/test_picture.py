@@ -113,9 +113,9 @@ def test_it_is_said_which_curve_was_taken_where_that_changes_the_light():
     deep = RAMP.astype(np.uint16)[..., None] * 257
     [remark] = drawn(png(deep)).remarks
     off = np.linalg.norm(from_srgb(RAMP / 255) * RAMP.mean() / from_srgb(RAMP / 255).mean() - RAMP)
-    assert remark.startswith("target.image: the file has 16 bits or more and no colour tag: its numbers are")
+    assert remark.startswith("target.image: the file has 16 bits or more and no colour tag: its values are")
     other = off * from_srgb(RAMP / 255).mean() / RAMP.mean() / np.linalg.norm(from_srgb(RAMP / 255))
-    assert f"(RRMSD between the two: {other:.2g})" in remark
+    assert f"(RRMSD between both readings: {other:.2g})" in remark
     [remark] = drawn(saved((RAMP / 255).astype(np.float32), "TIFF"), name="p.tif").remarks
     assert "the file has floats and no colour tag: they are read as irradiance; with gamma = 2.2" in remark
     stated = with_chunk(png(deep), b"sRGB", b"\0"), png(deep, (b"gAMA", struct.pack(">I", 100_000))), saved(RAMP)
@@ -322,7 +322,7 @@ def test_a_black_logo_on_transparency_is_light_and_says_so(mode, colour):
     data = saved(logo(colour, mode=mode))
     found = drawn(data)
     np.testing.assert_array_equal(found.light, INK)
-    assert len(found.remarks) == 1 and "opaque parts are taken as light" in found.remarks[0]
+    assert len(found.remarks) == 1 and "opaque parts are read as light" in found.remarks[0]
     np.testing.assert_array_equal(light(data, invert=True), ~INK)
 
 
@@ -339,7 +339,7 @@ def test_a_picture_with_tones_of_its_own_stands_before_black():
     found = drawn(saved(logo((255, 255, 255, 255))))
     np.testing.assert_array_equal(found.light, INK)
     share = 100 * (~INK).mean()
-    assert found.remarks == (f"target.image: transparency is taken as black ({share:.3g} % of the picture)",)
+    assert found.remarks == (f"target.image: transparency is read as black ({share:.3g} % of the picture)",)
     half = saved(Image.new("RGBA", (16, 16), (255, 255, 255, 128)))
     np.testing.assert_allclose(light(half), SRGB[128], rtol=1e-9)
     assert drawn(saved(logo((90, 0, 0, 255), ground=(0, 0, 0, 255)))).remarks == ()

@@ -137,7 +137,7 @@ PADDED = np.pad(WIDE, ((3, 3), (0, 0)))
 
 
 @pytest.mark.parametrize(("fit", "shown", "remark"), [
-    ("crop", WIDE[:, 3:9].repeat(2, 0).repeat(2, 1), 'cropped to the middle 6 x 6; fit = "pad" shows it whole'),
+    ("crop", WIDE[:, 3:9].repeat(2, 0).repeat(2, 1), 'cropped to the central 6 x 6 pixels; fit = "pad" shows it whole'),
     ("pad", PADDED, 'shown whole, with dark strips beside it; fit = "crop" fills the target'),
     ("stretch", WIDE.repeat(2, 0), 'stretched upwards by 1e+02 %; fit = "crop" keeps its proportions'),
 ])  # fmt: skip
@@ -156,8 +156,8 @@ def test_a_picture_of_the_target_s_proportions_is_left_alone(fit):
 
 def test_what_is_turned_or_a_sample_is_fitted_too_and_text_and_even_light_have_no_proportions():
     [remark] = target(WIDE, rotate=90).remarks()
-    assert "the picture of 6 x 12 is cropped to the middle 6 x 6" in remark
-    assert "cropped to the middle 512 x 256" in target(None, 200.0, 100.0, sample="camera").remarks()[0]
+    assert "the picture of 6 x 12 is cropped to the central 6 x 6" in remark
+    assert "cropped to the central 512 x 256" in target(None, 200.0, 100.0, sample="camera").remarks()[0]
     for content in ({"text": "THU"}, {"uniform": True}):
         assert target(None, 3.0, 1.0, **content).remarks() == ()
 
