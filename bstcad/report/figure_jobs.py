@@ -110,7 +110,7 @@ class Pictures:
         return pictures
 
     def data_sheet(self) -> bytes | None:
-        """Return the PDF; None if there is no data sheet, or the second process died."""
+        """Return the PDF of the data sheet; None if there is none, or the second process died."""
         with contextlib.suppress(BrokenExecutor):
             return None if self._sheet is None else self._sheet.result()
         return None

@@ -367,7 +367,7 @@ def extent(source: Emitter) -> Iterator[tuple[str, str]]:
 
 # --- remarks ----------------------------------------------------------------------------------------------------------
 # A remark names a request of the scene that the design does not fulfil, with its figure, whether a check judges it or
-# not.  A lens may be exact to a nanometre and still lose light, or be thicker than drawn, because the scene allows
+# not.  A lens may be exact to a nanometre and still lose light, or be thicker than stated, because the scene allows
 # nothing better; a reader of "passed" should not have to search the tables for that.
 
 

@@ -49,7 +49,7 @@ VERTEX_TOLERANCE = 1e-12  # mm; a net whose vertex is this near to z = 0 is not 
 MAX_CONTROL_POINTS = 2049
 NET_SIZES = (MIN_SIDE, MAX_CONTROL_POINTS)  # range of the control points per side of a net
 FIT_TOLERANCE = 1e-6  # mm; largest distance between a fitted net and its surface (a toroid, or a user's class)
-FIT_SIZES = (33, 65, 129, 257, 513, 1025)  # control points per side of a fitted net, tried in turn
+FIT_SIZES = (33, 65, 129, 257, 513, 1025)  # control points per side of a fitted net, tried in this order
 MAX_CELL_RATIO = 1.5  # ratio of length and width of a cell of the net above which a warning proposes another net
 MIN_ROUND_POINTS = 6  # control points per side for a round lens, whose net extends two spans past the rim
 

@@ -240,7 +240,7 @@ class LightPath:
             seen = Image.of(image(behind, target.screen.plane))
             if not is_faced(seen, vertex):
                 view = "seen from the lens in the mirrors, the target is edge-on or turned away"
-                yield f"{key}.tilt: {view}; turn the target or a mirror"
+                yield f"{key}.tilt: {view}; tilt the target or a mirror"
 
 
 def lowest(elements: Sequence[Window | Mirror]) -> float:

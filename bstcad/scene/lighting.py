@@ -67,7 +67,7 @@ def order_complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
 
 
 def unlit_complaints(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator[str]:
-    """Yield complaints about a source, turned or moved sideways, that sends no light to the lens inside its rim."""
+    """Yield complaints about a tilted or decentred source that sends no light to the lens inside its rim."""
     if not (source.tilted or getattr(source, "centre", None)):
         return
     upwards = lens.passes.sense > 0
@@ -75,7 +75,7 @@ def unlit_complaints(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator
     x, y = sampling.grid(source.window(rim, z, sags), IRRADIANCE_SAMPLES)
     if not bool((source.irradiance(x, y, z) > 0).any()):
         key = "tilt" if source.tilted else "centre"
-        yield f"source.{key}: no light reaches the {lens.optic}; turn or move the source towards it"
+        yield f"source.{key}: no light reaches the {lens.optic}; tilt or move the source towards the {lens.optic}"
 
 
 def doubts(source: Emitter, rim: Outline, key: str) -> Iterator[str]:

@@ -152,7 +152,7 @@ def coarse_to_fine(net: Sides) -> tuple[Sides, ...]:
 
 # ---- [[tolerance]]: none by default; a later table replaces values of an earlier one ---------------------------------
 
-# Names of errors; "lens.decentre" stands for lens.decentre_x and lens.decentre_y.
+# Names of errors; "lens.decentre" means both lens.decentre_x and lens.decentre_y.
 Name = Literal[
     "lens.decentre", "lens.decentre_x", "lens.decentre_y", "lens.axial",
     "lens.tilt", "lens.tilt_x", "lens.tilt_y", "lens.clocking",

@@ -144,7 +144,7 @@ class Scene(Record):
             yield from self._of_targets(lambda target: target.unfaced(lens))
         yield from coplanar_complaints(self.targets)
         if self.wavefront is not None and self.light_path.is_folded:
-            yield "wavefront: cannot be set with a mirror in [[behind]], which turns the wave; remove one of them"
+            yield "wavefront: cannot be set with a mirror in [[behind]], which reverses the wave; remove one of them"
         yield from _wavefront_complaints(self.wavefront, source, lens, accept=self.accept)
         yield from self.tailoring.complaints(lens)
         yield from _method_complaints(self)

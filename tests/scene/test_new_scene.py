@@ -169,7 +169,7 @@ def test_nothing_is_written_over(place):
     (["mine", "--size", "photo"], "--size photo: needs a photo; give --picture FILE"),
     (["../mine"], "'../mine' cannot be the name of a scene"),
     (["mine", "--picture", "none.jpg"], "--picture none.jpg: not found; give the path of a picture file"),
-    (["mine", "--picture", __file__], "is no "),
+    (["mine", "--picture", __file__], "is not a "),
     (["mine", "--size", "80by60"], "--size 80by60: is not a size; give a length in mm, such as 80, or width x height"),
     (["mine", "--light", "moon"], "--light moon: is unknown; give one of laser, sun, lamp, led"),
     (["mine", "--distance", "-3"], "--distance -3: is not between"),

@@ -285,7 +285,7 @@ def test_files_that_are_damaged_or_huge_or_of_another_kind_are_refused(tmp_path,
     with pytest.raises(SceneError, match="is damaged"):
         light(whole[: len(whole) // 2], 64)
     Image.new("L", (8, 8), 255).save(path)
-    with pytest.raises(SceneError, match="no PNG, JPEG, TIFF, WebP, BMP, GIF, HEIC or AVIF picture"):
+    with pytest.raises(SceneError, match="not a PNG, JPEG, TIFF, WebP, BMP, GIF, HEIC or AVIF picture"):
         read_picture(path)
     Image.new("1", (side, side)).save(path, "PNG")
     with pytest.raises(SceneError, match="shrink it"):
