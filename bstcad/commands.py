@@ -161,7 +161,7 @@ def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), prog
         order = _order(made, proof.shape, building)
         drawn.sheet(_sheet(made, proof, figures_of(made.goals, proof.lights), irradiances[0], order=order))
         progress("report", 0, 1, "")
-        estimates = _left_out(made, proof)  # while the pictures are drawn
+        estimates = _left_out(made, proof)  # at the same time the pictures are drawn
         drawn.result()
         made = replace(made, making=made.making.with_stages(StageRecord("report", time.perf_counter() - proven)))
         contents = replace(_contents(made, proof, estimates), order=order)
@@ -427,7 +427,7 @@ def _write_report(
 
 
 def _write_sheet(drawn: Pictures, folder: Path) -> None:
-    """Write datasheet.pdf, if it was drawn."""
+    """Write datasheet.pdf if the data sheet was drawn."""
     if (sheet := drawn.data_sheet()) is not None:
         files.put(folder / SHEET, sheet)
 

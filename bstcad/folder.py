@@ -217,7 +217,7 @@ def _stamps(folder: Path) -> list[tuple[object, ...]]:
 
 
 def scene_files(scene: scenes.Scene) -> dict[str, bytes]:
-    """Return scene.toml and the files that it names, by file name; a folder with them loads the same scene."""
+    """Return scene.toml and the files that it names, by file name; a folder with these files loads an equal scene."""
     return {SCENE: scene.toml().encode()} | {name: content.copy for name, content in scene.files.items()}
 
 

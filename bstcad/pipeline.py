@@ -147,7 +147,7 @@ def design(
         driver.end("loading")  # loading of the libraries, the scene and its files
     followed = start.followed or _stage1(scene, task, driver, lens, state=start.first, compare=not later)
     after_stage1, stages = followed.lens.apply_to(lens), len(driver.record.stages)
-    lens = scene.as_mounted(after_stage1)  # the clear apertures differ from those of a flat back
+    lens = scene.as_mounted(after_stage1)  # the clear apertures now follow the tailored back
     if start.lens:
         lens, stopped = start.lens.apply_to(lens), start.stopped
     else:
@@ -442,7 +442,7 @@ def reserve(scene: Scene) -> float:
 
 
 def purpose(scene: Scene, device: str) -> dict[str, Any]:
-    """Return all data that determine the result of `design`; a checkpoint with equal data is of the same design."""
+    """Return all data that determine the result of `design`; a checkpoint with equal data can be resumed."""
     keys = scene.model_dump(mode="json", exclude={"name", "title", "output", "accept"})
     return {
         "version": bstcad.__version__,

@@ -1,4 +1,4 @@
-"""Command `bstcad batch`: design many scenes, each in its own process and folder, and continue if one fails.
+"""Command `bstcad batch`: design many scenes, each in its own process and folder, and continue after a failure.
 
 A design is finished if batch.json lists it with an equal scene and this version of bstcad, and its folder still
 contains the design.  A design that was interrupted on this machine continues from its checkpoint.  batch.json has the

@@ -41,7 +41,7 @@ TRANSPORT_ROUNDS, COARSE_STEPS = 2, 40  # rounds of transport and slope fit, and
 
 @torch.no_grad()
 def coarse_lens(scene: Scene) -> Lens:
-    """Return a lens whose angles and paths are close to those of the finished lens, but whose picture is coarse."""
+    """Return a lens with nearly the angles and paths of the finished lens, but with a coarse picture."""
     channel = _central_channel(scene)
     lens = channel.through(scene.flat_lens(COARSE_POINTS))
     picture = _downsample(scene.target.irradiance(), COARSE_PIXELS)

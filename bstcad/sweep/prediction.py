@@ -36,7 +36,7 @@ from bstcad.tailoring.stage2 import round_shares, sheet_sizes, stage3_sheet_size
 
 Interval = tuple[float, float, float]  # (low, likely, high); nine of ten designs lie between low and high
 QUALITIES = ("draft", "standard", "fine")
-PILOT_QUALITIES = ("draft", "standard")  # qualities with a pilot; "fine" uses that of "standard"
+PILOT_QUALITIES = ("draft", "standard")  # qualities with a pilot; "fine" uses the pilot of "standard"
 INTERVAL_FACTORS = {"seconds": 1.5, "rrmsd": 1.5, "memory_gb": 1.25}  # factors within which nine of ten designs lie
 
 # --- the pilot --------------------------------------------------------------------------------------------------------
@@ -56,7 +56,7 @@ class Seconds:
 
     first: float  # stage 1
     search: float  # stage 2 or 3
-    rest: float  # start, writing, proof and report; for a pilot the part that does not scale with its sizes
+    rest: float  # start, writing, verification, report; for a pilot only the part independent of sizes
 
     @property
     def total(self) -> float:
@@ -69,9 +69,9 @@ class Pilot:
     """Result of a small design."""
 
     scene: Scene  # scene of the small design
-    seconds: Seconds  # times of its parts
+    seconds: Seconds  # duration of each part (s)
     rrmsd: float  # largest RRMSD of all goals
-    factor: float  # ratio of the pixels per side of the full scene to those of the pilot
+    factor: float  # pixels per side of the full scene / pixels per side of the pilot
     detail: float  # relative RMS of the detail of the full picture that is finer than the pilot's pixels
     blur: float  # RRMSD by blur of the source in the full scene minus that in the pilot
     steep: Steepness  # steepness that the map requires of the back
@@ -200,8 +200,8 @@ ADAM_SECONDS = 0.1  # step of the paper's procedure
 START_SECONDS = 2.8  # imports, and end of the process
 WRITE_SECONDS, NET_SECONDS, PICTURE_SECONDS = 1.5, 2.4, 1.1  # output: constant, control points, pixels
 MOUNT_SECONDS = 2.5  # cutting and verification of the mounted part
-RAY_SECONDS, DRAFT_RAY_SECONDS = 1.6, 1.0  # rays of a proof, for a target and a wavelength; parallel light
-WITNESS_SECONDS, DRAFT_WITNESS_SECONDS = 6.0, 2.5  # finer flux tubes for a second net, for a target
+RAY_SECONDS, DRAFT_RAY_SECONDS = 1.6, 1.0  # rays of a verification, per target and wavelength
+WITNESS_SECONDS, DRAFT_WITNESS_SECONDS = 6.0, 2.5  # finer flux tubes for a second net, per target
 LIBRARIES_GB = 1.5  # libraries in both processes
 TUBES_GB, NET_GB, PIXELS_GB = 0.12, 0.27, 0.02  # tubes, control points, pixels
 GOAL_MEMORY_FACTOR = 3.0  # memory of tubes per goal with several goals / memory with one target

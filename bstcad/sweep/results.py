@@ -107,7 +107,7 @@ class TradeoffTable(StoredRecord):
     machine: dict[str, Any]  # machine on which the times were measured
     versions: dict[str, str]  # versions of the libraries, by name
     reference: dict[str, Any]  # reference for the RRMSD: rays (numbers of rays, ascending), what (in words)
-    calibration: Calibration  # times of the calibration kernel
+    calibration: Calibration  # duration of the calibration kernel
     runs: tuple[ColdRun, ...]  # runs, the most important first, without PRIVATE_FIELDS
     knobs: tuple[TableKnob, ...]  # knobs that were varied
     front: tuple[StoredSettings, ...]  # settings of the runs on the Pareto front, the fastest first

@@ -59,7 +59,7 @@ class Knob:
 
 
 def other_seed(scene: Scene, point: Settings) -> Settings:
-    """Return the settings with another seed: that of the scene plus one."""
+    """Return the settings with the seed of the scene plus one."""
     return sorted_settings({**dict(point), "tailoring.seed": scene.tailoring.seed + 1})
 
 
@@ -133,7 +133,7 @@ def _is_candidate(net: Sides) -> bool:
 
 
 def _pixels(scene: Scene) -> Points:
-    """Return coarser and finer pictures of all targets; the lens is judged on the pixels of the base scene."""
+    """Return points with coarser and finer pictures of all targets; RRMSDs are on the pixels of the base scene."""
     own, points = [target.columns_rows for target in scene.targets], {}
     for factor in (1 / 4, HALF, 1, 2):
         sizes = [(round(factor * columns), round(factor * rows)) for columns, rows in own]

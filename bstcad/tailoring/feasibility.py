@@ -123,7 +123,7 @@ def _demand(task: Task, solution: float, lens: Lens) -> tuple[Demand, LightBehin
 
 @torch.no_grad()
 def _largest_turn(task: Task, lens: Lens, light: LightBehind) -> float:
-    """Return the largest angle (degrees) between a ray before the front and the same ray in the glass."""
+    """Return the largest angle (degrees) between the directions of a ray before the front and in the glass."""
     front, source = lens.shaping("front"), task.heaviest.source
     window, b = lit_window(source, front), light.intersect(lens.back)
     grid = square_grid(source, front, window, TRIAL_CELLS)

@@ -54,7 +54,7 @@ SOURCE_FLOOR = 0.02  # smallest irradiance of the map's source picture, relative
 # beside bright ones, Newton's method ends at a mass error of 0.06 to 0.25 without this blur, and at 0.003 with it.
 SOURCE_BLURS = (4.0, 2.0, 1.0)
 FINE_FACTOR = 2  # cells per side of the last map, relative to the transport grid: letters get light from much of a face
-# Solver with floors under the target picture, relative to its mean, that are lowered in turn
+# Solver with floors under the target picture, relative to its mean, used one after another
 TARGETS_SOLVER = Solver(floors=(0.1, 0.03, 0.01, 0.003))
 CONTRAST_RATIO = 1.5  # ratio of contrasts above which rays pass through pixel corners of the higher-contrast picture
 INTERSECTION_STEPS = 8  # Newton iterations for the intersection with a face
@@ -246,7 +246,7 @@ def between_targets(
         return light.reversed() if sign < 0 and not against else light
     parts = max(1, round(n / max(screen.shape)))
     place, there = in_space(screen.plane, *corners(screen, parts)), mapping(*corners(screen, parts))
-    i, j = grid_coordinates(*(sign * c for c in y), *(sign * c for c in there))  # both increase with t
+    i, j = grid_coordinates(*(sign * c for c in y), *(sign * c for c in there))  # now increasing with t
     way = _normalised(in_space(behind.plane, *_bilinear(np.stack(pixel_corners(behind)), i, j)) - place)
     return LightBehind(place, way, subdivide(sharp / sharp.sum(), parts))
 

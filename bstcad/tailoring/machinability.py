@@ -133,7 +133,7 @@ PartExcess = tuple[float, dict[int, Tensor], float]  # mean square, gradients by
 
 
 def _parts(lens: Lens, nets: dict[int, BSplineSurface], bounds: Bounds) -> Iterator[PartExcess]:
-    """Yield the excess of each tailored face, then that of the thickness; nets: in float64, by face number."""
+    """Yield the excess of each tailored face, then the excess of the thickness; nets: in float64, by face number."""
     if (bounds.concave, bounds.convex, bounds.slope) != (None, None, None):
         for k, from_above in _bounds_from_above(lens, bounds).items():
             squared, gradient, worst = _shape_excess(nets[k], lens.outline, from_above)
@@ -264,7 +264,7 @@ def _exceeds(lens: Lens, bounds: Bounds) -> bool:
 
 
 def _reduce_excess(lens: Lens, bounds: Bounds) -> Lens:
-    """Minimise the penalty; return the first lens that exceeds no bound, or else the one with the smallest penalty."""
+    """Minimise the penalty; return the first lens that exceeds no bound, or else the lens of the smallest penalty."""
     start = _heights(lens)
     variables = [SobolevVariable.of(net, torch.ones_like(net.heights)) for net in lens.nets]
 

@@ -144,7 +144,7 @@ class Merit:
 
     @property
     def _is_one(self) -> bool:
-        """True if the goal is one picture alone."""
+        """True if there is one picture and no wavefront goal."""
         return len(self.goals) == 1 and self.wave is None
 
     def landing(self, lens: Lens) -> Landings:

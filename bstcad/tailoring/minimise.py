@@ -236,7 +236,7 @@ Along = Callable[[float], LineSearch]
 
 
 def _strong_wolfe(along: Along, start: LinePoint, step: float) -> LineSearch:
-    """Return a point at a step a with f <= f0 + c1 a f0' and |f'| <= c2 |f0'| (algorithm 3.5), or else the last one."""
+    """Return a point at a step a with f <= f0 + c1 a f0' and |f'| <= c2 |f0'| (algorithm 3.5), or the last point."""
     before = start
     for _ in range(MAX_LINE_TRIALS):
         trial = yield from along(step)
@@ -248,7 +248,7 @@ def _strong_wolfe(along: Along, start: LinePoint, step: float) -> LineSearch:
             return (yield from _zoom(along, start, trial, before))
         nearest, farthest = step + 0.01 * (step - before.step), 10.0 * step
         lowest = _cubic_minimum(before, trial)
-        step = min(max(lowest, nearest), farthest) if lowest > step else farthest  # far: no minimum ahead
+        step = min(max(lowest, nearest), farthest) if lowest > step else farthest  # no minimum: go far
         before = trial
     return before
 
@@ -256,7 +256,7 @@ def _strong_wolfe(along: Along, start: LinePoint, step: float) -> LineSearch:
 def _zoom(along: Along, start: LinePoint, low: LinePoint, high: LinePoint) -> LineSearch:
     """Return the point of `_strong_wolfe` between two that bracket it (algorithm 3.6); `low` has the lower merit."""
     for _ in range(MAX_LINE_TRIALS):
-        margin = 0.1 * abs(high.step - low.step)  # distance to keep from both ends
+        margin = 0.1 * abs(high.step - low.step)  # distance to keep from the ends of the interval
         nearest, farthest = sorted((low.step, high.step))
         if not nearest < nearest + margin < farthest:  # the merit jumps: no float is left between them
             break

@@ -340,7 +340,7 @@ class Driver:
                 self.best = latest
 
     def _take(self, step: StageStep, pack: Callable[[Any], Any]) -> str:
-        """Record a step; return the reason if the stage ends with it, else ""."""
+        """Record a step; return the reason if the stage ends with this step, else ""."""
         now = self._clock()
         if step.work:
             self.measure(now - self._last, step.work)

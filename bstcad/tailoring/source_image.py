@@ -62,7 +62,7 @@ class ExtendedSource:
 
 @dataclass(frozen=True, eq=False)
 class BlurOperator:
-    """Operator B from the picture of the source's centre, on a screen with a border, to that of the whole source."""
+    """Operator B from the picture by the source's centre, on a screen with a border, to that by the whole source."""
 
     border: int  # width of the border whose light is blurred onto the screen (pixels)
     hats: tuple[np.ndarray, np.ndarray]  # hat functions, (nodes, rows + 2 border) and (nodes, columns + 2 border)
@@ -154,7 +154,7 @@ def _biquadratic(points: Sequence[tuple[float, float]]) -> Tensor:
 
 
 def blurs(extended: ExtendedSource, lens: Lens, screen: Screen) -> tuple[BlurOperator, ...]:
-    """Return B for each channel of a source and a lens, all with the same border."""
+    """Return B for each channel of a source and a lens, all with one border."""
     extent = extended.source.extent
     unit = Circle(1.0) if extent is not None and extent.is_round else Rectangle(2.0, 2.0)
     dots = _biquadratic(point_pairs(unit, IMAGE_PAIRS))

@@ -50,7 +50,7 @@ FINE_ROUNDS = 2  # number of fine rounds: the first has half the cells per side 
 # half a side of the square around the light (`slope_map.square_grid`).  Where more rounds gain nothing, the change is
 # at most 0.016.
 RETRY_RRMSD, RETRY_CHANGE = 0.25, 0.025
-SETTLED_CHANGE = 0.01  # RMS change of the map, in the same unit, below which the coarse rounds end
+SETTLED_CHANGE = 0.01  # RMS change of the map, in the unit of RETRY_CHANGE, below which coarse rounds end
 MAX_RAY_CELLS = 1026  # largest number of rays per side in the slope fit; a finer grid interpolates between rays
 MIN_FLUX_RATIO = 0.9  # smallest accepted flux on the target after `follow_aims`, relative to the flux after the rounds
 AIM_ROUNDS = 5  # number of rounds of `follow_aims`

@@ -436,7 +436,7 @@ class Comparison:
     merit: float  # relative difference of the merit at the start
     gradient: float  # norm of the difference of the gradients at the start, relative to the norm of the gradient
     evaluations: int  # number of evaluations in each precision
-    rrmsd_float64: float  # RRMSD at the end of the tailoring in float64; both by the same tubes, in float64
+    rrmsd_float64: float  # RRMSD at the end of the tailoring in float64; each RRMSD is computed in float64
     rrmsd_float32: float  # RRMSD at the end of the tailoring in float32
     heights: float  # largest difference between the heights of a control point (mm)
 

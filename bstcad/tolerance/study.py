@@ -266,7 +266,7 @@ class StudySettings:
     seed: int = 0  # seed of the trials
     trials: int = MODEL_TRIALS  # number of trials by the model
     full: int = 200  # number of the first trials that are also traced in full
-    tubes: int = 1031  # flux tubes per side and channel; their numerical error is the same in every trial
+    tubes: int = 1031  # flux tubes per side and channel; their numerical error is equal in every trial
     progress: Progress = lambda *event: None  # receives the progress of the traces
     spread: Spread = run_locally  # executor of the traces
 

@@ -81,7 +81,7 @@ def write_trial(folder: Path, number: int, path: Path, settings: StudySettings) 
 
 
 def _pictures(scene: Scene, nominal: Nominal, settings: StudySettings) -> tuple[TargetPictures, ...]:
-    """Return the pictures of each target; all have the same errors, and their screens move together."""
+    """Return the pictures of each target, with common errors; the screens move together."""
     channels = scene.channels(TRACED_SOURCE_POINTS) if scene.source.extent else scene.channels()
     setup = Setup(nominal.lens, channels, scene.target.screen)
     errors = perturbations(setup, graded_table(scene.tolerance, settings.grade), scene.lens.material)

@@ -201,7 +201,7 @@ def _splat(rho, x, y, parts, reach):
     """Add the images of the cells of each block of rows to parts[block], and store the rows reached in reach[block]."""
     n, blocks = rho.shape[0], parts.shape[0]
     for turn in prange(blocks):
-        block = 2 * turn % blocks + 2 * turn // blocks  # even, then odd blocks: every region for each thread
+        block = 2 * turn % blocks + 2 * turn // blocks  # even, then odd blocks: each thread gets rows from all regions
         begin, end = block * n // blocks, (block + 1) * n // blocks
         lo, hi = _rows_reached(x[begin : end + 1])
         reach[block, 0], reach[block, 1] = lo, hi
