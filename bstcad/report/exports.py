@@ -72,7 +72,7 @@ def export(
     lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = None, label: Label = DEFAULT_LABEL,
     mount: Mount | None = None, light: GridLight | None = None,
 ) -> Exported:  # fmt: skip
-    """Write the files of these kinds of files.EXPORTS (SHEET: none) to the folder, each completely or not at all.
+    """Write the files of `kinds` (files.EXPORTS; nothing for SHEET) to the folder, each completely or not at all.
 
     points: points along the wider side of grids; by default the number of control points of the back, and for
     OpticStudio the knots of the net.  label: name of meshes and of a part.  mount: mount of the part in drawings; None:

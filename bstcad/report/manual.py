@@ -41,7 +41,7 @@ def pages() -> dict[str, Path]:
 
 
 def name_of(topic: str) -> str | None:
-    """Return the name of a page by its name or by the last part of it; None: no page, or several."""
+    """Return the name of a page for its name or the last part of the name; None: no page, or several."""
     name = topic.removesuffix(".md")
     ending = [each for each in pages() if each.endswith(f"/{name}")]
     return name if name in pages() else ending[0] if len(ending) == 1 else None
@@ -67,7 +67,7 @@ def first() -> str:
 
 @cache
 def sections() -> dict[str, str]:
-    """Return all sections, Markdown from the heading on, by page and label such as "checks#check-rrmsd", in order."""
+    """Return all sections (Markdown from the heading on) by page and label, such as "checks#check-rrmsd", in order."""
     texts = {page: pages()[f"reference/{page}"].read_text(encoding="utf-8") for page in PAGES}
     return {f"{page}#{label}": text for page, whole in texts.items() for label, text in SECTION.findall(whole)}
 

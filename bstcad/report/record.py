@@ -262,7 +262,7 @@ class Examined:
     checks: tuple[Check, ...]
     part: Mapping[str, str]  # rows of name and value (prescription.part)
     placement: Mapping[str, Any] | None = None  # position of the lens in the file (Placement.facts); None: not moved
-    # the fields below are those of Contents, empty without a design
+    # fields of Contents, empty without a design
     all_remarks: tuple[Remark, ...] = ()
     bounds: Mapping[str, Any] | None = None
 

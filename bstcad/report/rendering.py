@@ -238,7 +238,7 @@ def _close_rays(path: LightPath) -> np.ndarray:
 
 
 def _add_lens(plotter: Any, solid: Any, path: LightPath) -> None:
-    """Add the solid, of transparent glass or of metal, with two lights, and a point source in front of it."""
+    """Add the solid, of transparent glass or of metal, with two lights, and a point source in front of the lens."""
     import pyvista
 
     finish = METAL_FINISH if path.mirror else GLASS_FINISH

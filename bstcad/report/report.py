@@ -95,7 +95,7 @@ def ledger(flux: Mapping[str, float], of: str) -> dict[str, float]:
 
 
 def first_figures(report: Contents | Examined) -> list[Figure]:
-    """Return the first figures of the terminal and of report.html; for a STEP file alone, those of the part."""
+    """Return the first figures of the terminal and of report.html; for a STEP file alone, the figures of the part."""
     if isinstance(report, Examined):
         return [(name, value, "") for name, value in report.part.items()]
     rows = tables("first_figures.txt.j2", report=report)["first"]
@@ -156,7 +156,7 @@ def html(
 
 
 def base64_images(pictures: Mapping[str, bytes | None]) -> dict[str, str]:
-    """Return pictures (PNG bytes by name) in base64, without those that are None."""
+    """Return pictures (PNG bytes by name) in base64; a picture that is None is omitted."""
     return {key: base64.b64encode(picture).decode() for key, picture in pictures.items() if picture}
 
 

@@ -62,7 +62,7 @@ class Sensitivity:
     distribution: Literal["normal", "uniform", "field"]
     cost: Width  # relative cost of the limit (default 1)
     sigma: Width  # standard deviation, in `unit`
-    rrmsd_change: float  # change of RRMSD by one sigma; with several targets, on the one that changes most
+    rrmsd_change: float  # change of RRMSD by one sigma; with several targets, on the target that changes most
     share: Fraction  # fraction of the mean square change that all errors cause in all pictures
     wavefront_change: float | None = None  # change of the RMS wavefront error by one sigma (waves); None: no wave
 
@@ -81,7 +81,7 @@ class Inverse:
     """Loosest tolerances for a requested yield, computed with superposed pictures."""
 
     wanted: Fraction  # requested yield
-    passed: Annotated[Yield, Field(alias="yield")]  # yield of new trials with these tolerances
+    passed: Annotated[Yield, Field(alias="yield")]  # yield of new trials with `limits`
     limits: Mapping[str, Width]  # width of each error, as Sensitivity.limit
 
 
@@ -94,10 +94,10 @@ class TargetStudy:
     rrmsd: Rrmsd  # RRMSD of the design on this target
     passed: Annotated[Yield, Field(alias="yield")]  # yield of the limit on this target
     passed_full: Annotated[Yield, Field(alias="yield_full")]  # yield of the trials traced in full
-    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of these trials, this screen adjusted
+    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of the full trials, screen adjusted
     rrmsd_trials: Spread  # RRMSD of the trials by superposed pictures
     rrmsd_full: Spread  # RRMSD of the trials traced in full
-    rrmsd_adjusted: Spread  # RRMSD of these trials by superposed pictures, with this screen adjusted
+    rrmsd_adjusted: Spread  # RRMSD of the full trials with this screen adjusted, superposed pictures
     model_off: Disagreement  # disagreement of superposed pictures with full traces
     sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # the worst first
 
@@ -134,10 +134,10 @@ class Tolerances:
     # yield by superposed pictures: lenses within `limit` on all targets and within the limit of the wavefront
     passed: Annotated[Yield, Field(alias="yield")]
     passed_full: Annotated[Yield, Field(alias="yield_full")]  # yield of the trials traced in full
-    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of these trials, screen adjusted
+    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of the full trials, screen adjusted
     rrmsd_trials: Spread  # RRMSD of the trials by superposed pictures
     rrmsd_full: Spread  # RRMSD of the trials traced in full
-    rrmsd_adjusted: Spread  # RRMSD of these trials by superposed pictures, with the screen adjusted
+    rrmsd_adjusted: Spread  # RRMSD of the full trials with the screen adjusted, superposed pictures
     model_off: Disagreement  # disagreement of superposed pictures with full traces
     sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # sensitivities, the worst first
     worst: Annotated[tuple[Trial, ...], Field(max_length=100)]  # worst of the fully traced trials

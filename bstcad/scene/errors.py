@@ -72,7 +72,7 @@ def explain(error: ValidationError, data: Any) -> str:
 
 
 def _applies(location: tuple[int | str, ...], data: Any) -> bool:
-    """Return False if the error belongs to an outline of another shape than the one in the data."""
+    """Return False if the error belongs to an outline whose shape differs from the shape in the data."""
     for step in location:
         if step in ("Circle", "Rectangle") and isinstance(data, dict):
             return data.get("shape") == step.lower()

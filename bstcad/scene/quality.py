@@ -197,7 +197,7 @@ class Tolerance(Record):
 
 
 def settings_of(tables: Sequence[Tolerance], error: str) -> dict[str, Any]:
-    """Return the settings of an error from all tables; the later of a grade and a limit replaces the other."""
+    """Return the settings of an error from all tables; of grade and limit, the later one replaces the earlier."""
     merged: dict[str, Any] = {}
     for stated in (table.stated for table in tables if table.covers(error)):
         for one, other in (("grade", "limit"), ("limit", "grade")):

@@ -115,7 +115,7 @@ def _check_links(path: Path, bounds: Sequence[Path]) -> None:
 
 
 def leaving_out(**defaults: Any) -> Any:
-    """Return a serializer that omits keys with these values, so that older files are written without change."""
+    """Return a serializer that omits keys with the values `defaults`, so that older files are written unchanged."""
 
     def written(self: Any, handler: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
         found = handler(self)
