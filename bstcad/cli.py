@@ -305,7 +305,7 @@ def generate(
 
 @app.command(epilog=examples("plan templates/thu.toml", "plan my-lens.toml --png reach.png"))
 def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False, png: ReachPng = None) -> int:
-    """Predict time, error and memory of a design; list neglected effects and the part of the target without light."""
+    """Predict time, error and memory of a design; list neglected effects and unreachable parts of the target."""
     with loading():
         wanted = load_scene(scene, settings)
         from bstcad import folder as folders

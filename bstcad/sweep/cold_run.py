@@ -294,7 +294,7 @@ def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick:
     process = processes.run(["generate", str(scene), "-o", str(folder), *changes], limit, tick)
     times: dict[str, Any] = {"settings": point, "seconds": process.seconds, "cpu_seconds": process.cpu_seconds}
     if process.seconds >= limit and process.code < 0:
-        reason = f"stopped after {process.seconds:.0f} s, because its share of the budget was used up"
+        reason = f"ended after {process.seconds:.0f} s, because its share of the budget was used up"
         return ColdRun(status=FAILED, reason=reason, allowed_seconds=limit, **times)
     if process.code not in (0, 1) or not (folder / "report.json").is_file():
         return ColdRun(status=FAILED, reason=process.reason, **times)
