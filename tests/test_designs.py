@@ -139,7 +139,7 @@ class TestOwnSurfaces:
             lambda d: d.with_lens(net(d, x=(-3.0, 4.0))),
             r"net along x \(mm\) is \(-3.0, 4.0\), and in the scene it is \(-4\.571\d+, 4\.571\d+\); give",
         ),
-        (lambda d: d.with_heights(torch.full((33, 33), math.nan)), "heights of the back are not finite"),
+        (lambda d: d.with_heights(torch.full((33, 33), math.nan)), "back has heights that are not finite"),
         (
             lambda d: d.with_heights(np.zeros((33, 32, 1))),
             r"with_heights: numbers of shape \(33, 32, 1\) .*; give \(m, n\) real",

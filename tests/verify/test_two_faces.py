@@ -217,7 +217,7 @@ def test_a_damaged_further_target_is_a_sentence(two, tmp_path):
         found = {name: design[name] for name in design.files}
     folders._write_scene(two.made, tmp_path)
     np.savez_compressed(tmp_path / "design.npz", **(found | {"target_2": 0 * found["target_2"]}))
-    with pytest.raises(bstcad.SceneError, match=r"the target\[1\] is all black"):
+    with pytest.raises(bstcad.SceneError, match=r"the picture of target\[1\] is all black"):
         folders.read_nominal(tmp_path)
 
 
