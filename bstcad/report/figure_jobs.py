@@ -206,7 +206,7 @@ def surface_maps(lens: Lens, found: Survey, face: str = "back") -> Figure:
     maps = (
         (scale * height, unit, heading),
         (slope, "degrees", f"Slope: up to {found.slope.largest:.3g}°"),
-        (bend, "1/mm", "Mean curvature (+: bends towards +z)"),
+        (bend, "1/mm", "Mean curvature (seen from +z: + hollow, − dome)"),
     )
     for axes, (values, label, title) in zip(panels, maps, strict=True):
         signed = axes is panels[2]
