@@ -147,7 +147,7 @@ class Design:
             given = getattr(heights, "shape", type(heights).__name__)
             given = f"numbers of shape {tuple(given)}" if isinstance(given, tuple) else given
             raise SceneError(
-                f"with_heights: {given} is not possible; give (m, n) real numbers in mm, such as lens.back.heights"
+                f"with_heights: {given} cannot be the heights; give (m, n) numbers in mm, such as lens.back.heights"
             ) from None
         m, n = (max(count, MIN_ROUND_POINTS) for count in found.shape)
         net = self.scene.flat_lens((m, n)).back_net

@@ -171,7 +171,7 @@ def _without_cubic(face: BSplineSurface) -> np.ndarray:
 
 
 def _energy(face: BSplineSurface, waves: np.ndarray) -> np.ndarray:
-    """Return the slope energy (m, n) of the cosines of a net, by their amplitudes (mm²); 0 where it is rounding."""
+    """Return the slope energy (m, n), mm², of cosines of a net with amplitudes `waves` (mm); 0 where it is rounding."""
     along_x, along_y = (2 - 2 * np.cos(np.pi * np.arange(count) / count) for count in face.shape)
     energy = (along_x[:, None] + along_y) * waves**2
     rounding = HEIGHT_ROUNDING * (abs(face.z) + float(face.heights.abs().max()))

@@ -26,7 +26,7 @@ from bstcad.sweep.plan import plan
 
 STAGES = ("preview", "settled", "effects", "predicted")
 MAX_PAGES = 32  # largest number of pages with a stored request
-IDLE_DELAY = 0.7  # pause (s) between a preview and the work on later answers, in case another change comes
+IDLE_DELAY = 0.7  # pause (s) between a preview and the next of STAGES, in case another change comes
 JOIN_TIMEOUT = 0.5  # time (s) in which the thread has to end
 PAGE_TIMEOUT = 60.0  # time (s) after a page's last poll until its request is dropped
 

@@ -105,7 +105,7 @@ class Pose:
         return (points - self.pivot - self.shift) @ self.rotation + self.pivot
 
     def compose(self, motion: np.ndarray, reach: float) -> Pose:
-        """Return the pose that removes this pose, then moves points by `motion` (6,), as in BackFace.columns."""
+        """Return the pose whose `to_design` is that of this pose, then `motion` (6,), as in BackFace.columns."""
         turn = Rotation.from_rotvec(motion[3:] / reach).as_matrix()
         rotation = self.rotation @ turn.T
         return Pose(rotation, self.shift - rotation @ motion[:3], self.pivot)
@@ -378,7 +378,7 @@ def _heights(face: BackFace, sample: np.ndarray, decentre: np.ndarray) -> list[f
 
 
 def _refine_start(face: BackFace, sample: np.ndarray, pose: Pose, steps: int) -> tuple[Pose, float]:
-    """Refine a pose by Gauss-Newton with weights 1 / (1 + (d / s)²), s = 2 x distance of the nearest quarter."""
+    """Return a pose refined by Gauss-Newton, weights 1 / (1 + (d / 2 q)²), and the lower quartile q of d (mm)."""
     distance = np.inf
     for _ in range(steps):
         points = pose.to_design(sample)

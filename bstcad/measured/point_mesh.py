@@ -97,7 +97,7 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
             case ["ply"] | ["comment" | "obj_info", *_] | []:
                 pass
             case _:
-                raise _Damaged(f"its header contains {line.strip()[:40]!r}")
+                raise _Damaged(f"its header has the unknown line {line.strip()[:40]!r}")
     if form != "ascii" and form not in ORDERS:
         raise _Damaged(f"its format is {form[:40]!r}")
     return form, elements, end.end()

@@ -146,19 +146,19 @@ def image(behind: Sequence[Interface], plane: Receiver) -> Receiver:
 
 
 def image_from_last_net(lens: Lens, plane: Receiver) -> Receiver:
-    """Return the image of a receiver behind the last net of a lens; the receiver itself if no interface follows."""
+    """Return the image of a receiver by the interfaces behind the last net; the receiver itself if there are none."""
     return image(lens.interfaces[lens.freeform[-1] + 1 :], plane)
 
 
 def image_screen(lens: Lens, screen: Screen) -> Screen:
-    """Return the screen with its image behind the last net of a lens as its receiver."""
+    """Return the screen whose receiver is its image by the interfaces behind the last net of a lens."""
     plane = screen.plane
     view = image_from_last_net(lens, plane)
     return screen if view is plane else replace(screen, surface=view)
 
 
 def image_from_lens(lens: Lens, screen: Screen) -> Receiver:
-    """Return the image of a screen's receiver behind the lens."""
+    """Return the image of a screen's receiver by the windows and mirrors behind the lens; itself if there are none."""
     return image(lens.behind, screen.plane)
 
 

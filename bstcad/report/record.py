@@ -139,7 +139,7 @@ class DesignCourse:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """An effect that is not simulated, and its estimated change (analysis.neglected_effects.Change); None: unknown."""
+    """An effect that is not simulated, and its estimated change (analysis.neglected_effects.Change)."""
 
     kind: str  # key of LEFT_OUT
     flux_change: float | None  # change of the flux on the target, as a fraction

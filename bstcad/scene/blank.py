@@ -576,14 +576,14 @@ class LensBlank(Record):
         return tuple(face for face in self.passes.faces if tailored[face])
 
     def front_net(self, net: Sides) -> Sides | None:
-        """Return the control points of a freeform front for a back of `net`; None if the front is not a net."""
+        """Return the control points per side of a freeform front if the back has `net`; None without a net."""
         if self.front.is_tailored:
             return self._tailored_front_net(net)
         fixed = _net_of(self.front.surface, self.outline) if isinstance(self.front, _FittedFront) else self.front.file
         return None if fixed is None else simplified(fixed.shape)
 
     def _tailored_front_net(self, net: Sides) -> Sides:
-        """Return the control points of a tailored front for a back of `net`, in the ratio of the scene."""
+        """Return the control points per side of a tailored front if the back has `net`, in the scene's ratio."""
         own = self.front.file.shape if self.front.file else self.front.control_points
         if own is None:
             return net
@@ -592,13 +592,13 @@ class LensBlank(Record):
         return in_proportion(net, of=self.back.net, to=simplified(own))
 
     def nets(self, net: Sides | None = None) -> tuple[Sides, ...]:
-        """Return the control points of the back (default: the scene's), then those of a freeform front."""
+        """Return the control points per side of the back (default: the scene's), then of a freeform front."""
         back = net or self.back.net
         front = self.front_net(back)
         return (back,) if front is None else (back, front)
 
     def flat_front(self, net: Sides, as_wide_as: Sides | None = None) -> Surface:
-        """Return the front before tailoring for a back of `net`; as_wide_as: see Scene.flat_lens."""
+        """Return the front before tailoring if the back has `net`; as_wide_as: see Scene.flat_lens."""
         if not self.front.is_tailored:
             return self.front_surface
         if self.front.file is not None:

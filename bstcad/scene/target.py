@@ -186,7 +186,7 @@ class Target(Record):
     def irradiance(self) -> np.ndarray:
         """Return the required flux per pixel, (rows, columns) float64 of sum 1; row 0 is y max, column 0 is x min.
 
-        Seen from the lens, along +z with y up, x increases to the left, so the left column of the picture is x max.
+        Seen from the lens, along +z with y up, x increases to the left: the last column (x max) is on the left there.
         """
         seen = drawing(self).light
         flux = seen[:, ::-1] if self.seen_from == "lens" else seen

@@ -90,7 +90,7 @@ def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
 
 
 def reach_from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver, law: Law, grazing: float) -> Tensor:
-    """Return `optics.reach.reach_margin` from each lit point of the face to each aim, (points, …).
+    """Return `optics.reach.reach_margin` from every FACE_STRIDE-th lit point of the face to each aim, (points, …).
 
     aims: x and y of the aims (mm), of one shape (…).
     """

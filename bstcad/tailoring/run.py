@@ -149,7 +149,7 @@ class Task:
         return replace(self, channels=self.sampled_sources[-1], sampled_sources=()) if self.sampled_sources else self
 
     def refined(self, lens: Lens, sides: Sides) -> Lens:
-        """Return the lens with its nets refined to the control points per side that belong to `sides` on the back."""
+        """Return the lens with its nets refined: the back to `sides`, a front to `front_sides(sides)`."""
         pairs = zip(lens.nets, self.sides(lens, sides), strict=True)
         return lens.with_nets(net.refined(count) for net, count in pairs)
 

@@ -182,7 +182,7 @@ def test_a_ply_file_is_held_to_what_its_header_promises(tmp_path, order):
         "declares 999999999999999999 rows of element 'face', but 2 follow": ply(order, faces=10**18 - 1),
         "declares 2 rows of element 'face', but 1 follow": ply(order, triangles=1),
         "follow": ply(order, more=b"1 2 3\n"),
-        "is not a readable PLY file (its header contains 'element vertex -5')": ply(order, -5),
+        "is not a readable PLY file (its header has the unknown line 'element vertex -5')": ply(order, -5),
     }
     for sentence, data in wrong.items():
         path.write_bytes(data)

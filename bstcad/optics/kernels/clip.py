@@ -388,7 +388,7 @@ def _mean(g, a, b, c):
 
 @njit(error_model="numpy")
 def _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, flags, known, edges):
-    """Store `along_edge` of the edges of the triangles of row k that are followed in `edges`.
+    """Store in `edges` the integrals `along_edge` of the edges of those triangles of row k that are followed.
 
     flags (m, 3): True for the first and the second triangle of a tube if it is followed, and for a tube that extends
     outside the screen.  edges: upper, lower, across (m, 3) and side (m + 1, 3), for the edges 03, 12, the diagonals and

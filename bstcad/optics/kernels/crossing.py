@@ -267,7 +267,7 @@ class Crossing(NamedTuple):
 class Cross(torch.autograd.Function):
     """Map (heights, position (3, n), direction (3, n), status (n,), crossing) to (out, status, path, cos θ).
 
-    out: landing points (2, n) mm, or for rays that go on hit (mm) and direction behind the face (6, n).  path (n,) to
+    out: landing points (2, n) mm; or, if rays go on, hit (mm) and direction behind the face (6, n).  path (n,) to
     the face (mm) and cos θ (n,) of incidence have a gradient if `crossing.lossy`; otherwise cos θ is empty.  The
     gradient is taken in heights, positions and directions, where needed.
     """
