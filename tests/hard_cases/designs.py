@@ -240,7 +240,7 @@ def main() -> None:
             rows.append(cells)
             words.append(f"- {name}: {said}")
             print(markdown.row(cells), flush=True)
-    content = [markdown.table(HEAD, rows), "", "What their reports say was given up:", "", *words]
+    content = [markdown.table(HEAD, rows), "", "Remarks of their reports:", "", *words]
     markdown.write(wanted.page, "<!-- figures: designs -->", "\n".join(content))
 
 

@@ -91,8 +91,9 @@ def test_tubes_cut_by_a_border_leave_no_light_beside(holds, compiled):
     lit = torch.zeros((5, 5), dtype=torch.bool)
     lit[1:3, 1:3] = True
     bound = 6 * 2 * n / width * ROUND
-    holds("tubes cut by a pixel border: their own pixels", float((4 * image[lit] / n**2 - 1).abs().max()), bound)
-    holds("tubes cut by a pixel border: dark pixels", float(image[~lit].abs().max()) / n**2, bound, "of the light")
+    error, dark = float((4 * image[lit] / n**2 - 1).abs().max()), float(image[~lit].abs().max()) / n**2
+    holds("tubes cut by a pixel border: error in their own pixels", error, bound)
+    holds("tubes cut by a pixel border: light in dark pixels", dark, bound, "of the light")
 
 
 @FORMS
