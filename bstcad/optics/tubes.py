@@ -220,7 +220,7 @@ def _over_the_back(source: Emitter, lens: Lens, n: int, few: int) -> _Sheet:
 
 def _proportioned(lens: Lens, light: Outline, n: int) -> Sides:
     """Return the tubes per side: n; for an oblong net about n² in all, in proportion to its spans inside `light`."""
-    net = lens.nets[-1]
+    net = lens.last_freeform.net
     if net.shape[0] == net.shape[1]:
         return n
     return spread(n, *(half / pitch for half, pitch in zip(light.half_extent, net.pitch, strict=True)))

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from functools import cache, partial, reduce
 from pathlib import Path
-from types import SimpleNamespace as Named
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -97,6 +97,15 @@ class Piece:
     def keep(self, known: Record, record: Record) -> None:
         """Put a record in its place."""
         reduce(lambda at, key: at.setdefault(key, {}), self.place[:-1], known)[self.place[-1]] = record
+
+
+class Named(SimpleNamespace):
+    """Part of a record with its keys as attributes."""
+
+    @property
+    def time_and_error(self):
+        """Time (seconds) and RRMSD of a run, as of `sweep.cold_run.ColdRun`."""
+        return self.seconds, self.rrmsd
 
 
 def pieces(budget: float, limit: float) -> dict[str, Piece]:
