@@ -53,7 +53,7 @@ from bstcad.tailoring.run import (
     Task,
 )
 from bstcad.tailoring.source_image import ExtendedSource
-from bstcad.tailoring.stage2 import Comparison, compare_precisions
+from bstcad.tailoring.stage2 import PrecisionComparison, compare_precisions
 from bstcad.transport.mapping import Mapping, TransportMap
 
 PROCEDURES: dict[str, tuple[str, Stage, Stage]] = {  # tailoring.method -> (name of stage 1, stage 1, stage 2)
@@ -84,7 +84,7 @@ class Stage1Result:
     lens: Parameters  # parameters of the lens after stage 1
     mapping: Mapping  # transport map of stage 1
     transport: TransportMap  # inverse map, from the pixels of the target
-    precision: Comparison | None  # comparison of float32 with float64; None: not made
+    precision: PrecisionComparison | None  # comparison of float32 with float64; None: not made
     rrmsd: float  # RRMSD of the lens for the centre of the source, without a mount
 
 

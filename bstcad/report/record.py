@@ -93,7 +93,7 @@ class CurvePoint:
 
 
 class PrecisionTest(TypedDict):
-    """float32 against float64 on the merit function of the scene; see tailoring.stage2.Comparison."""
+    """float32 against float64 on the merit function of the scene; see tailoring.stage2.PrecisionComparison."""
 
     control_points: int  # control points per side
     merit: Size  # relative difference of the merit before the first step

@@ -429,7 +429,7 @@ def stage3_sheet_sizes(knobs: ResolvedTailoring, pixels: tuple[int, int]) -> Ite
 
 
 @dataclass(frozen=True)
-class Comparison:
+class PrecisionComparison:
     """Differences between two copies of a lens, one tailored in float32, the other in float64."""
 
     control_points: int  # control points along the longer side
@@ -441,7 +441,7 @@ class Comparison:
     heights: float  # largest difference between the heights of a control point (mm)
 
 
-def compare_precisions(task: Task, lens: Lens) -> Comparison:
+def compare_precisions(task: Task, lens: Lens) -> PrecisionComparison:
     """Run a short stage 2 from `lens` in both precisions, with the same tubes and the same number of evaluations.
 
     Rounding can change where a line search ends, so the lenses may differ by more than rounding and be equally good.
@@ -453,7 +453,7 @@ def compare_precisions(task: Task, lens: Lens) -> Comparison:
     n, goal = round(side_factor(task.channels) * (COMPARED_TUBES + 1)), task.goals[0]
     rrmsd = [rrmsd_by_tubes(end, task.channels, goal, n=n) for end in (single, double)]
     pairs = zip(single.nets, double.nets, strict=True)
-    return Comparison(
+    return PrecisionComparison(
         control_points=max(max(net.shape) for net in lens.nets),
         merit=abs(merit / exact_merit - 1),
         gradient=float((gradient - exact_gradient).norm() / exact_gradient.norm()),
