@@ -115,7 +115,7 @@ class LineFigures:
 
 @dataclass(frozen=True)
 class DesignCourse:
-    """Course of a design; None: unknown, for a design whose earlier report is missing."""
+    """Course of a design; a value is None if the earlier report of the design is missing."""
 
     seconds_total: Seconds = 0.0  # time from the command to the verified lens
     stages: tuple[StageRecord, ...] = ()
