@@ -142,7 +142,7 @@ class TestOwnSurfaces:
         (lambda d: d.with_heights(torch.full((33, 33), math.nan)), "back has heights that are not finite"),
         (
             lambda d: d.with_heights(np.zeros((33, 32, 1))),
-            r"with_heights: numbers of shape \(33, 32, 1\) .*; give \(m, n\) real",
+            r"with_heights: numbers of shape \(33, 32, 1\) .*; give \(m, n\) numbers",
         ),
         (lambda d: d.with_heights(np.zeros((4, 4))), "control_points: 4 is not between 5 and 2049"),
         (lambda d: d.with_lens(replace(d.lens, front=bstcad.Plane(26.0))), "the lens is -1 mm thick at its centre"),
