@@ -97,7 +97,7 @@ def text_has(page, words):
 
 def change_the_scene(page):
     """4: the wall nearer and back; then a draft of few points and pixels."""
-    relief = page.locator("#figures tr:has-text('Relief') td")
+    relief = page.locator("#figures tr:has-text('Sag of the back') td")
     before = relief.inner_text()
     value_of(page, "target.z", "308")
     page.wait_for_selector("#saved:has-text('unsaved')")
