@@ -22,7 +22,7 @@ PICTURES = ("workbench-start.png", "workbench-scene.png", "workbench-run.png", "
 LARGEST = 300_000  # bytes of a picture
 WIDE, HIGH = 1200, 860  # pixels of the window
 PATIENCE = 1_200_000  # milliseconds, on a busy machine
-ALL_SEEN = "#status:has-text('Settled')"
+ALL_SEEN = "#status:has-text('Refined')"
 DROP = """([place, data]) => {
   const bytes = Uint8Array.from(atob(data), (sign) => sign.charCodeAt(0)), files = new DataTransfer();
   files.items.add(new File([bytes], "photo.jpg", { type: "image/jpeg" }));
