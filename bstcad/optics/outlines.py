@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -23,15 +24,15 @@ SIZE_RANGE = (1e-3, 1e6)  # range of the size of an outline in a scene, mm
 OUTLINE_POINTS = 720  # rim points on the arcs of an outline together, and about as many on its straight sides together
 
 
-class _Box:
+class _Box(ABC):
     """Methods of all outlines that follow from their limits."""
 
     is_round = False  # True for a circle
 
     @property
+    @abstractmethod
     def limits(self) -> Limits:
         """Limits (a, b, r²)."""
-        raise NotImplementedError
 
     @property
     def farthest(self) -> tuple[float, float]:
