@@ -34,7 +34,7 @@ from bstcad.optics.surfaces import Surface
 
 DEGREE = 2  # degree of the basis functions (order 3)
 SPANS_AT_A_TIME = 1 << 14  # spans evaluated at a time, so that their values stay in the cache
-# Positions in a span at which slope and curvature of the back are limited and reported, on the two sides of each knot.
+# Positions in a span, including both end knots, at which slope and curvature of the back are limited and reported.
 QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
@@ -53,7 +53,7 @@ def parameter(u: Tensor, m: int) -> Tensor:
 
 
 def span(u: Tensor, m: int) -> tuple[Tensor, Tensor]:
-    """Return (k, s), t(u) = k + s: the span and the position in it, without the rounding of a t as large as m."""
+    """Return (k, s), t(u) = k + s: number of the span and position in it, which has more digits than the sum t."""
     first, last = u < 1.5, u > m - 2.5
     end = torch.where(first, u, m - 1 - u)  # distance from the nearer end
     root = torch.sqrt(4.0 - 2.0 * torch.where(first | last, end, torch.ones_like(u)))  # guarded before the root
@@ -64,7 +64,7 @@ def span(u: Tensor, m: int) -> tuple[Tensor, Tensor]:
 
 
 def position(t: Tensor, m: int) -> Tensor:
-    """Return u(t) = 2t - t²/2, t + 1/2, or its mirror image in the last span: the inverse of `parameter`."""
+    """Return u(t), inverse of `parameter`: 2t - t²/2 in the first span, its mirror image in the last, or t + 1/2."""
     end = m - 2.0 - t
     return torch.where(t < 1, 2 * t - t * t / 2, torch.where(end < 1, m - 1 - 2 * end + end * end / 2, t + 0.5))
 
@@ -73,9 +73,9 @@ def basis(u: Tensor, m: int) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], tup
     """Return the three non-zero basis functions at u and their derivatives in u; Wang et al. 2023, Eqs. 8-12.
 
     With s = t - k and q = 1 - s in span k: B_k = a q², B_{k+2} = b s², B_{k+1} = 1 - B_k - B_{k+2}, where a = 1 in
-    the first span, b = 1 in the last, and otherwise a, b = 1/2 (the four corner functions; the paper prints B_{m-1}
-    and the first piece of B_{m-2} reversed, the correct form is the mirror image of B_0 and B_1).  Since the control
-    points are uniform, du/dt = Σ i B'_i = 2 (a q + b s).
+    the first span, b = 1 in the last, and otherwise a, b = 1/2 (the paper prints B_{m-1} and the first piece of
+    B_{m-2} reversed; the correct form is the mirror image of B_0 and B_1).  Since the control points are uniform,
+    du/dt = Σ i B'_i = 2 (a q + b s).
 
     Returns (k, (B_k, B_{k+1}, B_{k+2}), (dB/du …)), each shaped like u.
     """
@@ -114,9 +114,9 @@ def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Ten
 
 
 def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    """Return the gradient (m, n) of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v in the heights, seeds (g, g_u, g_v).
+    """Return the gradient (m, n) of Σ (g h + g_u ∂h/∂u + g_v ∂h/∂v) in the heights; seeds: (g, g_u, g_v).
 
-    This adjoint of `evaluate` does not depend on the heights; they give the net's size, type and device.
+    This adjoint of `evaluate` does not depend on the heights; `heights` gives the net's size, type and device.
     """
     if fast := ops.kernel("bspline.net_gradient", heights, u, v):
         return fast(heights, u, v, seeds)
@@ -127,7 +127,7 @@ def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Ten
 
 
 def basis_matrix(u: np.ndarray, m: int, derivative: int = 0) -> scipy.sparse.csr_matrix:
-    """Return the banded matrix (len(u), m) whose row r holds the basis functions, or their derivative, at u[r]."""
+    """Return the banded matrix (len(u), m) whose row r contains the basis functions, or their derivative, at u[r]."""
     points = torch.as_tensor(np.asarray(u, dtype=np.float64))
     k, *weights = basis(points, m)
     columns = (k[:, None] + torch.arange(3)).numpy()
@@ -172,7 +172,7 @@ def resampling_matrix(coarse: int, fine: int) -> scipy.sparse.csr_array:
 
 
 def _least_squares(basis: scipy.sparse.csr_matrix, projected: np.ndarray) -> np.ndarray:
-    """Solve B^T B c = projected for c, B the basis at some points, (points, m)."""
+    """Solve B^T B c = projected for c, B (points, m) the basis functions at some points."""
     normal, m = basis.T @ basis, basis.shape[1]  # banded: rounding of a dense solver depends on the number of threads
     bands = np.zeros((DEGREE + 1, m))
     for k in range(DEGREE + 1):
@@ -207,8 +207,8 @@ class BSplineSurface(Surface):
         """Fit a net of m x m control points over x and y (mm) to a surface by least squares along each axis.
 
         B^T B H C^T C = B^T Z C: Z are the surface's heights at four points per span along each axis, B and C the basis
-        along x and y.  The first and the last span are left out: x(t) is quadratic there, and the error falls as the
-        second power of the spacing, elsewhere as the third.  The outermost control points are extrapolated.
+        along x and y.  The first and the last span are left out: x(t) is quadratic there, so that the error would fall
+        as the second power of the spacing instead of the third.  The outermost control points are extrapolated.
         """
         u = np.linspace(1.5, m - 2.5, 4 * (m - 4) + 1)
         basis = basis_matrix(u, m)[:, 1:-1]  # the first and the last control point act on the end spans only
@@ -316,7 +316,7 @@ def is_net(surface: Surface) -> TypeIs[BSplineSurface]:
 def require_net(surface: Surface) -> BSplineSurface:
     """Return a surface that is a B-spline net; TypeError for another one."""
     if not is_net(surface):
-        raise TypeError(f"the {surface.kind} has no control points; fit a net to it by BSplineSurface.fitted")
+        raise TypeError(f"the {surface.kind} has no control points; fit a net to it with BSplineSurface.fitted")
     return surface
 
 
@@ -355,7 +355,7 @@ def principal(z_x: Tensor, z_y: Tensor, z_xx: Tensor, z_xy: Tensor, z_yy: Tensor
 
 
 def weights(span: Tensor, m: int, s: float) -> tuple[tuple[Tensor, Tensor, Tensor], ...]:
-    """Return the three non-zero basis functions and their first two derivatives in u at s of each span (int64).
+    """Return the three non-zero basis functions and their first two derivatives in u, at position s in each `span`.
 
     The functions are those of `basis`; du/dt = 2 (a q + b s), d²u/dt² = 2 (b - a).
     """
@@ -387,7 +387,7 @@ class Spans:
         return cls(surface.shape, surface.pitch, i=i, j=j, heights=heights)
 
     def jet(self, s: Sequence[float]) -> Jet:
-        """Return the derivatives at positions s x s of each span, differentiable in the heights."""
+        """Return the derivatives at positions s x s (0 to 1) of each span, differentiable in the heights."""
         pitch_x, pitch_y = self.pitch
         along_x, along_y = (
             self._weights(index, count, s) for index, count in zip((self.i, self.j), self.shape, strict=True)
@@ -408,7 +408,7 @@ class Spans:
         return [[torch.stack([w[order][k] for w in each]).to(self.heights) for k in range(3)] for order in range(3)]
 
     def scattered(self, gradient: Tensor) -> Tensor:
-        """Add a gradient in `heights` (9, n) to the net (m, n); the result does not depend on the order of the sum."""
+        """Return a gradient in `heights` (9, n) as a gradient in the net (m, n), added up in a fixed order."""
         m, n = self.shape
         net, corner = torch.zeros(m * n).to(gradient), self.i * n + self.j
         for k, part in enumerate(gradient):
@@ -438,8 +438,8 @@ def near_outline(surface: BSplineSurface, outline: Outline, i: Tensor, j: Tensor
 def curvature_bounds(surface: BSplineSurface, sign: float) -> Tensor:
     """Return an upper bound (m - 2, n - 2) of the positive principal curvatures of sign · z in each span (1/mm).
 
-    Second derivatives are weighted means of second differences of the control points, in an end span of 1/4 to 2 times
-    those differences.  A positive principal curvature is at most the larger eigenvalue of the Hessian, which grows with
+    Second derivatives are weighted means of second differences of the control points; in an end span, of 1/4 to 2 times
+    these differences.  A positive principal curvature is at most the larger eigenvalue of the Hessian, which grows with
     the two diagonal entries and with the magnitude of the mixed entry.
     """
     d_x, d_y = _differences(surface)

@@ -1,11 +1,11 @@
 """Channels: the light as a weighted sum of parts, each of which is traced separately.
 
-A channel is one sample point of the source at one wavelength, in media of one index each.  Irradiance, merit function
-and flux ledger are sums over channels, E = Σ_k w_k E_k with Σ_k w_k = 1.  A scene without an extended source and
-without a spectrum has one channel of weight 1.
+A channel is one sample point of the source at one wavelength, with the refractive index of each medium for it.
+Irradiance, merit function and flux ledger are sums over channels, E = Σ_k w_k E_k with Σ_k w_k = 1.  A scene without an
+extended source and without a spectrum has one channel of weight 1.
 
-The sample points of an extended source are divided among its spectral lines: n points give n channels, whatever the
-number of lines (at least two points per line).  The points of a line come in pairs, symmetric about the centre.
+The sample points of an extended source are divided among its spectral lines: n points give about n channels.  In
+`channels_of` each line has at least two points, in pairs that are symmetric about the centre.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def drawn_channels(source: Emitter, index: Callable[[float], float], points: int
     points: number of sample points of all lines together, at least one per line (sampling.shifted_lattice).
     """
     extent = source.extent
-    assert extent is not None  # a simple source has no points to draw
+    assert extent is not None  # a simple source has no points to sample
 
     def points_of(fraction: float, k: int) -> list[tuple[float, float]]:
         return sampling.shifted_lattice(extent, max(1, round(fraction * points)), (seed << 8) + k)
@@ -115,6 +115,6 @@ def _lines(channels: Sequence[Channel]) -> list[list[int]]:
 
 
 def weighted_sum(channels: Sequence[Channel], values: Iterable[Any]) -> Any:
-    """Return Σ_k w_k v_k, one value per channel, tensors or numbers; one value of weight 1 keeps its bits."""
+    """Return Σ_k w_k v_k of values v_k (tensors or numbers), one per channel; one of weight 1 keeps its bits."""
     first, *others = (channel.weight * value for channel, value in zip(channels, values, strict=True))
     return sum(others, first)

@@ -19,7 +19,7 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, tilt_of
 
-WIDTHS_BEFORE_LENS = 4.0  # distance of the aperture from the lens / its width, for a tilted beam without a plane z
+WIDTHS_BEFORE_LENS = 4.0  # distance of the aperture of a tilted beam without z from the lens, in aperture diagonals
 MAX_INCLINATION = 89.0  # degrees, largest angle of parallel light to the axis of the lens
 
 
@@ -79,7 +79,7 @@ class Collimated(Emitter):
 
     @property
     def is_rotation_invariant(self) -> bool:
-        """True if the aperture is round, as the cone is."""
+        """True if the aperture is round; the cone always is."""
         return self.aperture.is_round
 
     def moved(self, motion: Motion, entrance: float) -> Collimated:
@@ -206,8 +206,8 @@ class Collimated(Emitter):
     def start(self, z: float) -> float:
         """Return z (mm) of the plane from which rays start, for a front whose vertex is on the plane z.
 
-        A front that the rays can meet at a distance r from the axis, at most a half sphere, reaches at most r towards
-        them.  Tilted rays move towards the axis on the way to the plane, and start further away.
+        At a distance r from the axis a front, at most a half sphere, reaches at most r towards the rays.  Tilted rays
+        may move towards the axis on the way to the plane, so they start further away.
         """
         if self.z is not None:
             return self.z

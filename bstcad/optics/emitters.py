@@ -46,11 +46,11 @@ class Emitter(ABC):
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
     wavelength: Wavelength
-    lumens: float | None = None  # total flux, lm; None: relative
-    tilt: tuple[float, float] | None = None
-    profile: str = "own"
-    size_key: str | None = None  # scene key of the size; with the prefix real_ the key of the real lamp's size
-    kind: str = "own"
+    lumens: float | None = None  # total flux, lm; None: not stated, so that fluxes are relative
+    tilt: tuple[float, float] | None = None  # rotation of the axis about x, then y (degrees); None: not tilted
+    profile: str = "own"  # name of the distribution of the light
+    size_key: str | None = None  # scene key of the size; with the prefix real_, of the real lamp's size; None: no size
+    kind: str = "own"  # name of the kind of source
     parallel: bool = False  # True if the light of each point of the extent is parallel
     simple_name: str = "a source without size"  # name of the source without its extent
     start_key: str = "z"  # scene key of the position where the light starts
@@ -68,11 +68,11 @@ class Emitter(ABC):
         return None
 
     def nearest_z(self, upwards: bool) -> float | None:
-        """Return z (mm) of the point of the extent nearest to a lens above or below it; None as in `start_plane`."""
+        """Return z (mm) of the extent's point nearest to a lens above (upwards) or below; None as in `start_plane`."""
         return self.start_plane
 
     def complaints(self, z: float, optic: str) -> Iterator[str]:
-        """Yield faults of the size as "key: sentence"; z: of the first face (mm), optic: "lens" or "mirror"."""
+        """Yield faults of the size as "key: sentence"; z: plane of the first face (mm), optic: "lens" or "mirror"."""
         yield from ()
 
     @property
@@ -90,7 +90,7 @@ class Emitter(ABC):
 
     @abstractmethod
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
-        """Return the rectangle of the plane z (mm) with all rays that can meet the first surface inside its outline.
+        """Return the rectangle on the plane z (mm) with all rays that can meet the first surface inside its outline.
 
         The surface lies between the planes at `sags` (mm) above the plane z.
         """
@@ -100,7 +100,7 @@ class Emitter(ABC):
         return None, (0.0, 0.0)
 
     def start_point(self, entrance: float) -> Vector:
-        """Return the centre of the light (mm) where it starts, or on the plane `entrance` (mm) if none is stated."""
+        """Return the centre of the light (mm) on its start plane, or on the plane `entrance` (mm) if it has none."""
         z = entrance if self.start_plane is None else self.start_plane
         return (*self.spot(z)[1], z)
 
@@ -122,7 +122,7 @@ class Emitter(ABC):
         raise self._missing_method("how its light moves", "moved(motion, entrance)")
 
     def reference(self, place: Tensor, z: float, sense: int) -> Tensor:
-        """Return the path (mm) to points (3, …) from the wavefront through the intersection of axis and plane z."""
+        """Return the path (mm) from the wavefront through o = (0, 0, z) to points o + place, (3, …); sense: of Rays."""
         if not self.parallel:
             raise self._missing_method("its wavefronts", "reference(place, z, sense)")
         n_x, n_y, n_z = self.axes[2]
@@ -151,11 +151,11 @@ class Emitter(ABC):
         return self.parallel and not self.tilted
 
     def with_wider_cone(self, by: float) -> Emitter | None:
-        """Return the simple source with the tangent of its cone larger by the fraction `by`; None: no cone."""
+        """Return the simple source with the tangent of its half angle larger by the fraction `by`; None: no cone."""
         return None
 
     def moved_away(self, by: float, about: Vector) -> Emitter | None:
-        """Return the simple source at a distance from a point larger by the fraction `by`; None: no position."""
+        """Return the simple source with its distance from `about` larger by the fraction `by`; None: no position."""
         return None
 
     @property

@@ -1,4 +1,4 @@
-"""A goal: the picture that a lens projects onto a receiver, and its weight."""
+"""A goal: the picture that a lens has to project onto a receiver, and its weight."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Goal:
     picture: np.ndarray  # (rows, columns), row 0 = y max: fraction of the flux wanted in each pixel; the sum is 1
     weight: float = 1.0  # weight of the goal's RRMSD² in the merit function
     reachable: np.ndarray | None = None  # (rows, columns), True in the pixels that light can reach; None: all pixels
-    whole: np.ndarray | None = None  # (rows, columns), picture before the restriction; None: not restricted
+    whole: np.ndarray | None = None  # (rows, columns), picture before `restricted`; None: not restricted
 
     @property
     def suffix(self) -> str:
@@ -60,6 +60,6 @@ def words_of(key: str) -> str:
 
 
 def worst(rrmsds: Iterable[float | None]) -> int:
-    """Return the number of the goal with the largest RRMSD; None or NaN (no light on the goal) counts as infinite."""
+    """Return the index of the goal with the largest RRMSD; None or NaN (no light on the goal) counts as infinite."""
     known = [math.inf if each is None or math.isnan(each) else each for each in rrmsds]
     return known.index(max(known))

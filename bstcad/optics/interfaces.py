@@ -8,8 +8,8 @@ A ray meets a spline at the root of F(s) = z(s) - sag(x(s), y(s)) (mm), s the pa
 written for light along +z, which comes from below the face, where F < 0; for light along -z (`Rays.sense`) F, d_z and
 all heights change their sign.  F' = d_z - ∇sag · (d_x, d_y), and no slope of the face exceeds that of the steepest leg
 of its control net.  If this bound keeps F' positive, the ray crosses the face once, and Newton's method finds the
-crossing.  A ray that is *steep* to the face may cross it several times.  Light leaves the glass at the first crossing,
-so the search approaches it from below, by steps too short to pass it, before Newton's method takes over.
+crossing.  Any other ray is *steep* to the face and may cross it several times.  Light leaves the glass at the first
+crossing, so the search approaches this crossing in steps too short to pass it, before Newton's method takes over.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MIN_COS_REFRACTION = 1e-3  # lower bound of cos θ' in the gradient of Snell's l
 TANGENCY_TOLERANCE = 1e-6  # largest |F'| at which a ray counts as tangent to the surface and does not meet it
 NEWTON_STEPS = 20  # maximum number of Newton steps, after which a ray misses; a smooth lens needs 3 to 5
 APPROACH_STEPS = 200  # maximum number of steps of the approach, after which a ray misses the face
-SIDE_EXIT_COSINE = 1e-2  # largest |d_z| at which a steep ray leaves through a side
+SIDE_EXIT_COSINE = 1e-2  # largest |d_z| at which a steep ray leaves through a side of the lens
 MIN_NEWTON_DERIVATIVE = 1e-3  # lower bound of |F'| as the divisor of a Newton step; its sign is kept
 STEPS_BEFORE_RIM_CHECK = 3  # Newton steps before rays outside the net are identified; most rays then have converged
 APPROACH_DISTANCE = 1e-5  # distance below the face at which an approach ends, as a fraction of the net's half width
@@ -40,7 +40,7 @@ APPROACH_DISTANCE = 1e-5  # distance below the face at which an approach ends, a
 class Refract:
     """Snell's law as vectors: d' = η d + (cos θ' - η cos θ) N, η = n_in / n_out, N the unit normal along the light.
 
-    cos² θ' = 1 - η² (1 - cos² θ) <= 0 is total internal reflection; rays that meet the surface from behind
+    cos² θ' = 1 - η² (1 - cos² θ) <= 0 means total internal reflection; rays that meet the surface from behind
     (cos θ <= 0) also count as totally reflected.  Neither has a gradient.  The gradient of the other rays grows towards
     the critical angle as d cos θ' = η² cos θ / cos θ' d cos θ.  It is capped there: in this derivative, and nowhere
     else, cos θ' is at least MIN_COS_REFRACTION.
@@ -157,7 +157,7 @@ def _path(before: Rays, behind: Rays) -> Tensor:
 
 
 def deflect(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -> Hit:
-    """Refract or reflect rays at a surface with these slopes.  level: the surface is a plane z = const."""
+    """Refract or reflect rays at a surface of slopes z_x and z_y.  level: the surface is a plane z = const."""
     if at.axial and level:  # normal incidence
         one = torch.ones_like(z_x)
         return Hit(replace(at, direction=-at.direction, sense=-at.sense) if law.reverses else at, one, one)
@@ -262,7 +262,7 @@ def first_root(
         if bool(arrived.any()):
             root, met = _newton(net, _select(start, index), direction, below, searched=arrived, tolerance=tolerance)
             s[index] = root
-            meets[index] = met & ((root - below).abs() <= bounds.near / MIN_NEWTON_DERIVATIVE)  # else tangent
+            meets[index] = met & ((root - below).abs() <= bounds.near / MIN_NEWTON_DERIVATIVE)  # otherwise tangent
     return s, meets & (path + s >= -tolerance)  # a ray may begin on the face, to rounding
 
 
@@ -274,7 +274,7 @@ def _select(vectors: Tensor, index: tuple[Tensor, ...]) -> Tensor:
 def _newton(
     net: BSplineSurface, start: Tensor, direction: Tensor, s: Tensor, searched: Tensor, tolerance: float, first: int = 0
 ) -> tuple[Tensor, Tensor]:
-    """Return (s*, meets) of `searched` rays by Newton steps from s to |F| <= tolerance (mm); first: steps done."""
+    """Return (s*, meets) of `searched` rays by Newton steps from s to |F| <= tolerance (mm); first: steps made."""
     dx, dy, dz = direction
     meets = torch.zeros_like(searched)
     for step in range(first, NEWTON_STEPS):
@@ -309,7 +309,7 @@ def slopes_beyond(surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_
 def _approach(
     surface: BSplineSurface, begin: Tensor, direction: Tensor, bounds: NetBounds, sense: int
 ) -> tuple[Tensor, Tensor]:
-    """Return (s, arrived): path from `begin` to just below the first crossing ahead.
+    """Return (s, arrived): path (mm) from `begin` to just below the first crossing ahead, True if there is one.
 
     F changes by at most |d_z| + |∇sag · (d_x, d_y)| per mm of path: a step of -F divided by this bound passes no root.
     """

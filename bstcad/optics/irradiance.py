@@ -118,7 +118,7 @@ def tent(rays: Landed, screen: Screen) -> Tensor:
 
 
 def collect(rays: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
-    """Return (tent picture, Σ flux · (distance outside the border in pixels)²), float64, differentiable in the landing.
+    """Return (tent picture, Σ flux · (distance outside the border in pixels)²), float64, differentiable in position.
 
     Binning gives no gradient to a ray outside the screen; the second sum does.
     """
@@ -160,7 +160,7 @@ def box(rays: Landed, screen: Screen) -> Tensor:
 
 
 def rrmsd(irradiance: Tensor, target: Tensor) -> Tensor:
-    """Return sqrt(Σ |E_s - E|² / Σ E²), E_s scaled to the target's sum (Wang et al. 2023, Eq. 15)."""
+    """Return sqrt(Σ |E_s - E|² / Σ E²), E_s: irradiance scaled to the sum of target E (Wang et al. 2023, Eq. 15)."""
     scaled = irradiance * (total(target) / total(irradiance))
     return torch.sqrt(total((scaled - target) ** 2) / total(target**2))
 
@@ -195,7 +195,7 @@ LEDGER = {  # status of lost rays, by line of the ledger
 
 
 def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
-    """Return the flux of rays by fate; the lines sum to their total flux."""
+    """Return the flux of rays by fate; the lines sum to the total flux except that of Status.BLOCKED."""
     flux = rays.flux.double()
     on_screen = screen.contains(rays.position[0], rays.position[1])
     lines = {
@@ -207,7 +207,7 @@ def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
 
 
 def efficiency(flux: dict[str, float]) -> float:
-    """Return the ratio of the flux inside the target to the flux that leaves the back face."""
+    """Return the flux on the target divided by the flux that leaves the last surface; flux: the ledger."""
     inside, outside = (flux[f"{side} target"] + flux.get(f"ghost {side} target", 0.0) for side in ("on", "off"))
     leaving = inside + outside
     return inside / leaving if leaving > 0 else 0.0

@@ -2,7 +2,7 @@
 
     radius: Annotated[float, Key("Radius.", "mm", 1e-3, 1e6)]
 
-pydantic checks the range when it reads a scene; scene/schema.py makes the JSON schema and `bstcad keys` from the keys.
+pydantic checks the range when it reads a scene; scene/schema.py makes the JSON schema and the text of `bstcad keys`.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Key:
-    """Meaning, unit and range of a field; the range holds for each number of a list, and the first of inner lists."""
+    """Meaning, unit and range of a field; the range applies to all numbers of a list, or the first of inner lists."""
 
     meaning: str  # meaning, one sentence
     unit: str = ""  # unit; "": a pure number or a word
     minimum: float | None = None  # lower end of the range; None: the field contains no number
     maximum: float | None = None
-    example: Any = None  # example value of a key that every scene must state
-    remedy: str = ""  # advice on a number out of range; "": choose a value in between
-    of_light: bool = False  # True for a limit on the light, which a verdict requires
+    example: Any = None  # example value, for a key that every scene must state
+    remedy: str = ""  # advice for a number out of range; "": "choose a value in between"
+    of_light: bool = False  # True for a limit on the light; a verdict on the light requires at least one
 
     def in_range(self, value: Any) -> Any:
         """Return the value of a field if all its numbers are in range; otherwise raise ValueError with a sentence."""
-        assert self.minimum is not None and self.maximum is not None  # pydantic checks fields with a range only
+        assert self.minimum is not None and self.maximum is not None  # called only for fields with a range
         for number in _numbers(value):
             if not self.minimum <= number <= self.maximum:
                 unit = f" {self.unit}" if self.unit else ""
@@ -36,7 +36,7 @@ class Key:
         return value
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> dict[str, Any]:
-        """Return the pydantic schema of the field: its type, then its range."""
+        """Return the pydantic schema of the field, which checks its type, then its range."""
         if self.minimum is None:
             return handler(source)
         check = {"type": "no-info", "function": self.in_range}
@@ -51,14 +51,14 @@ class Key:
 
 
 def _numbers(value: Any) -> list[float]:
-    """Return the numbers of a field's value: the number itself, each of a list, the first of each inner list."""
+    """Return the numbers of a field's value to which the range applies (see `Key`)."""
     if isinstance(value, tuple):
         return [number for part in value for number in _numbers(part[0] if isinstance(part, tuple) else part)]
     return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
 
 
 def _bound(schema: dict[str, Any], key: Key, listed: bool = False) -> None:
-    """Add the range to the numbers of a JSON schema that `_numbers` selects."""
+    """Add the range of a key to the numbers in its JSON schema (see `Key`); listed: True for an element of a list."""
     if schema.get("type") in ("number", "integer"):
         schema |= {"minimum": key.minimum, "maximum": key.maximum}
     inner = [*schema.get("prefixItems", ()), *([schema["items"]] if isinstance(schema.get("items"), dict) else [])]

@@ -41,13 +41,13 @@ class Lens:
     back: Surface  # upper surface, at larger z
     outline: Outline  # outline of front and back
     index: float  # refractive index at the design wavelength; unused for a first-surface mirror
-    reflects: bool = False  # True if a face reflects; without `own_passes` True means a mirror and False a lens
+    reflects: bool = False  # True if a face reflects; if `own_passes` is None, True: MIRROR, False: LENS
     losses: LensLosses | None = None  # losses at its faces and in its glass; None: no losses
-    clear: tuple[Outline, Outline] | None = None  # clear apertures of front and back; None: the outline
+    clear: tuple[Outline, Outline] | None = None  # clear apertures (front, back); None: the outline, or a front's own
     before: tuple[Interface, ...] = ()  # interfaces before the solid, such as a window
     behind: tuple[Interface, ...] = ()  # interfaces behind the solid, such as a fold mirror
     shaped: tuple[int, ...] | None = None  # numbers of the interfaces that tailoring shapes; None: the back alone
-    own_passes: Passes | None = None  # passes of the light through the solid; None: those of a lens or of a mirror
+    own_passes: Passes | None = None  # passes of the light through the solid; None: determined by `reflects`
 
     def __post_init__(self) -> None:
         if self.own_passes is not None:
@@ -196,7 +196,7 @@ class Lens:
         return replace(self, outline=EVERYWHERE, clear=(EVERYWHERE, EVERYWHERE))
 
     def with_apertures_scaled(self, by: float) -> Lens:
-        """Return the lens with the clear apertures of the solid larger by a factor."""
+        """Return the lens with the clear apertures of the solid scaled by a factor."""
         front, back = self.apertures
         return replace(self, clear=(front.scaled(by), back.scaled(by)))
 

@@ -2,11 +2,9 @@
 
 `share(cos_in, cos_out, path)` of a loss is the fraction of a ray's flux that remains behind an interface, given the
 cosines of the angles of incidence and of refraction or reflection there and the path before it (mm); `line` is the line
-of the flux ledger that counts the rest.  `Losses` assigns the losses of one wavelength to the interfaces of a lens;
-interfaces.cross applies them.  This module is loaded only if a scene contains such an effect.
+of the flux ledger that counts the rest.  `Losses` assigns the losses of one wavelength to the interfaces of a lens.
 
-Fresnel's equations: Born and Wolf, Principles of Optics, 7th ed., section 1.5.2; a single layer: section 1.6.4; metals:
-section 14.2.
+Born and Wolf, Principles of Optics, 7th ed.: Fresnel's equations, section 1.5.2; single layer, 1.6.4; metals, 14.2.
 """
 
 from __future__ import annotations
@@ -22,6 +20,7 @@ from torch import Tensor
 from bstcad.optics.interfaces import Interface, Loss, Reflect
 from bstcad.optics.kernels.reductions import elementary
 
+# Lines of the flux ledger.
 REFLECTED, ABSORBED, BY_THE_MIRROR = "reflected at the faces", "absorbed in the glass", "absorbed by the mirror"
 Polarisation = Literal["none", "s", "p"]
 
@@ -50,7 +49,7 @@ def coated_reflectance(face: Transmission, coating: CoatingLayer, cos_in: Tensor
     """Return the reflectance R of a face with a single layer between its two media.
 
     r = (r_1 + r_2 e^{2iβ}) / (1 + r_1 r_2 e^{2iβ}),  β = 2π n_f d cos θ_f / λ,  r_1 and r_2 the amplitudes at the two
-    sides of a layer of thickness d.  The angle in the layer is real for transmitted light, since n_f >= 1 >= n sin θ.
+    sides of a layer (index n_f, thickness d).  Its angle θ_f is real for transmitted light, since n_f >= 1 >= n sin θ.
     """
     n_f = coating.index
     cos_f = torch.sqrt(1 - (face.n_in / n_f) ** 2 * (1 - cos_in * cos_in))
@@ -188,7 +187,7 @@ class Losses:
     def _at(self, k: int, interface: Interface, index: float) -> tuple[Loss, ...]:
         inside = (self.absorption,) if self.absorption and k > 0 else ()  # glass lies behind the first interface
         own = (loss for loss in self.own if k > 0 or not loss.in_glass)
-        return (*inside, *own, *((self.fresnel.of(interface, index),) if self.fresnel else ()))  # last, for ghosts
+        return (*inside, *own, *((self.fresnel.of(interface, index),) if self.fresnel else ()))  # trace needs it last
 
 
 def _amplitudes(n_in: float, n_out: float, cos_in: Tensor, cos_out: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,18 +4,17 @@ Verification, manufactured parts, tolerances and the sweeps of accuracy against 
 
 RRMSD is estimated without bias from SETS independent sets of stratified rays.  Set i gives a picture A_i = A + n_i: the
 noiseless picture A of the lens plus noise n_i of mean zero.  The squared distance of A_i from the target T is too large
-by the squared noise, but the product of two sets is unbiased: E <(A_i - T) (A_j - T)> = <(A - T)²>, i ≠ j.  The mean
-over all pairs is a U-statistic (Hoeffding 1948), and its standard error follows from the scatter of the pairs
-(`squared_distance`).  Rays are added until this error is as small as requested.  For an extended source each set
-samples new source points, so that their finite number causes no bias.
+by the squared noise, but the product of two sets is unbiased: E <(A_i - T) (A_j - T)> = <(A - T)²>, i ≠ j (E is the
+expectation, <> the sum over pixels).  The mean over all pairs is a U-statistic (Hoeffding 1948), and its standard error
+follows from the scatter of the pairs (`squared_distance`).  Rays are added until this error is as small as requested.
+For an extended source each set samples new source points, so that their finite number causes no bias.
 
 The picture for display is the mean of all sets, smoothed as long as this removes more noise than detail.  Flux tubes
 (tubes.py) give a second picture without noise, the witness; rays and tubes share only the trace.  Tubes interpolate
 linearly between their corners: with two tubes per control cell and side the error is about the RRMSD that remains after
 tailoring with tubes, with four a third of this error, with eight a tenth (measured).  The tubes are therefore halved in
 width until the pictures agree, or until the error of the tubes cannot explain the difference.  The RRMSD by tubes
-(`rrmsd_by_tubes`) is a few per cent too low for a lens tailored with them.  A ghost is traced once, with equal noise in
-all sets.
+(`rrmsd_by_tubes`) is a few per cent too low for a lens tailored with them.  A ghost is traced once, for all sets.
 
 An extended source forms an image of itself through each point of the lens (`ImageSamples`).  All rays through one point
 of the back meet the same slope, whichever source point they come from: no lens can unite them in one point.
@@ -45,7 +44,7 @@ from bstcad.optics.trace import UNDERSIDE, GhostImage, Simulation, simulate, thr
 
 SETS = 8  # number of independent sets of rays: the relative uncertainty of a standard error is a quarter
 PILOT_DIVISOR = 5  # maximum rays per side divided by those of the first sets, which predict the number needed
-PICTURE_NOISE = 0.45  # largest noise of the mean picture divided by RRMSD, at the default accuracy; adds 10 %
+PICTURE_NOISE = 0.45  # largest noise of the mean picture divided by RRMSD, at the default accuracy; adds 10 % to RRMSD
 RESOLVED = 5.0  # smallest ratio of an RRMSD to its standard error at which it counts as resolved
 # Tolerances of the difference between the pictures by rays and by tubes: relative to the smaller RRMSD, and absolute.
 WITNESS_RELATIVE_TOLERANCE, WITNESS_TOLERANCE = 0.5, 0.002
@@ -197,7 +196,7 @@ class _Rays:
     weight: float = 1.0  # weight of the pictures in a mean: inverse variance of their noise, on any scale
 
     def joined(self, other: _Rays) -> _Rays:
-        """Return the weighted mean of each set and the set of equal number in `other`; sets stay independent."""
+        """Return the weighted mean of each set and the set of the same number in `other`; sets stay independent."""
         weight = self.weight + other.weight
         share = other.weight / weight
 
@@ -260,8 +259,7 @@ def squared_distance(pictures: Sequence[Tensor], other: Tensor) -> tuple[float, 
 
     The jackknife is 4 / M times the variance of the means of p_ij over j times ((M - 1) / (M - 2))².  Its second term
     is 4 σ_e² / (M (M - 2)) (Efron and Stein 1981): twice too large where noise dominates, or by chance ten times too
-    small. σ_e² is therefore estimated from the residuals e_ij of the M (M - 1) / 2 products, with M (M - 3) / 2 degrees
-    of freedom.
+    small.  Therefore σ_e² is estimated from the M (M - 1) / 2 residuals e_ij, with M (M - 3) / 2 degrees of freedom.
     """
     differences = [(picture - other).reshape(-1) for picture in pictures]
     size, m = _squared(other), len(differences)
@@ -315,7 +313,7 @@ def _sample(setup: _Setup, effort: Effort, max_noise: float = math.inf) -> _Rays
     """Trace rays, at most `effort.rays` per side, until the standard error is `effort.accuracy` times the RRMSD.
 
     The noise of the mean picture, which falls as n^-3/2 with n rays per side, must also be below `max_noise` times
-    RRMSD. The standard error falls as n^-3 where products of noise dominate (the variance of a pixel of n² stratified
+    RRMSD.  The standard error falls as n^-3 where products of noise dominate (the variance of a pixel of n² stratified
     rays falls as n^-3; measured: n^-2.9), and as n^-3/2 where products of the lens's error and noise dominate.
     """
     pilot = max(effort.rays // PILOT_DIVISOR, min(effort.rays, 32))
@@ -332,7 +330,7 @@ def _sample(setup: _Setup, effort: Effort, max_noise: float = math.inf) -> _Rays
         squared, error = squared_distance(rays.boxes, setup.target)
         goal = 2 * effort.accuracy * squared  # σ(U) = 2 RRMSD σ(RRMSD)
         noise = _noise(rays.boxes, setup.target)
-        if error <= goal and noise <= max_noise**2 * squared and side > first:  # the first pass may be small by chance
+        if error <= goal and noise <= max_noise**2 * squared and side > first:  # the first errors are uncertain
             return rays
         finer = (1.5 * error / goal) ** (1 / 3) if goal > 0 else math.inf
         if squared > 0:
@@ -379,7 +377,7 @@ def _sample_source(setup: _Setup, effort: Effort, max_noise: float) -> _Rays:
 
 
 def _witness(setup: _Setup, channels: Sequence[Channel], rays: _Rays) -> Witness:
-    """Compare the pictures by rays and by tubes (`_compare`), from `tubes_of(lens)` tubes per side on."""
+    """Compare the pictures by rays and by tubes (`_compare`), starting with `tubes_of` tubes per side."""
     lens, screen, target = setup.lens, setup.screen, setup.target
 
     def by_tubes(n: int) -> Tensor | None:
@@ -422,7 +420,7 @@ def _compare(
 
 
 def tubes_of(lens: Lens, pixels: int = 0) -> int:
-    """Return the number of tubes per side for a lens: two per control point, at least MIN_TUBES.
+    """Return the number of tubes per side for a lens: two per control point, at least MIN_TUBES; pixels: per side.
 
     A lens with two nets gets twice as many, since light deflected by the first net varies within the cells of the
     second.  If a cell of the net lights several pixels, two tubes per pixel are used, at most four per cell.  Five more
@@ -518,7 +516,7 @@ class ImageSamples:
     flux: Tensor  # flux of each channel through each point, (channels, points)
 
     def width(self) -> float:
-        """Return 2 √2 times the RMS distance from the centroid (pixels), the diameter D of an equal uniform disc."""
+        """Return 2 √2 times the RMS distance from the centroid (pixels), the diameter of a uniform disc of this RMS."""
         square = torch.where(self.flux > 0, (self.offset**2).sum(0), torch.zeros_like(self.flux))
         return 2 * math.sqrt(2 * float(total(square * self.flux) / total(self.flux)))
 

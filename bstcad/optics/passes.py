@@ -36,11 +36,11 @@ class Passes:
         return tuple(dict.fromkeys(step.face for step in self.steps))
 
     def numbers_of(self, face: Face) -> tuple[int, ...]:
-        """Return the numbers of the passes at a face; empty if no light meets it."""
+        """Return the numbers, from 0, of the passes at a face; empty if no light meets it."""
         return tuple(k for k, step in enumerate(self.steps) if step.face == face)
 
     def laws(self, index: float) -> Iterator[Law]:
-        """Yield the law of each pass; index: of the solid."""
+        """Yield the law of each pass; index: refractive index of the solid."""
         inside, outside = index, 1.0
         for _, law in self.steps:
             if law is Reflect:
@@ -61,7 +61,7 @@ class Passes:
 
     @property
     def mirror(self) -> Face | None:
-        """Face that reflects the light; None: there is none."""
+        """Face that reflects the light; None: no face does."""
         return next((face for face, law in self.steps if law is Reflect), None)
 
     @property
@@ -99,7 +99,7 @@ class Passes:
         return f"by a {self.optic}'s {', '.join(step.face for step in self.steps)}"
 
     def name(self, face: Face) -> str:
-        """Return the name of a face: front, back, the mirror face, or the rear, which no light meets."""
+        """Return "front" or "back" for a face that refracts, "mirror face" if it only reflects, "rear" if dark."""
         laws = [self.steps[k].law for k in self.numbers_of(face)]
         return face if Refract in laws else "mirror face" if laws else "rear"
 

@@ -23,7 +23,7 @@ from bstcad.optics.wavefront import path_from_sphere
 
 SIZE_KEYS = "diameter", "width", "height"  # scene keys of the size of an emitting disc or rectangle
 HALF_SPACE = math.pi / 2  # rad, half angle of light that fills the half space on the side of the lens
-MAX_CONE_HALF_ANGLE = math.radians(89.0)  # rad, half angle below which the edge of a cone is a curve on planes
+MAX_CONE_HALF_ANGLE = math.radians(89.0)  # rad, half angle below which light has an edge on planes (`is_cone`)
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Point(Emitter):
             yield f"{name}: {sizes[name]:g} mm is more than {far}; make the source smaller or move it away"
 
     def reference(self, place: Tensor, z: float, sense: int) -> Tensor:
-        """Return the path (mm) to points (3, …) from the sphere about the source through the origin of the plane z."""
+        """Return the path (mm) from the sphere about the source through o = (0, 0, z) to points o + place, (3, …)."""
         x, y, start = self.position
         return path_from_sphere(place, (x, y, start - z))
 
@@ -103,7 +103,7 @@ class Point(Emitter):
         return ", ".join([f"{kind} at ({position}) mm", PROFILE_NAMES[self.profile], *sizes])
 
     def sizes(self) -> Iterator[tuple[str, float, str]]:
-        """Yield diameter, width and height, as far as stated."""
+        """Yield diameter, width and height, if stated."""
         yield from ((key, size, "mm") for key in SIZE_KEYS if (size := getattr(self, key)))
 
     @property
@@ -117,7 +117,7 @@ class Point(Emitter):
         return replace(self, position=motion.point(self.position), tilt=tilt)
 
     def with_wider_cone(self, by: float) -> Point | None:
-        """Return the source with the tangent of its cone larger by the fraction `by`; None: no cone."""
+        """Return the source with the tangent of its half angle larger by the fraction `by`; None: no cone."""
 
         def wider(angle: float) -> float:
             return math.degrees(math.atan((1 + by) * math.tan(math.radians(angle))))
@@ -127,7 +127,7 @@ class Point(Emitter):
         return replace(self, half_angle=wider(self.half_angle)) if self.half_angle else None
 
     def moved_away(self, by: float, about: Vector) -> Point:
-        """Return the source at a distance from a point larger by the fraction `by`."""
+        """Return the source with its distance from the point `about` (mm) larger by the fraction `by`."""
         middle = np.array(about)
         return replace(self, position=tuple((middle + (1 + by) * (np.array(self.position) - middle)).tolist()))
 
@@ -200,12 +200,12 @@ class Point(Emitter):
         return sense * n[0], sense * n[1], n[2]
 
     def _tilted_irradiance(self, x: Tensor, y: Tensor, distance: float, axis: Vector) -> Tensor:
-        """Return E of a tilted source at (x, y) from its foot on a plane at distance D; c = n · (x, y, D) = d cos θ.
+        """Return E of a tilted source at (x, y) from its projection onto a plane at distance D.
 
-        E = I(θ) D / d³, and zero where c <= 0.  lambertian: I = cos θ / (π sin² θ_max), E = D c / (π sin² θ_max d⁴);
-        uniform: I constant, both where cos θ >= cos θ_max.  gaussian: on its own planes E ∝ exp(-2 tan² θ / t²),
-        t = tan(half_angle_1e2), so I = 2 / (π t²) exp(-2 tan² θ / t²) / cos³ θ, and
-        E = 2 D / (π t² c³) exp(-2 (d² - c²) / (t² c²)).
+        E = I(θ) D / d³, and zero where c = n · (x, y, D) = d cos θ <= 0.  lambertian: I = cos θ / (π sin² θ_max),
+        E = D c / (π sin² θ_max d⁴); uniform: I is constant; both are zero where cos θ < cos θ_max.  gaussian: on planes
+        perpendicular to n E ∝ exp(-2 tan² θ / t²), t = tan(half_angle_1e2), so I = 2 / (π t²) exp(-2 tan² θ / t²) /
+        cos³ θ, and E = 2 D / (π t² c³) exp(-2 (d² - c²) / (t² c²)).
         """
         d2 = x * x + y * y + distance**2
         c = axis[0] * x + axis[1] * y + axis[2] * distance
@@ -242,7 +242,7 @@ class Point(Emitter):
         return Beam(x, y, limit_r2=reach2, peak=peak, fall=fall, power=power, distance=distance, start=distance)
 
     def _tilted_law(self, distance: float) -> tuple[float, float, int, float]:
-        """Return (peak, fall, power, smallest cosine) of `_tilted_irradiance`."""
+        """Return (peak, fall, power, smallest cosine) of `_tilted_irradiance`, as in `Beam`."""
         if self.profile == "gaussian":
             t2 = self._spread**2
             return 2 * distance / (math.pi * t2), 2 / t2, 0, 0.0
@@ -252,17 +252,17 @@ class Point(Emitter):
         return distance / (2 * math.pi * (1 - math.cos(self.edge))), 0.0, 3, min_cosine
 
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
-        """Return the rectangle of the plane z with all rays that can meet the first surface inside its outline.
+        """Return the rectangle on the plane z with all rays that can meet the first surface inside its outline.
 
-        The surface lies between the planes at `sags` (mm) above the plane z.  A surface that bends towards the source
-        is seen at a wider angle; one that bends away may be seen shifted by a source off the axis.
+        The surface lies between the planes at `sags` (mm) above the plane z.  Seen from the source, a surface appears
+        larger if it bends towards the source, and may appear shifted if it bends away and the source is off the axis.
         """
         distance = abs(z - self.position[2])
         offsets = [abs(p) for p in self.position[:2]]
         half = list(outline.half_extent)
         for sag in sags:
             away = sag if z > self.position[2] else -sag
-            w = distance / max(distance + away, 1e-3 * distance)  # a point at h appears at p + w (h - p)
+            w = distance / max(distance + away, 1e-3 * distance)  # from p, a point at h is seen at p + w (h - p)
             apparent = (w * h + abs(1 - w) * p for h, p in zip(outline.half_extent, offsets, strict=True))
             half = [max(h, s) for h, s in zip(half, apparent, strict=True)]
         if self.is_cone:
@@ -272,7 +272,7 @@ class Point(Emitter):
     def _cone_slopes(self, z: float) -> tuple[float, float]:
         """Return the largest |dx/dz| and |dy/dz| of the cone's rays to the plane z; inf if a ray is parallel to it.
 
-        X = dx/dz ends where the line of all Y touches the cone: (1 + X²) sin² θ_max = (n_x - n_z X)².
+        At the limits of X = dx/dz the plane of rays with this X touches the cone: (1 + X²) sin² θ_max = (n_x - n_z X)².
         """
         edge = self.edge
         if not self.tilted:
@@ -285,7 +285,7 @@ class Point(Emitter):
         return slope_x, slope_y
 
     def spot(self, z: float) -> tuple[Outline | None, tuple[float, float]]:
-        """Return (disc of the cone, centre in mm) on the plane z; disc None: the light has no edge."""
+        """Return (disc of the cone, centre in mm) on the plane z; disc None: the light has no edge, or is tilted."""
         centre = self.position[:2]
         if not self.is_cone or self.tilted:
             return None, centre

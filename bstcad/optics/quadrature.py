@@ -21,7 +21,7 @@ MIN_SPANS = 128  # minimum parts of an axis of a net; the spans of a coarser net
 GAUSS_POINTS_PER_PART = 3  # Gauss points in each part of a chord or of an edge
 FINE_NET = 400  # smallest number of control points per side at which FINE_POINTS give the area to 1e-9
 FINE_POINTS = 2  # Gauss points in each part of a chord or of an edge of such a net
-CHORD_POINTS = 96  # Gauss points of a chord over a smooth face; exact to rounding up to a half diagonal of 0.95 R
+CHORD_POINTS = 96  # Gauss points of a chord over a smooth face; exact to rounding on a sphere to 0.95 of its radius
 END_PARTS = 12  # minimum parts of an end span, where h(x) is not a polynomial; gives volumes to 1e-12
 BORDER_POINTS_PER_STRIP = 512  # border points evaluated at a time
 MIN_RELATIVE_DX = 1e-14  # largest |dx| / ds of border points that are left out, since they add nothing
@@ -71,14 +71,14 @@ def of_face(face: Surface, border: Border, raised: float = 0.0) -> Sums:
 
 
 def of_wall(face: Surface, border: Border, raised: float = 0.0) -> Sums:
-    """Integrate over the wall along z between the plane z = 0 and the rim of a face, n away from the face."""
+    """Integrate over the wall along z between the plane z = 0 and the rim of a face, n pointing outwards."""
     h = face.relative_sag_and_slope(torch.from_numpy(border.x), torch.from_numpy(border.y))[0].numpy() + raised
     cone = h * (border.x * border.dy - border.y * border.dx)  # r·n ds, times the wall's height
     return Sums(float((border.ds * h).sum()), float(cone.sum()) / 3, _moment(cone, border.x, border.y, h / 2))
 
 
 def _sums_of_points(face: Surface, raised: float, x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> Sums:
-    """Sum over points of a face with these weights (mm²)."""
+    """Return the sums over points (x, y) of a face with weights (mm²)."""
     h, h_x, h_y = (part.numpy() for part in face.relative_sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
     area, h = weight * np.sqrt(1 + h_x * h_x + h_y * h_y), h + raised
     cone = weight * (h - x * h_x - y * h_y)
@@ -90,7 +90,7 @@ def _moment(cone: np.ndarray, *r: np.ndarray) -> np.ndarray:
 
 
 def rim_breaks(surface: BSplineSurface, radius: float) -> np.ndarray:
-    """Return ascending angles from 0 to 2 pi between which the rim of a round lens crosses no knot line of the surface.
+    """Return ascending angles (rad) from 0 to 2 pi between which the rim of a round lens crosses no knot line of a net.
 
     Neighbouring angles differ by at most 2 pi / 256.
     """
@@ -166,7 +166,7 @@ def _points(face: BSplineSurface) -> int:
 
 
 def _smooth_parts(face: BSplineSurface, axis: int, parts: int) -> np.ndarray:
-    """Return breaks (mm) along an axis of a net, between which heights are nearly polynomial: knot lines and more."""
+    """Return breaks (mm) along an axis of a net, between which heights are nearly polynomial: knots and others."""
     (first, last), pitch = (face.x, face.y)[axis], face.pitch[axis]
     lines = np.concatenate([[first], first + pitch * (np.arange(1, face.shape[axis] - 2) + 0.5), [last]])
     ends = [np.linspace(low, high, END_PARTS + 1) for low, high in (lines[:2], lines[-2:])]
@@ -197,7 +197,7 @@ class MassProperties:
 def of_lens(lens: Lens) -> MassProperties:
     """Return the properties of a bare lens to 1e-9; OCC needs minutes for a large net and has errors of 1e-5."""
     lens, total = lens.plain(), Sums()
-    z_ref = lens.front.z  # origin of the heights, which limits rounding
+    z_ref = lens.front.z  # near origin of the heights, which limits rounding
     for face, sign in ((lens.back, 1), (lens.front, -1)):
         rim, raised = face.around, face.around.z - z_ref
         border = outline_border(lens.outline, rim)

@@ -1,6 +1,6 @@
 """Ray bundles, and frames of directions in space.
 
-A bundle keeps its size: a lost ray keeps its index, and `status` states the reason.
+A bundle keeps its size: a lost ray keeps its place in the tensors, and `status` states the reason.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ import torch
 from torch import Tensor
 
 NO_LOSSES: Mapping[str, Tensor] = MappingProxyType({})
-MIN_AXIAL_COSINE = 1e-9  # largest cosine to the axis of a ray that counts as parallel to the screen
+MIN_AXIAL_COSINE = 1e-9  # smallest cosine of the angle between a ray and the normal of a screen that it can reach
 
 
 class Status(IntEnum):
     """State of a ray: alive, or the reason of its loss."""
 
     ALIVE = 0  # not lost
-    MISSED_FRONT = 1  # missed the clear aperture of the first surface
+    MISSED_FRONT = 1  # missed the clear aperture of the first face of the solid, or an element before it
     VIGNETTED = 2  # missed a later face of the solid, or met it outside its clear aperture
     TOTAL_REFLECTION = 3  # total internal reflection at a face
-    TURNED_BACK = 4  # left the last surface, but not towards the receiver
+    TURNED_BACK = 4  # left the last surface away from the receiver, or met a mirror from its rear
     BLOCKED = 5  # missed a window or mirror behind the lens, or met it outside its outline
 
 
@@ -36,12 +36,12 @@ TENSORS = ("position", "direction", "flux", "status")  # names of the tensors of
 class Rays:
     """A bundle of rays, one column per ray."""
 
-    position: Tensor  # (3, …) positions, mm; z is relative to the plane `z`
+    position: Tensor  # (3, …) positions, mm; the third coordinate is relative to the plane `z`
     direction: Tensor  # (3, …) unit vectors
-    flux: Tensor  # (…) fraction of the source's flux; for a corner of a flux tube the fraction that remains
+    flux: Tensor  # (…) fraction of the source's flux; for a corner of a flux tube the transmitted fraction
     status: Tensor  # (…) uint8, Status of each ray
     axial: bool = False  # True if every direction is (0, 0, sense), so that intersections need no iteration
-    z: float = 0.0  # mm, reference plane of the positions: sags keep their digits far from the origin
+    z: float = 0.0  # mm, reference plane of the positions, so that sags keep their digits far from the origin
     sense: int = 1  # +1 or -1, direction of the light along z; rays of opposite sense are lost at the next surface
     taken: Mapping[str, Tensor] = field(default_factory=lambda: NO_LOSSES)  # (…) flux lost, by ledger line
 
@@ -51,18 +51,18 @@ class Rays:
         return self.status == Status.ALIVE
 
     def above(self, z: float) -> Tensor:
-        """Return the height along the axis above the plane z (mm), negative below it."""
+        """Return the heights of the positions above the plane z (mm), negative below it."""
         return self.position[2] + (self.z - z)
 
     def lose(self, where: Tensor, reason: Status) -> Tensor:
-        """Return the status after rays at `where` are lost for `reason`; a ray keeps its first reason."""
+        """Return the status after rays where `where` is True are lost for `reason`; a ray keeps its first reason."""
         return torch.where(self.alive & where, torch.full_like(self.status, int(reason)), self.status)
 
 
 def joined(bands: Iterable[Rays], rows: int, shared: int = 0) -> Rays:
-    """Return one bundle (…, rows, columns) from bands of rows; each band repeats the last `shared` rows before it.
+    """Return one bundle (…, rows, columns) from bands of rows; each repeats the last `shared` rows of the band before.
 
-    Only one band exists at a time besides the whole.
+    Besides the whole bundle only one band exists at a time.
     """
     whole: dict[str, Tensor] = {}
     done = 0

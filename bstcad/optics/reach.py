@@ -26,8 +26,8 @@ from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import Receiver, dot
 from bstcad.optics.tubes import rays_to
 
-MAX_EXIT_ANGLE = math.radians(85)  # largest angle of refraction in air (rad), at 0.2° from the critical angle in PMMA
-MAX_SLOPE = math.tan(math.radians(70))  # largest slope: no tool machines steeper faces; lens as thick as wide
+MAX_EXIT_ANGLE = math.radians(85)  # largest angle of refraction in air (rad); in PMMA 0.2° below the critical angle
+MAX_SLOPE = math.tan(math.radians(70))  # largest slope: a steeper face cannot be machined; its lens is as thick as wide
 
 
 def largest_deflection(index: float, grazing: float = MAX_EXIT_ANGLE) -> float:
@@ -46,9 +46,9 @@ def grazing_of(index: float, others: Iterable[float], spread: float = 0.0) -> fl
 
 
 def spread_at(source: Emitter, lens: Lens) -> float:
-    """Return the angle (rad) that an extended source subtends in front of the last freeform face; 0 for a point.
+    """Return half the angle (rad) that an extended source subtends in front of the last freeform face; 0 for a point.
 
-    It is the largest angle at the centre of the face between light from the centre of the source and from its ends.
+    It is the largest angle at the centre of the face between light from the centre of the source and from its edge.
     """
     if source.extent is None:
         return 0.0
@@ -125,7 +125,7 @@ def reach_margin(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing:
     """Return the margin of each ray (a cosine) to the limits of the face; negative: the aim is out of reach.
 
     It is the minimum of three: d · d' minus the cosine of the largest deflection; n_z - |(n_x, n_y)| / MAX_SLOPE of the
-    normal n = η d - d'; and the cosine between the light and the receiver's normal on the side of the lens.
+    normal n = η d - d'; and the cosine between the light and the receiver's normal that points away from the lens.
     """
     _, out, along = directions(at_face, aim, plane)
     normal = normal_towards(at_face, out, law)
@@ -138,7 +138,7 @@ def reach_margin(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing:
 
 
 def unreached(picture: np.ndarray, part: np.ndarray, angle: float | None) -> dict[str, float | None]:
-    """Return the fractions of area and light of a picture that lie outside the reachable part of the target.
+    """Return the fractions of area and light of a picture that lie outside its reachable `part` (True: reachable).
 
     angle: largest deflection (degrees) of the face (Passes.largest_turn), copied to the result.
     """

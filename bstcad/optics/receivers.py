@@ -1,8 +1,8 @@
-"""Receivers: the planes or other surfaces that collect the light, each with two coordinates of its own.
+"""Receivers: the planes or other surfaces that collect the light, each with its own two coordinates.
 
-A plane is level, z = const, or tilted, with x and y measured on it (mm).  A receiver of another form states the path of
-a ray to it, the coordinates of a point on it, and the point of given coordinates; it may measure them in another unit,
-such as degrees.  The kernels trace rays to planes only; the torch code traces rays to other receivers.
+A plane is level, z = const, or tilted, with x and y measured on it (mm).  A receiver of another form defines the path
+of a ray to it, the coordinates of a point on it, and the point of given coordinates; its coordinates may have another
+unit, such as degrees.  The kernels trace rays to planes only; the torch code traces rays to other receivers.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Array = Any  # numpy array, torch tensor or number
 
 
 class Receiver(ABC):
-    """A surface that collects light, with coordinates x and y of its own."""
+    """A surface that collects light, with its own coordinates x and y."""
 
     unit: str = "mm"  # unit of x and y
     light: str = "irradiance"  # quantity of a pixel: irradiance (per area) or radiant intensity (per solid angle)
@@ -36,7 +36,7 @@ class Receiver(ABC):
 
     @property
     def axes(self) -> Frame | None:
-        """Axes (e_x, e_y, n) for the kernels; None: no kernel."""
+        """Axes (e_x, e_y, n) for the kernels; None: no kernel supports the receiver."""
         return None
 
     @property
@@ -106,7 +106,7 @@ class Receiver(ABC):
         return torch.stack([x - rays.position[0], y - rays.position[1], z - rays.above(0.0)])
 
     def clearance(self, outline: Outline, z: float) -> float:
-        """Return the distance (mm) along +z from an outline on the plane z to the receiver; -inf: a part misses it."""
+        """Return the smallest path (mm) along +z from an outline on the plane z to the receiver; -inf: part misses."""
         x, y = (torch.as_tensor(p, dtype=torch.float64) for p in outline.rim_points())
         along = torch.stack([torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)])
         start = torch.stack([x, y, torch.zeros_like(x)])
@@ -123,17 +123,17 @@ class Receiver(ABC):
         return self.throw(z)
 
     def areas(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray | None:
-        """Return areas or solid angles of the (rows, columns) cells of x by y, of mean 1; None: they are equal."""
+        """Return areas or solid angles, relative to their mean, of (rows, columns) cells of x by y; None: all equal."""
         return None
 
     def to_level_plane(self, x: Array, y: Array, eye: float) -> tuple[Array, Array]:
-        """Project coordinates from the eye (0, 0, eye) onto the level plane through the centre; points in mm."""
+        """Return (x, y) (mm) of coordinates projected from (0, 0, eye) onto the level plane through the centre."""
         p_x, p_y, p_z = self.point(x, y)
         scale = self.throw(eye) / (p_z - eye)
         return scale * p_x, scale * p_y
 
     def from_level_plane(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
-        """Return the coordinates whose projection by `to_level_plane` is given."""
+        """Return the coordinates that `to_level_plane` projects onto (q_x, q_y) (mm)."""
         x, y = (torch.as_tensor(q, dtype=torch.float64) for q in (q_x, q_y))
         direction = torch.stack([x, y, torch.full_like(x, self.throw(eye))])
         direction = direction / torch.sqrt((direction * direction).sum(0))
@@ -143,7 +143,7 @@ class Receiver(ABC):
 
 
 def _by_component(rays: Rays, position: Any, direction: Any) -> Rays:
-    """Return rays with a tuple of three components, which receivers index like a tensor, in place of each tensor."""
+    """Return rays with position and direction as tuples of three components, which receivers index like tensors."""
     return replace(rays, position=position, direction=direction)
 
 
@@ -155,7 +155,7 @@ class MovedReceiver(Receiver):
     motion: Motion  # rigid motion
 
     def __post_init__(self) -> None:
-        for name in ("unit", "light", "names", "position_text", "per_radian", "areas"):  # unchanged by motions
+        for name in ("unit", "light", "names", "position_text", "per_radian", "areas"):  # as at rest
             object.__setattr__(self, name, getattr(self.rest, name))
 
     @property
@@ -198,12 +198,12 @@ def _rotate(motion: Motion, vector: Array | Sequence[Array]) -> tuple[Array, Arr
 
 
 class PlaneReceiver(Receiver):
-    """Plane P = C + (x - o_x) e_x + (y - o_y) e_y, n · (p - C) = 0, with centre C of coordinates o."""
+    """Plane P = C + (x - o_x) e_x + (y - o_y) e_y, n · (p - C) = 0, with centre C at the coordinates o."""
 
     @property
     def frame(self) -> Frame:
         """Axes (e_x, e_y, n)."""
-        assert self.axes is not None  # a plane that no kernel takes overrides `frame`
+        assert self.axes is not None  # a plane without a kernel overrides `frame`
         return self.axes
 
     def height(self, point: Vector) -> float:
@@ -211,7 +211,7 @@ class PlaneReceiver(Receiver):
         return math.fsum(n * (p - c) for n, p, c in zip(self.frame[2], point, self.middle, strict=True))
 
     def clearance(self, outline: Outline, z: float) -> float:
-        """Return the distance (mm) from an outline on the plane z to the receiver; negative: they intersect."""
+        """Return the smallest distance (mm) from an outline on the plane z to this plane; negative: they intersect."""
         return -self.height((0.0, 0.0, z)) - outline.reach(*self.frame[2][:2])
 
     def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
@@ -302,7 +302,7 @@ class TiltedPlane(PlaneReceiver):
         return self.centre
 
     def from_level_plane(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
-        """Return the coordinates whose projection by `to_level_plane` is given."""
+        """Return the coordinates that `to_level_plane` projects onto (q_x, q_y) (mm)."""
         (e_x, e_y, n), (c_x, c_y, c_z) = self.axes, self.centre
         throw = c_z - eye
         path = -self.height((0.0, 0.0, eye)) / (n[0] * q_x + n[1] * q_y + n[2] * throw)

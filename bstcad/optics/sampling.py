@@ -23,13 +23,13 @@ from bstcad.optics.sides import Sides, as_pair
 
 POINTS_PER_STRIP = 1 << 18  # approximate number of points in a strip of rows
 SPLITMIX_INCREMENT = 0x9E3779B97F4A7C15  # increment of SplitMix64: 2^64 divided by the golden ratio
-MIX_1, MIX_2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
-# 1/g of g² = g + 1, the step of a golden lattice; 1/g of g³ = g + 1, the shift of a lattice from draw to draw
+MIX_1, MIX_2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB  # multipliers of the finaliser of SplitMix64
+# Step φ of a golden lattice, 1/g with g² = g + 1; shift from one lattice (`draw`) to the next, 1/g with g³ = g + 1.
 GOLDEN_RATIO, DRAW_SHIFT = 0.6180339887498949, 0.7548776662466927
 
 
 def grid(window: Rectangle, sides: Sides, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """Return the centres of equal cells, x and y, each (along x, along y); sides: number of cells per side."""
+    """Return x and y (mm) of the centres of equal cells, each (cells along x, cells along y); sides: their numbers."""
     along_x, along_y = ((torch.arange(n, dtype=dtype) + 0.5) / n - 0.5 for n in as_pair(sides))
     x, y = torch.meshgrid(along_x * window.width, along_y * window.height, indexing="ij")
     return x.contiguous(), y.contiguous()
@@ -38,7 +38,7 @@ def grid(window: Rectangle, sides: Sides, dtype: torch.dtype = torch.float64) ->
 def stratified_strips(
     window: Rectangle, n: int, seed: int, dtype: torch.dtype = torch.float64
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield a random point in each of n x n equal cells, a strip of rows at a time, which fits the cache."""
+    """Yield x and y (mm) of a random point in each of n x n equal cells, in strips of rows that fit the cache."""
     rows = max(1, POINTS_PER_STRIP // n)
     for first in range(0, n, rows):
         i = np.arange(first, min(first + rows, n))[:, None]
@@ -78,8 +78,8 @@ def point_pairs(outline: Outline, pairs: int, draw: int = 0) -> list[tuple[float
     """Return points (x, y) uniformly over an outline, each followed by its reflection in the centre: their mean is 0.
 
     A golden lattice, a = (k + 1/2) / pairs and b = (k φ + shift) mod 1 for k = 0, 1, …, covers one half: of a rectangle
-    as (a, 2 b - 1), of a disc as the sunflower spiral r² = a, ψ = π b.  The shift depends on `draw`.  From two pairs on
-    the second moments equal those of the outline, for which a point of a rectangle may lie outside it by hundredths of
+    as (a, 2 b - 1), of a disc as the sunflower spiral r² = a, ψ = π b.  The shift depends on `draw`.  For two or more
+    pairs the second moments are made those of the outline, so that a point may lie outside a rectangle by hundredths of
     its size.  32 points of a disc have 2/3 of the noise of 128 random ones at a hard edge, 1/5 at a soft one.
     """
     half_x, half_y = outline.half_extent
@@ -93,7 +93,7 @@ def point_pairs(outline: Outline, pairs: int, draw: int = 0) -> list[tuple[float
 
 
 def shifted_lattice(outline: Outline, count: int, seed: int) -> list[tuple[float, float]]:
-    """Return points (x, y) over an outline, each uniformly distributed over seeds, so that sums over them are unbiased.
+    """Return points (x, y) over an outline; over all seeds each is uniformly distributed, so that means are unbiased.
 
     A golden lattice of `count` points, a = k / count and b = k φ, shifted by two random numbers modulo 1
     (Cranley and Patterson 1976); on a disc r² = a, ψ = 2 π b.

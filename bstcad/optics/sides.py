@@ -1,6 +1,6 @@
 """Numbers along the two sides of a rectangle: control points of a net, cells of a grid, flux tubes of a sheet.
 
-One number applies to the two sides; a pair is (along x, along y).
+A single number applies to both sides; a pair is (along x, along y).
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ def simplified(sides: Sides) -> Sides:
 
 
 def size_text(sides: Sides) -> str:
-    """Return the numbers in words: "257" or "512 x 128"."""
+    """Return the numbers as text: "257" or "512 x 128"."""
     return " x ".join(map(str, as_pair(sides))) if isinstance(sides, tuple) else str(sides)
 
 
 def side(net: Sides) -> int:
-    """Return the control points per side of the square net with the same number of control points."""
+    """Return the number of control points per side of a square net with about as many points in total as `net`."""
     return round(math.sqrt(math.prod(as_pair(net))))
 
 
 def scaled(net: Sides, share: float) -> Sides:
-    """Return a net with `share` times the spans in each direction."""
+    """Return a net with `share` times the spans of `net` along each side, at least MIN_SIDE control points."""
     x, y = (max(round(share * (points - 1)) + 1, MIN_SIDE) for points in as_pair(net))
     return simplified((x, y))
 
@@ -46,12 +46,12 @@ def in_proportion(net: Sides, of: Sides, to: Sides) -> Sides:
 
 
 def coarser(net: Sides, longer: int) -> Sides:
-    """Return a net of the same span shape with `longer` control points on its longer side; `net` if it is not finer."""
+    """Return `net` with `longer` control points on its longer side and the same ratio of spans; it is never refined."""
     longest = max(as_pair(net))
     return net if longer >= longest else scaled(net, (longer - 1) / (longest - 1))
 
 
 def spread(count: int, x: float, y: float) -> Sides:
-    """Return about count² cells in proportion to x and y: n_x / n_y = x / y."""
+    """Return the numbers n_x and n_y of cells with about n_x n_y = count² and n_x / n_y = x / y."""
     root = math.sqrt(x / y)
     return simplified((max(round(count * root), 1), max(round(count / root), 1)))

@@ -24,12 +24,12 @@ class Surface(ABC):
     """Surface given by its height z over (x, y); lengths in mm.  A subclass is a frozen dataclass."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-    z: float  # height of the vertex on the axis, or for a net of the plane from which its heights are measured (mm)
-    kind: str
+    z: float  # z of the vertex (mm); for a net, z of the plane from which its heights are measured
+    kind: str  # kind of surface, such as "sphere"; the names of scenes
     is_net = False  # True for a B-spline net, which has `heights`
     curvature: float | Tensor  # curvature at the vertex of a surface of revolution (1/mm), > 0 towards +z
     conic_constant: float | Tensor  # conic constant of a surface of revolution
-    outline: Circle | None = None  # outline of the optical part, with a plane around it; None: all of it is optical
+    outline: Circle | None = None  # outline of the optical part, which a plane surrounds; None: all is optical
 
     @property
     def level(self) -> bool:
@@ -38,7 +38,7 @@ class Surface(ABC):
 
     @property
     def detail(self) -> float:
-        """Width of the smooth pieces of the surface (mm)."""
+        """Width of the smooth pieces of the surface (mm); infinite if it is smooth everywhere."""
         return math.inf
 
     @property
@@ -48,7 +48,7 @@ class Surface(ABC):
 
     @property
     def around(self) -> Surface:
-        """Surface at the rim of a lens that is larger than the optical part: the plane around it, else the surface."""
+        """Surface at the rim of the lens: the plane around the optical part, or the surface if all of it is optical."""
         return self
 
     @abstractmethod
@@ -65,7 +65,7 @@ class Surface(ABC):
         return torch.ones_like(x, dtype=torch.bool)
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
-        """Return (s in mm, met): path along rays from (x, y) on the plane z; sense: -1 for light along -z."""
+        """Return (path in mm along rays from (x, y) on the plane z, True if they meet the surface); sense: of Rays."""
         raise self.unknown
 
     @abstractmethod
@@ -126,7 +126,7 @@ def sag(surface: Surface, x: Any, y: Any) -> np.ndarray:
 
 
 class _Revolved(Surface):
-    """Surface of revolution: c = `curvature`, k = `conic_constant`."""
+    """Surface of revolution; c is its `curvature`, k its `conic_constant`."""
 
     @property
     def level(self) -> bool:
@@ -165,7 +165,7 @@ class _Revolved(Surface):
         return 1 - self.curvature * self.curvature * (1 + self.conic_constant) * r2
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
-        """Return (s in mm, met): path along rays from (x, y) on the plane z0 to the surface around its vertex.
+        """Return (path s in mm along rays from (x, y) on the plane z0, True where they meet the part with the vertex).
 
         a s² - 2 g s + c r² = 0, a = c (1 + k d_z²), g = d_z - c (x d_x + y d_y), is solved as
         s = c r² / (g + sqrt(g² - a c r²)), the root at which a ray comes from below, d_z > ∇z · (d_x, d_y).
@@ -181,7 +181,7 @@ class _Revolved(Surface):
         return s, ok & ((1 + self.conic_constant) * c * s * dz < 1)  # excludes the far half and the other sheet
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Return zero and the sag where the outline is farthest from the axis (mm), the lower one first."""
+        """Return zero and the sag (mm) at the point of the outline farthest from the axis, the lower one first."""
         x, y = (torch.tensor(p, dtype=torch.float64) for p in outline.farthest)
         rim = float(self.plain().relative_sag_and_slope(x, y)[0])
         return min(rim, 0.0), max(rim, 0.0)
@@ -204,7 +204,7 @@ class Plane(_Revolved):
         return zero, zero, zero
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
-        """Return (s in mm, met) for rays from (x, y) on the plane z0: zero, and True."""
+        """Return (path in mm along rays from (x, y) on the plane z0, True where they meet the plane): (0, True)."""
         return torch.zeros_like(x), torch.ones_like(x, dtype=torch.bool)
 
 
@@ -264,7 +264,7 @@ class Toroid(Surface):
     __pydantic_config__ = STRICT
 
     def _profile(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (1 - c_x² x², 1 - c_y f, (1 - c_y f)² - c_y² y²); the first and the last are positive in the rim."""
+        """Return (1 - c_x² x², 1 - c_y f, (1 - c_y f)² - c_y² y²); first and last are positive inside the rim."""
         c = self.curvature_x
         cos2 = 1 - c * c * x * x
         f = c * x * x / (1 + _root(cos2))
@@ -297,7 +297,7 @@ class Toroid(Surface):
 
 
 def _root(square: Tensor) -> Tensor:
-    """Return the square root, limited where the surface is vertical."""
+    """Return sqrt(square), at least sqrt(MIN_COS2): the square is 0 where the surface is vertical."""
     return torch.sqrt(torch.where(square > MIN_COS2, square, torch.full_like(square, MIN_COS2)))
 
 
@@ -305,7 +305,7 @@ def _root(square: Tensor) -> Tensor:
 class Recess(Surface):
     """Surface of revolution inside a circle, continued outside by the plane z = const through its rim.
 
-    Examples are a dome over an LED in a flat underside, or a bulge there.  Light is traced to the optical part alone.
+    Examples are a dome over an LED in a flat underside, or a bulge on it.  Light is traced to the optical part alone.
     """
 
     face: Sphere | Conic  # optical part
@@ -317,7 +317,7 @@ class Recess(Surface):
         return self.face
 
     def __post_init__(self) -> None:
-        for name in ("z", "kind", "curvature", "conic_constant", "conic", "parameters"):  # facts of the optical part
+        for name in ("z", "kind", "curvature", "conic_constant", "conic", "parameters"):  # those of the optical part
             object.__setattr__(self, name, getattr(self.face, name))
 
     @property
@@ -334,7 +334,7 @@ class Recess(Surface):
         return torch.where(inside, h, rim), torch.where(inside, z_x, zero), torch.where(inside, z_y, zero)
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Return zero and the sag (mm) at the end of the optical part or of the outline, the lower one first."""
+        """Return zero and the sag (mm) at the rim of the optical part, or of a smaller outline, the lower one first."""
         smaller = math.hypot(*outline.farthest) < self.outline.radius
         return self.face.sags(outline if smaller else self.outline)
 

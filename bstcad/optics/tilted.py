@@ -59,7 +59,7 @@ class TiltedSurface(Surface):
         return self.unit_normal[2] ** 2 - self.face_curvature * f
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (h, ∂h/∂x, ∂h/∂y) at (x, y), ∂h/∂x = (c u_x - N_x) / (N_z - c h); meaningless outside the rim."""
+        """Return (h in mm, ∂h/∂x, ∂h/∂y) at (x, y), ∂h/∂x = (c u_x - N_x) / (N_z - c h); invalid outside the rim."""
         x, y, f = self._from_vertex(x, y)
         cos2 = self._cos2(f)
         root = torch.sqrt(torch.where(cos2 > MIN_COS2, cos2, torch.full_like(cos2, MIN_COS2)))  # no NaN in the gradient
@@ -71,7 +71,7 @@ class TiltedSurface(Surface):
         return self._cos2(self._from_vertex(x, y)[2]) > MIN_COS2
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
-        """Return (path s in mm, hit) along rays from (x, y) of the plane z = V_z to the surface.
+        """Return (path s in mm along rays from (x, y) on the plane z = V_z, True where they meet the surface).
 
         c s² - 2 g s + f = 0, g = N · d - c u · d; the root near the vertex is s = f / (g ± sqrt(g² - c f)).
         """

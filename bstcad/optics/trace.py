@@ -8,8 +8,8 @@ A simulation traces stratified rays a strip at a time, so that memory does not g
 A ghost is light that is reflected twice inside the lens: it enters through the front, is reflected at the back and
 again at the front, and leaves through the back.  With T and R the transmittance and reflectance of the front, T' and R'
 those of the back, it carries the fraction T R' R T' of a ray's flux, about a thousandth for bare glass; beyond the
-critical angle R = 1.  Light that is reflected more often is a few hundred times fainter and is neglected.  Light that
-meets the outline is absorbed by the sides.  Only verification traces ghosts, in plain torch.
+critical angle R = 1.  Light that is reflected more often is a few hundred times fainter and is neglected.  A ghost's
+light that meets a face outside its outline counts as absorbed.  Only verification traces ghosts, in plain torch.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.surfaces import Plane, Surface
 
-UNDERSIDE = "vignetted by the underside"  # line of the ledger: light beside the optical part of a front
-BLOCKED = "stopped beside a window or mirror"  # line of the ledger: light that misses such an element
-UNDERSIDE_CELLS = 256  # cells per side of the lens, over which the light stopped by the underside is summed
-WINDOW_CELLS = 96  # cells per side of the search for useful light in front of a window or mirror
+UNDERSIDE = "vignetted by the underside"  # line of the ledger: light that meets a front beside its optical part
+BLOCKED = "stopped beside a window or mirror"  # line of the ledger: light outside the outline of an element
+UNDERSIDE_CELLS = 256  # cells per side of the grid on which light that meets the underside is summed
+WINDOW_CELLS = 96  # cells per side of the grid that finds the light which reaches the lens through windows and mirrors
 MIN_RAYS_FOR_TABLE = 256  # minimum rays per side for which a table of the source's light is worth its cost
 GHOST_RAYS = 1024  # maximum rays per side of a ghost; 3 % noise per pixel on 1 % of the light adds 0.0003 to RRMSD
 # Lines of the ledger that a ghost changes, besides losses.REFLECTED.
@@ -113,7 +113,7 @@ def is_transmitted(rays: Rays, lens: Lens) -> Tensor:
 
 
 def window(source: Emitter, lens: Lens) -> Rectangle:
-    """Return the rectangle of the plane through the vertex of the first surface that all useful light crosses."""
+    """Return the rectangle that all useful light crosses on the plane z = const through the first surface's vertex."""
     first, aperture = lens.entrance, lens.interfaces[0].outline
     area = source.window(aperture, first.z, first.sags(aperture))
     if not lens.before:
@@ -128,7 +128,7 @@ def window(source: Emitter, lens: Lens) -> Rectangle:
 def _useful(
     source: Emitter, before: tuple[Interface, ...], faces: tuple[Interface, ...], area: Rectangle, n: int = WINDOW_CELLS
 ) -> Rectangle:
-    """Return the part of `area`, on the first vertex's plane, whose light meets one of the planes `faces`.
+    """Return the part of `area`, on the plane of the first vertex, whose light meets one of the planes `faces`.
 
     Two grids are traced; the second covers only the useful part found on the first.
     """
@@ -164,7 +164,7 @@ def clear_window(source: Emitter, lens: Lens, n: int = 256) -> Rectangle:
 
 
 def launch_strips(source: Emitter, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Iterator[Rays]:
-    """Launch n x n stratified rays over `area` (default: the window), a strip at a time, where there is flux."""
+    """Yield those of n x n stratified rays over `area` (default: the window) that carry flux, a strip at a time."""
     area, like = area or window(source, lens), lens.like
     for x, y in sampling.stratified_strips(area, n, seed):
         lit = source.irradiance(x, y, lens.entrance.z) > 0
@@ -178,7 +178,7 @@ class Simulation:
     """Simulated light of one set of rays behind a lens."""
 
     box: Tensor  # flux in each pixel (rows, columns), as a fraction of the source's, row 0 = y max
-    tent: Tensor  # flux in each pixel by linear binning, as `box`
+    tent: Tensor  # flux in each pixel by linear (tent) binning; shape and unit as of `box`
     flux: dict[str, float]  # ledger of the flux by fate, as fractions of the source's; the lines sum to 1
     rays: int  # number of rays launched
 
@@ -223,13 +223,13 @@ def simulate_plain(lights: Lights, screen: Screen, n: int) -> Simulation:
 
 
 def _as_fractions(lights: Lights, box: Tensor, tent: Tensor, flux: dict[str, float], count: int) -> Simulation:
-    """Return the sums as fractions of the source's light; other light missed the lens or met its underside."""
+    """Return the sums as fractions of the source's light; light not launched missed the lens or met its underside."""
     launched = sum(flux.values())
-    whole = max(launched, 1.0)  # a cell on the rim of a beam counts or not: together a little more than the beam
+    whole = max(launched, 1.0)  # the sum may exceed 1 slightly: a cell at the rim of a beam counts whole
     flux = {line: value / whole for line, value in flux.items()}
     flux["missed the lens"] += 1.0 - launched / whole
     first = lights[0][2]
-    if first.front.outline is not None and first.passes.sense > 0 and not first.before:  # light meets the plane around
+    if first.front.outline is not None and first.passes.sense > 0 and not first.before:  # the underside is lit
         stopped = sum(part * on_underside(source, lens.front.plain(), lens.outline) for part, source, lens, _ in lights)
         flux[UNDERSIDE] = max(min(stopped, flux["missed the lens"]), 0.0)
         flux["missed the lens"] -= flux[UNDERSIDE]
@@ -239,7 +239,7 @@ def _as_fractions(lights: Lights, box: Tensor, tent: Tensor, flux: dict[str, flo
 @functools.lru_cache(maxsize=4096)  # independent of the back, which changes in tailoring
 def on_underside(source: Emitter, front: Surface, outline: Outline, n: int = UNDERSIDE_CELLS) -> float:
     """Return the fraction of a source's light that meets the plane around a front's optical part, inside `outline`."""
-    assert front.outline is not None  # a front without one has no plane around it
+    assert front.outline is not None  # a front without outline has no plane around it
     plane, (half_x, half_y) = front.around, outline.half_extent
     area = Rectangle(2 * half_x, 2 * half_y)
     x, y = sampling.grid(area, n)
@@ -261,7 +261,7 @@ class Reflection:
     through: Loss  # loss whose share is the transmittance T
     law: Refract  # law of refraction of the transmitted light
 
-    line, in_glass, fused = "transmitted", False, True  # no line of the ledger: such light does not belong to the ghost
+    line, in_glass, fused = "transmitted", False, True  # not a line of the ledger: this light leaves the ghost
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
         """Return R at the angle of incidence."""
@@ -275,11 +275,11 @@ def ghost(lens: Lens) -> tuple[Interface, ...]:
 
     The reflectance of the faces follows from the lens's losses.
     """
-    assert lens.losses is not None  # without them no face reflects
+    assert lens.losses is not None  # without losses no face reflects
     number = lens.number_of("front")
     front, back = lens.interfaces[number : number + 2]
     outwards = replace(front, law=Refract(lens.index, 1.0), status_if_missed=Status.VIGNETTED)
-    _, outwards = lens.losses.on((front, outwards))  # light meets the second one from the glass
+    _, outwards = lens.losses.on((front, outwards))  # losses of `outwards` for light from inside the glass
     return front, _from_inside(back), _from_inside(outwards), back
 
 
@@ -295,7 +295,7 @@ class GhostImage:
     """Light of a ghost."""
 
     picture: Tensor  # flux in each pixel (rows, columns), as a fraction of the source's, row 0 = y max
-    flux: dict[str, float]  # changes of the ledger of the directly transmitted light; the lines sum to 0
+    flux: dict[str, float]  # changes by the ghost to the ledger of a simulation without it; the lines sum to 0
 
 
 @torch.no_grad()
@@ -324,7 +324,7 @@ def _ghost_of_channel(channel: Channel, lens: Lens, screen: Screen, n: int, seed
             flux = float(total((out.flux * (out.alive & counted)).double()))
             lines[line] += flux if line in gains else -flux
         launched += float(total(rays.flux.double()))
-    whole = max(launched, 1.0)  # divisor, which `_as_fractions` uses, too
+    whole = max(launched, 1.0)  # the divisor of `_as_fractions`
     return GhostImage(picture / whole, {line: value / whole for line, value in lines.items()})
 
 

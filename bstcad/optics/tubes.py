@@ -30,7 +30,7 @@ from bstcad.optics.trace import behind, from_first_net, is_transmitted, whole_ke
 
 ALL = slice(None)  # all rows or columns
 SHEET_TUBES = 256  # tubes per side of the sheet from which finer sheets are interpolated
-RIM_SHRINK = 1e-9  # relative shrinkage to the centre, so that corners on the rim of the light count as lit
+RIM_SHRINK = 1e-9  # relative shrinkage towards the centre, so that corners on the rim of the light count as lit
 MAX_BAND_ROWS = 256  # maximum rows of tubes traced at a time for a picture; even, since the diagonals alternate
 MAX_BAND_TUBES = 1 << 19  # maximum tubes traced at a time for a picture, which limits its memory
 MAX_RAYS_PER_BAND = 1 << 17  # maximum rays traced at a time in plain torch: a megabyte per quantity
@@ -55,11 +55,11 @@ class Tubes:
         return from_first_net(self.rays, lens.unbounded(), plane)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
-        """Return (flux per pixel, row 0 = y max; Σ flux · (distance outside the border, pixels)²)."""
+        """Return (flux per pixel, row 0 = y max; Σ flux · mean squared distance of corners outside, pixel²)."""
         return collect(screen.pixels_of(corners.position.double()), self.arriving_flux(corners), screen.shape)
 
     def transmitted_flux(self, corners: Landed) -> Tensor:
-        """Return the flux of each tube (rows, columns) after losses at faces and in glass, also with lost corners."""
+        """Return the flux of each tube (rows, columns) after losses at faces and in glass, even if corners are lost."""
         return self.flux * middle(corners.flux) if corners.taken else self.flux
 
     def arriving_flux(self, corners: Landed) -> Tensor:
@@ -77,8 +77,7 @@ def launch_tubes(source: Emitter, lens: Lens, n: int) -> Tubes:
 
     If the net has different numbers of control points along x and y, about n² tubes are launched, in the proportion of
     its spans under the light.  The sheet covers the beam's cross-section if the lens transmits all of the beam, else
-    the back face; its rim is the rim of the light.  A partly lit tube spreads the flux of its lit part over its whole
-    area.
+    the back face; its rim is the rim of the light.  A partly lit tube spreads its flux over its whole area.
     """
     sheet = _sheet(source, lens, n)
     flux: list[Tensor] = []
@@ -124,7 +123,7 @@ class _Sheet:
 
 
 def _bands(count: int, size: int) -> Iterator[slice]:
-    """Yield the slices of rows of corners of bands of `size` rows of tubes; count: rows of tubes in total."""
+    """Yield the rows of corners of each band of `size` rows of tubes, as a slice; count: rows of tubes in total."""
     for first in range(0, count, size):
         yield slice(first, min(first + size, count) + 1)
 
@@ -143,7 +142,7 @@ def _tubes(source: Emitter, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tube
     interfaces = lens.unbounded().interfaces
     edges = lens.with_apertures_scaled(1 + RIM_SHRINK).interfaces  # margin for rounding
     first, back = lens.freeform[0], lens.number_of("back")
-    end = lens.solid.stop if lens.solid.stop > back + 1 else back  # light may meet the front again behind the back
+    end = lens.solid.stop if lens.solid.stop > back + 1 else back  # faces behind the back: in a second-surface mirror
     for k in range(max(first, end)):
         rays.append(cross(rays[k], interfaces[k]).rays)
         if k < end and k != back:  # the sheet itself ends at the back's rim
@@ -161,7 +160,7 @@ def _density(source: Emitter, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | No
         density = torch.where(count == 1, density, torch.zeros_like(density))
         rim = (count > 0) & (count < 1)
         if bool(rim.any()):
-            density[rim] = _partly_lit(source, lens, *(_quads(p, rim) for p in (x, y))).to(density)
+            density[rim] = _mean_lit_density(source, lens, *(_quads(p, rim) for p in (x, y))).to(density)
     return density.double()
 
 
@@ -176,7 +175,7 @@ def _over_the_beam(source: Emitter, lens: Lens, n: int) -> _Sheet | None:
     spot, centre = source.spot(z)
     if spot is None:
         return None
-    count = _proportioned(lens, spot, n)
+    count = _tubes_per_side(lens, spot, n)
     n_x, n_y = as_pair(count)
     ends = (slice(0, 1), ALL), (slice(n_x, None), ALL), (ALL, slice(0, 1)), (ALL, slice(n_y, None))
     sides = zip(*(corners(spot, count, *end) for end in ends), strict=True)
@@ -201,7 +200,7 @@ def _over_the_back(source: Emitter, lens: Lens, n: int, few: int) -> _Sheet:
     """
     from scipy.interpolate import RectBivariateSpline  # slow to import, and not needed for a plan
 
-    n_x, n_y = as_pair(_proportioned(lens, lens.apertures[1], n))
+    n_x, n_y = as_pair(_tubes_per_side(lens, lens.apertures[1], n))
     few_x, few_y = min(n_x, few), min(n_y, few)
     x, y, _ = rays_to(source, lens, *corners(lens.apertures[1], (few_x, few_y)))
     mean_x, mean_y = (float(total(p) / p.numel()) for p in (x, y))
@@ -218,8 +217,8 @@ def _over_the_back(source: Emitter, lens: Lens, n: int, few: int) -> _Sheet:
     return _Sheet(rows, n_x, (mean_x, mean_y), cut=True)
 
 
-def _proportioned(lens: Lens, light: Outline, n: int) -> Sides:
-    """Return the tubes per side: n; for an oblong net about n² in all, in proportion to its spans inside `light`."""
+def _tubes_per_side(lens: Lens, light: Outline, n: int) -> Sides:
+    """Return n tubes per side; for a net of unequal sides about n² in all, in proportion to its spans in `light`."""
     net = lens.last_freeform.net
     if net.shape[0] == net.shape[1]:
         return n
@@ -232,16 +231,16 @@ def _quads(p: Tensor, where: Tensor) -> tuple[Tensor, ...]:
     return p[row, column], p[row, column + 1], p[row + 1, column], p[row + 1, column + 1]
 
 
-def _partly_lit(source: Emitter, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tensor, ...]) -> Tensor:
+def _mean_lit_density(source: Emitter, lens: Lens, x: tuple[Tensor, ...], y: tuple[Tensor, ...]) -> Tensor:
     """Return the mean flux density (1/mm²) of transmitted light over PARTS_PER_SIDE² parts of each tube of `_quads`."""
     inner = ((torch.arange(PARTS_PER_SIDE) + 0.5) / PARTS_PER_SIDE).to(x[0])
     a, b = (t.reshape(-1, 1) for t in torch.meshgrid(inner, inner, indexing="ij"))
     p, q = (((1 - a) * ((1 - b) * c[0] + b * c[1]) + a * ((1 - b) * c[2] + b * c[3])).reshape(-1) for c in (x, y))
-    return _getting_through(source, lens, p, q).view(PARTS_PER_SIDE**2, -1).mean(0)
+    return _transmitted_density(source, lens, p, q).view(PARTS_PER_SIDE**2, -1).mean(0)
 
 
-def _getting_through(source: Emitter, lens: Lens, x: Tensor, y: Tensor) -> Tensor:
-    """Return the flux density (n,) (1/mm²) at points of the first plane, zero where the lens blocks the light."""
+def _transmitted_density(source: Emitter, lens: Lens, x: Tensor, y: Tensor) -> Tensor:
+    """Return the flux density (1/mm²) at points (n,) of the vertex plane, zero where light misses a face."""
     receiver = LevelPlane(lens.back.z + 1.0)  # any plane behind the lens
     if lens.losses is None and (fast := whole_kernel("trace.land", source, lens, receiver)):
         landed = fast(source, lens, receiver, x=x.double(), y=y.double())
@@ -303,7 +302,7 @@ def rays_to(
     jacobian = functools.partial(_inverse_jacobian, arrive, RELATIVE_DIFFERENCE_STEP * extent)
     p, q = x, y
     inverse: list[Tensor] | None = None
-    last: tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]] | None = None  # step, and distances left before it
+    last: tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]] | None = None  # step, and distance left before it
     # for light along the axis, x and y are the solution
     if max(x.shape) > 2 * COARSE_GRID_POINTS and not arrive(x[:1, :1], y[:1, :1], z[:1, :1]).axial:
         lines = tuple(torch.linspace(0, n - 1, min(n, COARSE_GRID_POINTS)).round().long() for n in x.shape)
@@ -331,7 +330,7 @@ def rays_to(
 
 
 def _inverse_jacobian(arrive: Callable[..., Rays], step: float, p: Tensor, q: Tensor, height: Tensor) -> list[Tensor]:
-    """Return the inverse of ∂(hit) / ∂(p, q) by difference quotients: [xx, xy, yx, yy]."""
+    """Return the inverse of ∂(hit) / ∂(p, q) by difference quotients of `step` (mm): [xx, xy, yx, yy]."""
     shifted_p, shifted_q = torch.cat((p + step, p - step, p, p)), torch.cat((q, q, q + step, q - step))
     right, left, above, below = arrive(shifted_p, shifted_q, height.repeat(4, 1)).position.chunk(4, dim=1)
     one, two = right - left, above - below
@@ -342,7 +341,7 @@ def _inverse_jacobian(arrive: Callable[..., Rays], step: float, p: Tensor, q: Te
 
 
 def _broyden_update(inverse: list[Tensor], step: tuple[Tensor, Tensor], shift: tuple[Tensor, Tensor]) -> list[Tensor]:
-    """Return Broyden's update of each inverse Jacobian B, so that B shift = step; shift: last change of the hits."""
+    """Return Broyden's update of each inverse Jacobian B, so that B shift = step; shift: change of hits by `step`."""
     xx, xy, yx, yy = inverse
     (s_x, s_y), (m_x, m_y) = step, shift
     off_x, off_y = s_x - (xx * m_x + xy * m_y), s_y - (yx * m_x + yy * m_y)
@@ -369,8 +368,7 @@ def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tenso
     """Return (picture (rows, columns), outside) of tubes.
 
     corner: (column, row) of the corners in pixels, (2, n + 1, m + 1).  flux: flux of the tubes, (n, m).
-    outside: Σ flux · (mean square of the corners' distance outside the border, in pixels), which has a gradient where
-    the light falls on no pixel.
+    outside: Σ flux · (mean of the corners' squared distances outside the border, pixel²); light outside has a gradient.
     """
     if corner.dtype == torch.float64 and (fast := ops.kernel("tubes.collect", corner)):
         return fast(corner, flux, shape, MIN_TRIANGLE_AREA)

@@ -2,8 +2,8 @@
 
 Stage 1 aims straight from the last tailored face to the image of the receiver.  The image in flat mirrors is exact.
 A plate of thickness t and index n moves the image nearer by t (1 - 1 / n), to first order in the angle; stage 2, which
-traces all interfaces, corrects the rest.  Light inside the glass leaves it through a flat face, and its direction to
-each point of the receiver follows from Snell's law (`BehindGlass`).
+traces all interfaces, corrects the rest.  Light that is still inside the glass leaves it through a flat face, and its
+direction to each point of the receiver follows from Snell's law (`BehindGlass`).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Image(PlaneReceiver):
         return self.centre
 
     def in_mirror(self, mirror: TiltedSurface) -> Image:
-        """Return the mirror image."""
+        """Return the image of this image in a flat mirror."""
         n = mirror.unit_normal
         e_x, e_y, (n_x, n_y, n_z) = (point_along(v, -2 * dot(v, n), n) for v in self.frame)
         centre = point_along(self.centre, -2 * mirror.height_above(self.centre), n)
@@ -100,10 +100,10 @@ class BehindGlass(Receiver):
     def vector_to(self, rays: Rays, aim: Tensor) -> Tensor:
         """Return the unit vectors (3, …) along which rays in the glass reach coordinates (2, …) of the receiver.
 
-        Behind a point of the face the light goes along s over the distance d to the receiver.  By Snell's law it comes
-        along i = (s_x / η, s_y / η) through the thickness t of glass, which meets the face at a second point.  Newton's
-        method makes the two points equal: as the first moves by 1, the second moves back by k = t s_z / (η d i_z)
-        across the plane of incidence, and by k (s_z / i_z)² in it.
+        From a point of the face the light goes along the unit vector s over the distance d to the receiver.  By Snell's
+        law it comes along i, (i_x, i_y) = (s_x, s_y) / η, through glass of thickness t; the ray along i meets the face
+        at a second point.  Newton's method makes the two points equal: as the first moves by 1, the second moves back
+        by k = t / (η d i_z) across the plane of incidence, and by k (s_z / i_z)² in it.
         """
         below, direction = rays.above(self.z), self.rest.vector_to(rays, aim)
         point = rays.position - below / direction[2] * direction
@@ -151,7 +151,7 @@ def image_from_last_net(lens: Lens, plane: Receiver) -> Receiver:
 
 
 def image_screen(lens: Lens, screen: Screen) -> Screen:
-    """Return the screen whose receiver is its image by the interfaces behind the last net of a lens."""
+    """Return the screen with the image of its receiver by the interfaces behind the last net of a lens as receiver."""
     plane = screen.plane
     view = image_from_last_net(lens, plane)
     return screen if view is plane else replace(screen, surface=view)

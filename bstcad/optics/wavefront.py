@@ -6,7 +6,7 @@ two of the direction cosines of the rays, and d = (W_x, W_y, sqrt(1 - W_x² - W_
 Principles of Optics, section 3.1).
 
 Sign: where W is larger the path is longer, and the wavefront lags behind; where W is smaller it runs ahead.  Rays go
-towards larger W: a diverging wave has W > 0 around its axis, as Noll's Z_4 with c_4 > 0.
+towards larger W: for a diverging wave W grows away from the axis, as Noll's Z_4 with c_4 > 0 does.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from bstcad.optics.rays import Vector
 MM_PER_NM = 1e-6  # millimetres per nanometre
 MIN_FOCUS_DISTANCE = 1e-3  # mm, smallest distance of a focus from the plane
 MAX_RAY_ANGLE = math.radians(89.0)  # rad, angle to the axis above which a ray counts as parallel to the plane
-SAMPLES_PER_SIDE = 129  # grid points per side of a Zernike circle, at which the largest slope is searched
+SAMPLES_PER_SIDE = 129  # grid points per side of the square around a Zernike circle, for its largest slope
 Place = tuple[float, float]
 
 Z = Key("Plane behind the lens on which the wavefront is stated and measured.", "mm", -1e8, 1e8, example=40.0)
 WEIGHT = Key("Weight of the wavefront relative to the pictures.", "", 0.0, 1e9, example=2.0)
-LIGHT_DIRECTION = "Direction of the light, of any length."
+LIGHT_DIRECTION = "Vector along the light, of any length."
 FOCUS = "Centre of the sphere. Behind z, light converges to the focus; before z, light diverges from it."
 COEFFICIENTS = "Coefficients in waves (main wavelength), in Noll's order from j = 1."
 
@@ -131,8 +131,8 @@ class SphericalWave(_Wave):
 class ZernikeWave(_Wave):
     """Wave W = λ Σ_j c_j Z_j((x - c_x) / a, (y - c_y) / a), Noll's orthonormal polynomials (zernike.py), j = 1, 2, ….
 
-    c_j are waves RMS over the circle of radius a about (c_x, c_y).  The wave is not stated outside the circle, where
-    `path` and `directions` extrapolate the polynomials where |∇W| < 1.
+    c_j are waves RMS over the circle of radius a about (c_x, c_y).  Outside the circle the wave is not stated;
+    there `path` and, where |∇W| < 1, `directions` extrapolate the polynomials.
     """
 
     coefficients: Annotated[tuple[float, ...], Key(COEFFICIENTS, "", -1e6, 1e6, example=[0.0, 0.0, 0.0, 1.5])]

@@ -7,11 +7,11 @@ of Malus and Dupin S is the eikonal of the light on that plane, as W (wavefront.
     OPD = S - W,   ∇OPD = (d_x, d_y) - (w_x, w_y),
 
 with d and w the directions of the ray and of the goal wave at its position; a positive OPD is light that arrives late.
-An OPD at a reference sphere, or perpendicular to the goal direction, differs to second order in the angle of d and w.
+An OPD at a reference sphere, or perpendicular to w, differs from this one to second order in the angle of d to w.
 
 Piston (a constant) is not an error of a wavefront; tilt (a linear part in x and y) deflects the light, and moves the
-focus of a spherical wave.  Piston and tilt are fitted by least squares, weighted by flux; figures are given without
-piston, and without piston and tilt.
+focus of a spherical wave.  Piston and tilt are fitted by least squares, weighted by flux; RMS and peak to valley are
+given without piston, and without piston and tilt.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from bstcad.optics.receivers import LevelPlane, dot
 from bstcad.optics.trace import behind, clear_window
 from bstcad.optics.wavefront import MM_PER_NM, Wave, length
 
-RAYS_PER_SIDE = 512  # rays per side of the light before the lens
+RAYS_PER_SIDE = 512  # rays per side of the grid before the lens
 MAX_MAP_CELLS = 256  # largest number of cells per side of the map
 RAYS_PER_BAND = 1 << 17  # rays traced at a time: a megabyte for each quantity
 ROUNDINGS_PER_SEGMENT = 4  # roundings of a path segment: two ends, length and sum
@@ -113,7 +113,7 @@ def optical_path(source: Emitter, lens: Lens, rays: Rays, z: float) -> tuple[Ray
 
 
 def path_from_reference(source: Emitter, z: float, rays: Rays, sense: int) -> Tensor:
-    """Return the path (mm) of rays from their reference to the first surface; z: vertex of the surface (mm)."""
+    """Return the path (mm) of rays from the reference of `optical_path` to the first surface; z: its vertex (mm)."""
     position = torch.stack([*rays.position[:2], rays.above(z)])
     return source.reference(position, z, sense)
 
@@ -140,7 +140,7 @@ class WavefrontError:
 
     z: float  # plane of the comparison, mm
     wavelength: float  # main wavelength, nm
-    without_piston: OpdSize
+    without_piston: OpdSize  # OPD without piston
     without_tilt: OpdSize  # OPD without piston and tilt
     tilt: tuple[float, float]  # tilt removed, µrad: inclination of the light towards +x and +y relative to the goal
     angle_rms: float  # RMS angle between rays and goal rays, weighted by flux, tilt included, µrad
@@ -155,9 +155,9 @@ class WavefrontError:
 
 @torch.no_grad()
 def wavefront_error(source: Emitter, lens: Lens, wave: Wave, n: int = RAYS_PER_SIDE) -> WavefrontError:
-    """Return the wavefront error by n x n rays of a point or parallel source that pass the lens.
+    """Return the wavefront error of a lens, computed with n x n rays of a point or parallel source.
 
-    The lens has the index of the source's main wavelength.  Raises ValueError if no ray can be compared.
+    The lens must have the index for the source's main wavelength.  Raises ValueError if no ray can be compared.
     """
     pupil, nm = exit_pupil(source, lens, wave.z, n), source.main_wavelength
     compared, without_piston, fit, share = _compare(pupil, wave, nm)
@@ -190,10 +190,10 @@ def residual(pupil: ExitPupil, wave: Wave, nm: float) -> Tensor:
 
 
 def _compare(pupil: ExitPupil, wave: Wave, nm: float) -> tuple[Tensor, Tensor, _Fit, Tensor]:
-    """Return (compared rays (n, n); for these: OPD without piston in mm, its plane fit, fraction of their flux)."""
+    """Return (compared rays (n, n); for these: OPD without piston in mm, its plane fit, flux divided by their sum)."""
     compared = pupil.alive & wave.contains(pupil.x, pupil.y)
     if int(compared.sum()) < 3:
-        raise ValueError(f"no light reaches the goal wave on the plane z = {wave.z:g}; change its plane or circle")
+        raise ValueError(f"no light reaches the goal wave on the plane z = {wave.z:g} mm; change z or the circle")
     x, y, path, flux = (part[compared] for part in (pupil.x, pupil.y, pupil.path, pupil.flux))
     opd, share = path - wave.path(x, y, nm), flux / float(total(flux))
     fit = _least_squares(x, y, opd, share=share)
@@ -209,7 +209,7 @@ class _Fit:
     middle: tuple[float, float]  # mean position (x, y), weighted by flux (mm)
 
     def at(self, x: Tensor, y: Tensor) -> Tensor:
-        """Return the tilt part at (x, y)."""
+        """Return the tilt part (mm) at (x, y)."""
         return self.slopes[0] * (x - self.middle[0]) + self.slopes[1] * (y - self.middle[1])
 
 

@@ -7,8 +7,8 @@ the disc is 1 for i = j, else 0 (Noll, J. Opt. Soc. Am. 66, 207, 1976).  With ζ
     ∂V_n^m/∂x = n (V_{n-1}^{m-1} + V_{n-1}^{m+1}) + ∂V_{n-2}^m/∂x,
     ∂V_n^m/∂y = i n (V_{n-1}^{m-1} - V_{n-1}^{m+1}) + ∂V_{n-2}^m/∂y,
 
-with V_n^m = 0 for |m| > n and V_n^-m = V_n^m*, which lose no digits at high orders (Shakibaei and Paramesran, Opt.
-Lett. 38, 2487, 2013; Janssen, J. Opt. Soc. Am. A 31, 1604, 2014).
+with V_n^m = 0 for |m| > n and V_n^-m = V_n^m*.  These recurrences lose no digits at high orders (Shakibaei and
+Paramesran, Opt. Lett. 38, 2487, 2013; Janssen, J. Opt. Soc. Am. A 31, 1604, 2014).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 POINTS_AT_A_TIME = 1 << 13  # points evaluated at a time, whose harmonics fit the cache
-Complex = tuple[Tensor, Tensor]  # real and imaginary part, apart since torch's complex numbers are slower
+Complex = tuple[Tensor, Tensor]  # real and imaginary part, since torch's own complex numbers are slower
 Harmonic = tuple[Complex, Complex, Complex]  # V_n^m and its derivatives in x and in y
 
 

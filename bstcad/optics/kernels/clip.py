@@ -11,8 +11,9 @@ traverse it in opposite senses, so it is followed once, with the difference of t
 followed: one that lies in one pixel or has no area gives its flux to a pixel, and one outside the screen or with an
 invalid corner gives none.  Their edges get the density 0, so that they do not affect their neighbours.
 
-With G = ∂L/∂I and H(x, y) = ∫_y^∞ G dy the adjoint needs for each edge Φ = ∫ H dx (for ∂L/∂A) and ∫ (1 - s) G ds,
-∫ s G ds (an edge that moves by δ sweeps the area δ · n ds, n its normal).  These are equal for the two triangles.
+With L the merit function, G = ∂L/∂I and H(x, y) = ∫_y^∞ G dy, the adjoint needs for each edge Φ = ∫ H dx (for ∂L/∂A)
+and ∫ (1 - s) G ds, ∫ s G ds, s = 0 … 1 along the edge (an edge that moves by δ sweeps the area δ · n ds, n its normal).
+They are computed once for the two triangles beside the edge.
 
 All lengths are in pixels, x along columns, y down the rows.  Columns come first in the sums, as x does in a sheet of
 tubes: the rows of tubes of one part reach few columns.
@@ -90,7 +91,7 @@ def area_of(a, b, c):
 
 @inlined
 def outside(p, size):
-    """Return the signed distance of a coordinate outside the border."""
+    """Return the signed distance (pixels) of a coordinate p outside 0 … size; 0 inside."""
     return p - min(max(p, 0.0), size)
 
 
@@ -109,7 +110,7 @@ def half_square_outside(a, b, c, d, columns, rows):
 
 @inlined
 def _first_border(start, cell, d, size):
-    """Return (step, s of the next border, s between borders) along one axis; outside the screen is one cell."""
+    """Return (step, s of the next border, s between borders) along one axis; the outside is one cell on either side."""
     if d > 0.0 and cell < size:
         return 1, (cell + 1 - start) / d, 1.0 / d
     if d < 0.0 and cell >= 0:
@@ -134,7 +135,7 @@ def _one_border(a, b):
 
 @inlined
 def _add_piece(sums, i, j, share, middle):
-    """Add a piece of an edge in pixel (i, j), with its midpoint at y = `middle`."""
+    """Add a piece of an edge in pixel (i, j), with midpoint y = `middle`; share: its dx times the density."""
     below = middle - j
     sums[i, j] += share * (1.0 - below)
     sums[i, j + 1] += share * below
@@ -196,7 +197,7 @@ def _piece_values(g, below_g, i, j, middle):
 
 @inlined
 def along_edge(g, below_g, a, b):
-    """Return (∫ H dx, ∫ (1 - s) G ds, ∫ s G ds) along an edge; below_g: sums of g (columns, rows) from each row on."""
+    """Return (∫ H dx, ∫ (1 - s) G ds, ∫ s G ds) along an edge; below_g[i, j]: sum of g[i, j:]."""
     if a[4] | b[4] == ON:
         borders = abs(a[2] - b[2]) + abs(a[3] - b[3])
         dx, dy = b[0] - a[0], b[1] - a[1]
@@ -393,6 +394,7 @@ def _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, flags, known,
     flags (m, 3): True for the first and the second triangle of a tube if it is followed, and for a tube that extends
     outside the screen.  edges: upper, lower, across (m, 3) and side (m + 1, 3), for the edges 03, 12, the diagonals and
     01.  known (m,): True for edges of `upper` that the row before has computed; on return, for those of `lower`.
+    in_flux: True if the gradient in the flux is needed.
     """
     columns, rows = g.shape
     upper, lower, across, side = edges

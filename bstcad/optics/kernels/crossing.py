@@ -121,7 +121,10 @@ def _restore_hit(net, faces, path, first, count, work):
 
 @njit(inline="always")
 def _at_level(faces, at, e, h, gx, gy):
-    """Return ∂L/∂(direction behind the face), ∂L/∂hit and ∂L/∂path of a landing on a level screen, at fixed slopes."""
+    """Return ∂L/∂(direction behind the face), ∂L/∂hit and ∂L/∂path of a landing on a level screen, at fixed slopes.
+
+    at: x and y of the hit (mm), 0, direction before the face; e: direction behind it; h: sag; gx, gy: ∂L/∂landing.
+    """
     ex, ey, ez = e
     ez = min(ez, -faces.rules.grazing) if faces.reflects else max(ez, faces.rules.grazing)
     a, b, far = ex / ez, ey / ez, (faces.throw - h) / ez
@@ -133,7 +136,7 @@ def _at_level(faces, at, e, h, gx, gy):
 def _at_tilted(faces, tilted, at, e, h, gx, gy):
     """Return the gradients of `_at_level` for a tilted screen.
 
-    The landing moves by u · (dP - n (e · dP) / (n · e)) along each axis u of the screen, dP = dp + far de.
+    The landing moves by u · (dP - e (n · dP) / (n · e)) along each axis u of the screen, dP = dp + far de.
     """
     ex, ey, ez = e
     n_x, n_y, n_z = tilted.n_x, tilted.n_y, tilted.n_z
@@ -148,7 +151,7 @@ def _at_tilted(faces, tilted, at, e, h, gx, gy):
 
 @njit(inline="always")
 def _behind_face(at, work, r):
-    """Return the gradients of `_at_level` for rays that go on: those in hit and direction are given in `work`."""
+    """Return the gradients of `_at_level` for rays that go on: `work` contains ∂L/∂hit and ∂L/∂direction."""
     g_x, g_y, g_z = work[G_X + r], work[G_Y + r], work[G_Z + r]
     g_e = (work[G_DX + r], work[G_DY + r], work[G_DZ + r])
     return g_e, (g_x, g_y, g_z), g_x * at[3] + g_y * at[4] + g_z * at[5]
@@ -156,7 +159,7 @@ def _behind_face(at, work, r):
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _chain(faces, tilted, lands, count, work, path, d_rays, first):
-    """Replace Z and slopes in `work` by ∂L/∂(sag, slopes) at the hit, by the chain rule through screen, law and hit.
+    """Replace Z and slopes in `work` by ∂L/∂(sag, slopes in u, v) at the hit, by the chain rule from screen to hit.
 
     d_rays: None, or (6, n), which receives ∂L/∂(position, direction) of rays first … first + count - 1 before the face.
     path (n,): path to the face (mm).

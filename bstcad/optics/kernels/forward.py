@@ -47,7 +47,7 @@ def cosines(offset, count, work):
 
 @njit(error_model="numpy")
 def refract(eta, reflected, count, work):
-    """Refract rays at the slopes in `work` by Snell's law: `interfaces.Refract`."""
+    """Refract rays at the slopes in `work` by Snell's law: `interfaces.Refract`; reflected: status of blocked rays."""
     for r in range(count):
         p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
         dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
@@ -65,7 +65,7 @@ def refract(eta, reflected, count, work):
 
 @njit(error_model="numpy")
 def reflect(turned, count, work):
-    """Reflect rays at the slopes in `work`: `interfaces.Reflect`."""
+    """Reflect rays at the slopes in `work`: `interfaces.Reflect`; turned: status of blocked rays."""
     for r in range(count):
         p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
         dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
@@ -80,7 +80,7 @@ def reflect(turned, count, work):
 
 @njit(error_model="numpy")
 def first_root(net, faces, x, y, z, dx, dy, dz):
-    """Return (s, found): path of a ray steep to the net to its first crossing (interfaces.py); z: above its plane."""
+    """Return (s, found): path (mm) of a ray steep to the net to its first crossing; z: height over the net's plane."""
     last_u, last_v, floor = faces.m - 1.0, faces.n - 1.0, faces.rules.min_derivative
     u, v, u_s, v_s = (x - faces.x) * faces.per_x, (y - faces.y) * faces.per_y, dx * faces.per_x, dy * faces.per_y
     rate = abs(dz) + faces.steepest_x * abs(dx) + faces.steepest_y * abs(dy)
@@ -121,7 +121,7 @@ def start_search(net, faces, count, work):
 
 @njit(error_model="numpy")
 def to_net(faces, count, work):
-    """Move rays to the plane of the net's heights; store u, v there and ∂u/∂s, ∂v/∂s along the ray."""
+    """Move rays to the plane of the net's heights; store the path in Z, u and v, and ∂u/∂s and ∂v/∂s along the ray."""
     for r in range(count):
         dx, dy = work[DX + r], work[DY + r]
         start = (faces.gap - work[Z + r]) / work[DZ + r]
@@ -135,7 +135,7 @@ def to_net(faces, count, work):
 def search(net, faces, count, work, active):
     """Find the path s from the net's plane to the back by Newton steps of all rays in turn: `interfaces._newton`.
 
-    On return `work` holds s after a ray's last step, and sag and slopes (in u and v) before that step.
+    On return `work` contains s after a ray's last step, and sag and slopes (in u and v) before that step.
     """
     last_u, last_v, floor = faces.m - 1.0, faces.n - 1.0, faces.rules.min_derivative
     searching = 0
@@ -169,7 +169,7 @@ def search(net, faces, count, work, active):
 
 @njit(error_model="numpy")
 def at_back(faces, count, work):
-    """Move rays to the back face; lose rays outside its clear aperture, behind their hit or tangent to it."""
+    """Move rays to the back face; lose rays outside its clear aperture, with a hit behind them, or tangent to it."""
     for r in range(count):
         s, dx, dy, dz = work[S + r], work[DX + r], work[DY + r], work[DZ + r]
         x, y = work[X + r] + s * dx, work[Y + r] + s * dy
@@ -218,7 +218,7 @@ def to_screen(faces, tilted, count, work):
 # Length of the ledger: flux by Status (alive: on the screen), flux outside the screen, number of rays, and flux lost at
 # faces and in glass.
 LINES = 9
-BESIDE, COUNT, BY_FACES, BY_GLASS = 5, 6, 7, 8  # indices in the ledger, after those of Status
+BESIDE, COUNT, BY_FACES, BY_GLASS = 5, 6, 7, 8  # indices in the ledger, after those of Status (no ray is BLOCKED)
 RAY_PARTS = 8  # number of partial sums of the rays; each has its own pictures, which take time to clear and to add
 
 
@@ -355,7 +355,7 @@ def _trace(net, beam, faces, tilted, losses, count, work, active):
     to_net(faces, count, work)
     search(net, faces, count, work, active)
     at_back(faces, count, work)
-    if losses.present:  # the direction in the glass is a unit vector: the path is the rise over its z
+    if losses.present:  # the direction in the glass is a unit vector: the path is the rise divided by its z
         for r in range(count):
             rise = faces.gap + work[S + r] * work[DZ + r] - work[PATH + r]
             work[PATH + r] = rise / work[DZ + r]
@@ -479,7 +479,7 @@ def simulate(lights: Sequence[SeededLight], screen: Screen, n: int) -> tuple[Ten
     count = RAY_PARTS
     box, tent, lines = (np.zeros((count, *shape)) for shape in (screen.shape, screen.shape, (LINES,)))
     pixels = kernel_arguments.pixels(screen)
-    many = len(lights) >= count  # each part takes whole lights, otherwise some rows of each light
+    many = len(lights) >= count  # True: a part traces whole lights; False: some rows of each light
 
     def part(c: int) -> None:
         for arguments in scenes[c::count] if many else scenes:

@@ -26,12 +26,12 @@ from bstcad.optics.receivers import Receiver
 
 TRANSMISSION_NODES = 4097  # nodes of a table of a face's transmission
 TABLE_SIDES = 65, 129, 257, 513  # control points per side of a table of light, tried in this order
-IRRADIANCE_TOLERANCE = 1e-5  # largest RMS of a table's relative error in the irradiance, far below any picture's
+IRRADIANCE_TOLERANCE = 1e-5  # largest RMS of a table's relative error in the irradiance, far below those of pictures
 MIN_IRRADIANCE = 1e-4  # irradiance relative to its maximum, below which the error counts relative to this value
 SLOPE_TOLERANCE = 1e-8  # largest RMS of a table's error in the slopes of rays
-PEAK_TO_RMS = 100.0  # largest error of a table / these tolerances: the outermost spans are the least exact
+PEAK_TO_RMS = 100.0  # largest error at a point of a table / RMS tolerance: the outermost spans are least exact
 MAX_LIGHT_TABLES = 16  # tables of light in the cache
-MAX_TABLE_ERROR_RATIO = 0.5  # largest ratio of a table's error to the coarser table's; above: an edge
+MAX_TABLE_ERROR_RATIO = 0.5  # largest ratio of a table's error to the coarser table's; larger: the light has an edge
 
 
 def rules() -> Rules:
@@ -47,8 +47,7 @@ def faces(
     """Return the numbers of a net, of the front before it and the screen behind it, if any, and of the screen's tilt.
 
     The kernels trace light along +z.  If light comes along -z (sense -1), all numbers describe the scene reflected by
-    z -> -z, as the heights and the rays must (crossing.reflect_z).  start: z of the plane that the positions of the
-    rays are measured from (mm).
+    z -> -z, as the heights and the rays must (crossing.reflect_z).  start: `Rays.z` (mm).
     """
     surface, law = interface.net, interface.law
     conic = (front.surface.curvature, front.surface.conic_constant) if front else (0.0, 0.0)
@@ -130,7 +129,7 @@ def _table_of_light(source: Emitter, window: Rectangle, z: float) -> Beam | None
 
 
 def _tilted(plane: Receiver | None, before: int, behind: int) -> records.TiltedScreen | None:
-    """Return a tilted plane as numbers, None for a level one; before, behind: sense of the light at the last face."""
+    """Return a tilted plane as numbers, None for a level one; before, behind: sense of the light at the net."""
     if plane is None or plane.is_level:
         return None
     assert plane.axes is not None  # no kernel traces to other receivers

@@ -20,7 +20,7 @@ def floats(values: Sequence[float | Tensor]) -> tuple[float, ...]:
 
 
 class LightTable(NamedTuple):
-    """Irradiance and slopes of rays on a plane, as splines: flat nets of m x n heights."""
+    """Irradiance and slopes of rays on a plane, as splines: flattened nets of m x n values."""
 
     m: int  # control points along x; 0: no table
     n: int  # control points along y
@@ -37,7 +37,7 @@ NO_TABLE = LightTable(0, 0, 0.0, 0.0, 0.0, 0.0, *3 * (np.zeros(0),))
 
 
 class Beam(NamedTuple):
-    """E = peak exp(-fall r²) / d^power on the plane of the front's vertex, r from (x, y), inside the limits.
+    """E = peak exp(-fall r²) / d^power on the plane of the front's vertex, r from (x, y), d from the source.
 
     The irradiance of a tilted point source is `Point._tilted_irradiance`: peak times c / d^4, 1 / d³ or
     exp(-fall (d² - c²) / c²) / c³ for the powers 4, 3 and 0.  With a table E is peak times the table's irradiance.

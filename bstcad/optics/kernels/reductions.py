@@ -5,8 +5,8 @@ same merit.  So a net or picture to which many rays add is summed in parts whose
 rays; threads compute the parts, and the parts are added in their order.  Neighbouring rays touch only a few rows of the
 net or the picture: a part clears a row when it first touches it, and only touched rows are merged.
 
-BLAS divides products of dense matrices by the number of threads, so they are avoided.  exp, sin and cos may round
-differently for the last few numbers of a thread's part.
+BLAS divides a product of dense matrices among its threads, so such products are avoided.  exp, sin and cos may round
+differently for the last few numbers of a thread's part (`elementary`).
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def _merge(own, touched, out):
 
 
 def shares(n: int, block: int) -> list[tuple[int, int]]:
-    """Return (first, last + 1) of the rays of each part, divided between blocks."""
+    """Return (first, last + 1) of the rays of each part; each part consists of whole blocks."""
     count, blocks = parts(n), -(-n // block)
     ends = [min(n, k * blocks // count * block) for k in range(count + 1)]
     return list(zip(ends, ends[1:], strict=False))

@@ -18,7 +18,7 @@ RAYS_PER_TASK = 4096  # rays per task, whose coordinates and results stay in the
 
 @compiled(parallel=True)
 def _splat(position, flux, frame, image, touched, outside):
-    """Splat rays bilinearly onto pixel centres; image (parts, rows, columns), outside (parts,)."""
+    """Splat rays bilinearly onto pixel centres; image (parts, rows, columns), outside (parts,): as in `Splat`."""
     n = flux.size
     count, rows, columns = image.shape
     share = (n + count - 1) // count
@@ -55,7 +55,7 @@ def _splat(position, flux, frame, image, touched, outside):
 
 @compiled(parallel=True)
 def _splat_adjoint(position, flux, frame, g, g_outside, d_position):
-    """Compute the gradient in the positions from g (rows, columns), in the pixels, and g_outside, in `outside`."""
+    """Compute the gradient in the positions from the gradients g (rows, columns) in the image and g_outside."""
     rows, columns = g.shape
     n = flux.size
     for c in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):

@@ -28,7 +28,7 @@ def _flat(t: Tensor) -> np.ndarray:
 
 
 def net_of(heights: Tensor) -> np.ndarray:
-    """Return the heights for the kernels: flat, float64."""
+    """Return the heights for the kernels: flattened, in float64."""
     return _flat(heights.detach().double())
 
 
@@ -56,7 +56,7 @@ def basis(u, m):
 
 @njit(error_model="numpy", fastmath={"contract"})
 def bend(u, m):
-    """Return d²B_k/du² = d²B_{k+2}/du² = a b r³ / 2 at u (see `basis`)."""
+    """Return d²B_k/du² = d²B_{k+2}/du² = a b r³ / 2 at u, r = 1 / (a q + b s) (see bspline.basis)."""
     if 1.5 <= u <= m - 2.5:
         return 1.0
     k, s = (0, 2.0 - math.sqrt(4.0 - 2.0 * u)) if u < 1.5 else (m - 3, math.sqrt(4.0 - 2.0 * (m - 1 - u)) - 1.0)
@@ -76,7 +76,7 @@ def _row(net, at, b0, b2, q0, q2):
 
 @njit(inline="always")
 def sag(net, m, n, u, v):
-    """Return (h, ∂h/∂u, ∂h/∂v) as sums over differences of neighbouring heights; net (m, n) flat (bspline.evaluate)."""
+    """Return (h, ∂h/∂u, ∂h/∂v) as sums over differences of neighbouring heights; net (m, n) flattened (bspline)."""
     i, a0, a2, p0, p2 = basis(u, m)
     j, b0, b2, q0, q2 = basis(v, n)
     at = np.uint64(i * n + j)  # unsigned, so that no negative index is tested for
@@ -128,7 +128,7 @@ def scatter(own, touched, u, v, g, g_u, g_v):
 
 @njit(error_model="numpy", inline="always")
 def beyond2(x, y, limit_x, limit_y):
-    """Return the left side of `outlines.inside` (mm²), to be compared with r²; NaN for NaN."""
+    """Return max(|x| - a, 0)² + max(|y| - b, 0)² (mm²), at most r² inside `outlines.Limits` (a, b, r²); NaN for NaN."""
     p, q = abs(x) - limit_x, abs(y) - limit_y
     p, q = 0.0 if p < 0.0 else p, 0.0 if q < 0.0 else q
     return p * p + q * q
@@ -168,7 +168,7 @@ def _adjoint_in_places(net, m, n, u, v, g, g_u, g_v, d_u, d_v):
 
 
 def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    """Return the gradient (m, n) of Σ g h + g_u ∂h/∂u + g_v ∂h/∂v at (u, v) in the heights, seeds (g, g_u, g_v)."""
+    """Return the gradient (m, n) of Σ (g h + g_u ∂h/∂u + g_v ∂h/∂v) at (u, v) in the heights; seeds: (g, g_u, g_v)."""
     d_net, touched = reductions.buffers(reductions.parts(u.numel()), *heights.shape)
     _adjoint_in_net(_flat(u), _flat(v), *map(_flat, seeds), d_net, touched)
     return torch.from_numpy(reductions.merged(d_net, touched)).to(heights.dtype)
@@ -207,7 +207,7 @@ ROW_PARTS = 16  # parts of the rows of spans, one per task
 def largest_bending(
     net: np.ndarray, along: Pair, at: Pair, limits: Triple, bounds: Triple
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the maxima (3,), their indices along x and y (3, 2) and the numbers of points at the bounds (3,).
+    """Return the maxima (3,), their indices along x and y (3, 2) and the numbers of points that reach `bounds` (3,).
 
     The three are concave curvature, convex curvature (1/mm) and |∇z|; a curvature is negative if no point is bent that
     way.  net: (m, n) heights (mm).  along: (m - 2, points, 9) weights of a span's three control points in value, first
