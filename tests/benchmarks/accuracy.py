@@ -47,12 +47,12 @@ from tests.benchmarks.mitsuba_caustic import control_net
 RECORDED, PAGE = ROOT / "docs" / "accuracy.json", ROOT / "docs" / "accuracy.md"
 TEXT = Path(__file__).with_name("accuracy.md.j2")
 SCENES = {  # template: what it is
-    "thu": "Letters, off axis, collimated (example 2)",
-    "portrait": "Portrait, point source (example 1)",
+    "thu": "Letters, off axis, collimated (example 2 of Wang et al.)",
+    "portrait": "Portrait, point source (example 1 of Wang et al.)",
     "off_axis": "Portrait, off axis, collimated",
     "mirror": "Portrait on the wall, by a mirror below a lamp",
-    "caustic_portrait": "Portrait, on axis, 100 mm (the peers' case)",
-    "caustic_letters": "Letters, on axis, 100 mm (the peers' case)",
+    "caustic_portrait": "Portrait, on axis, 100 mm (the scene of other programs)",
+    "caustic_letters": "Letters, on axis, 100 mm (the scene of other programs)",
 }
 PEER = "caustic_portrait"  # the scene of Mitsuba's caustic optimisation
 FIGURES = {PEER: "accuracy.png", "thu": "accuracy-letters.png"}  # names of the figures in docs/, by sweep

@@ -22,7 +22,7 @@ SIZE = ("lens.back.control_points=129", "target.pixels=256", "tailoring.quality=
 NONE = "none"
 EFFECTS = {  # name: settings of the scene
     NONE: (),
-    "none, once more": (),
+    "none, repeated": (),
     "fresnel": ('effects=[{kind="fresnel"}]',),
     "fresnel, coated": ('effects=[{kind="fresnel",coating={index=1.38,thickness=110.0}}]',),
     "absorption": ('effects=[{kind="absorption",coefficient=0.001}]',),
@@ -60,7 +60,7 @@ def main() -> None:
     machine = reports[NONE]["machine"]
     rounds = "One round" if wanted.runs == 1 else f"{wanted.runs} rounds"
     said = f"{rounds} on {machine['processor']}, {machine['cores']} cores."
-    head = ("effect", "CPU time over that without", "CPU seconds", "RRMSD")
+    head = ("effect", "CPU time, relative to none", "CPU seconds", "RRMSD")
     markdown.write(wanted.output, "<!-- made by make effects -->", f"{said}\n\n{markdown.table(head, rows)}")
 
 

@@ -129,7 +129,7 @@ DESIGNS: dict[str, Hard] = {
                                 bench=True),
     "target 50 m behind": Hard("disk", _size(20_000.0, **{"target.z": 50_020.0}), bench=True),
     "deflection of 33 to 38 degrees": Hard("thu", _aside(600.0), rrmsd=0.2, says=(MISSED, CLOSE, LIFTED)),
-    "deflection no face can make": Hard(
+    "deflection that no face can make": Hard(
         "thu", _aside(1500.0),
         refused="target: no light reaches the target, as a face of index 1.488 deflects light by at most 47.8",
     ),
@@ -140,7 +140,7 @@ DESIGNS: dict[str, Hard] = {
         "disk", {**_PICTURE, "lens.index": 1.05}, rrmsd=0.19, efficiency=0.95, rough={"tailoring.rounds": 3},
         says=(CHANGED, MISSED, MISSES, SIDES), perhaps=(OUTSIDE, "would need a face steeper"),
     ),
-    "index 1.05, a target it cannot reach": Hard(  # without a surface for it each round ends elsewhere
+    "index 1.05, a target that light cannot reach": Hard(  # without a surface for it each round ends elsewhere
         "disk", {"lens.index": 1.05}, rrmsd=0.6, efficiency=0.9, rough={"tailoring.rounds": 3},
         says=(MOVED, MISSED, MISSES, SIDES, OUTSIDE, LIFTED), perhaps=(CLOSE, STEEP, DARK), bench=True,
     ),
@@ -168,7 +168,7 @@ DESIGNS: dict[str, Hard] = {
                            **{"tailoring.solution": "convex"}),
         refused="of the light would have to cross between the lens and the nearest target",
     ),
-    "two faces, more than a front can turn": Hard(
+    "two faces, a deflection that no front can make": Hard(
         "disk", _two_faces(6.0, _even(150.0, 9.0), width=24.0, wavefront={"kind": "plane", "z": 150.0}), rrmsd=2.0,
         efficiency=0.95, told=(IN_GLASS,), says=(MISSED, DARK, "face steeper than"),
         perhaps=(CHANGED, OUTSIDE, CLOSE, LIFTED, STEEP, "The facets of"), bench=True,
@@ -191,12 +191,13 @@ def overrides(name: str, folder: Path, more: Mapping[str, Any]) -> tuple[Path, d
 
 
 HEAD = (
-    "design", "exit", "RRMSD", "standard error", "efficiency", "margin to reflection", "thinnest", "steepest", "time",
+    "design", "exit code", "RRMSD", "standard error", "efficiency", "margin to total reflection", "smallest thickness",
+    "steepest slope", "time",
 )  # fmt: skip
 
 
 def designed(name: str, folder: Path, quality: str) -> tuple[list[str], str]:
-    """A row of the table, and what the report says in words."""
+    """Return a row of the table, and the remarks of the report, as links, or the message of a refusal."""
     pictures, design = folder / "pictures", DESIGNS[name]
     pictures.mkdir(exist_ok=True)
     pixels = SIDE if design.picture else 128
@@ -210,7 +211,8 @@ def designed(name: str, folder: Path, quality: str) -> tuple[list[str], str]:
     rrmsd = report["rrmsd"]
     shape, margin = report["shape"], report.get("stability", {}).get("tir_margin_deg")
     failed = [c["name"] for c in report["checks"] if not c["passed"] and not c["name"].startswith("RRMSD")]
-    said = " ".join([*report["given_up"], *(f"Failed: {name}." for name in failed)])
+    remarks = [f"[{id}](reference/remarks.md#remark-{id})" for id in dict.fromkeys(report["remarks"])]
+    said = ", ".join([*remarks, *(f"failed: {name}" for name in failed)]) or "none"
     return [
         name, str(run.code), f"{rrmsd:.4f}", f"{report['rrmsd_noise']:.1e}", f"{report['efficiency']:.4f}",
         "" if margin is None else f"{margin:.2f}°", f"{shape['thickness_min']:.2f} mm",
@@ -240,7 +242,7 @@ def main() -> None:
             rows.append(cells)
             words.append(f"- {name}: {said}")
             print(markdown.row(cells), flush=True)
-    content = [markdown.table(HEAD, rows), "", "Remarks of their reports:", "", *words]
+    content = [markdown.table(HEAD, rows), "", "Remarks of their reports, or the message of a refusal:", "", *words]
     markdown.write(wanted.page, "<!-- figures: designs -->", "\n".join(content))
 
 

@@ -167,4 +167,4 @@ def test_the_surface_is_not_evaluated_for_20_164_rays_because_of_one(way, dtype,
             asked.append(0)
             through_back(each, lens, Z)
     assert asked[0] >= 4 * rays.flux.numel()  # it is Newton's method that was counted
-    holds("ray evaluations with one miss among 20 164 rays, divided by those without", asked[1] / asked[0], 1.01)
+    holds("surface evaluations for 20 164 rays with one miss, relative to no miss", asked[1] / asked[0], 1.01)

@@ -1,4 +1,4 @@
-"""2. Incidence at the critical angle, beside it by 1e-2 to 1e-8 rad, and exactly at it.
+"""2. Incidence exactly at the critical angle, and 1e-2 to 1e-8 rad from it.
 
 The derivative of refraction grows without bound towards the critical angle.  DiffOptics clamps the square under the
 root at 1e-8 and loses the gradient of every ray below that; elsewhere it is infinite (mitsuba3 #279).  Here the
@@ -63,7 +63,7 @@ def test_flag_and_direction(offset, dtype, holds):
     holds(f"length of the direction minus 1, {NAMES[dtype]}", error, 4 * eps(dtype))
     if after.alive[0]:
         height = float(after.direction[2].detach())  # cos θ'; its square is off by some units
-        holds(f"cos² θ' against sixty digits, {NAMES[dtype]}", abs(height**2 - float(truth)), 4 * eps(dtype))
+        holds(f"error of cos² θ', against 60 digits, {NAMES[dtype]}", abs(height**2 - float(truth)), 4 * eps(dtype))
     assert torch.equal(after.flux, rays.flux)
 
 
@@ -79,7 +79,7 @@ def test_the_gradient_is_the_derivative_up_to_its_cap(offset, dtype, holds):
     assert all(torch.isfinite(g).all() for g in everything)
     cap = N * N / MIN_COS_REFRACTION
     # a slope turns the normal by less than itself, and the normal enters with η cos θ and cos θ' besides: 4 η
-    holds(f"largest derivative, {NAMES[dtype]}", max(largest(g) for g in everything), 2 * cap + 4 * N)
+    holds(f"largest derivative of the direction, {NAMES[dtype]}", max(largest(g) for g in everything), 2 * cap + 4 * N)
     if not after.alive[0]:
         assert not any(g.any() for g in everything)
         return
@@ -87,7 +87,7 @@ def test_the_gradient_is_the_derivative_up_to_its_cap(offset, dtype, holds):
     expected = N * N * float(way[2].detach()) / max(cosine, MIN_COS_REFRACTION)
     # cos² is known to 2 units, and the derivative is divided by its root: relative 1 / max(cos², MIN_COS_REFRACTION²)
     error = abs(float(g_way[2]) / expected - 1) * max(cosine, MIN_COS_REFRACTION) ** 2
-    holds(f"relative error of the derivative, times cos² θ', {NAMES[dtype]}", error, 4 * eps(dtype))
+    holds(f"relative error of ∂ cos θ' / ∂ cos θ, times cos² θ', {NAMES[dtype]}", error, 4 * eps(dtype))
 
 
 def near_critical(back: BSplineSurface, n: int, spread: float) -> Rays:
@@ -122,12 +122,12 @@ def test_the_back_face_keeps_to_the_same_rule_in_every_form(spread, holds):
     # per ray: a slope turns d' by at most 2 η² / MIN_COS_REFRACTION, and the landing moves by throw / ez² < 1e3 / 0.1²
     # of that angle; a control point acts on two slopes, by less than 2 / pitch each
     bound = 2 * N * N / MIN_COS_REFRACTION * 1e5 * 2 * 2 / back.pitch[0]
-    holds("gradient of a landing by a control point, relative to its bound", max(gradients) / bound, 1.0)
+    holds("derivative of a landing point by a control point, relative to its bound", max(gradients) / bound, 1.0)
     if spread == 1e-5:  # where the cap sets in; nearer the angle one form reflects other rays than the other
         (status, plain), (other, fused) = found["plain"], found["fused"]
         assert torch.equal(status, other)
         # cos θ' > MIN_COS_REFRACTION is known to 1e-16 / MIN_COS_REFRACTION², and below that it hardly counts
-        figure = "fused gradient against plain torch at the angle, float64"
+        figure = "difference between fused and plain gradient at the critical angle, float64"
         bound = 100 * eps(plain.dtype) / MIN_COS_REFRACTION**2
         holds(figure, largest(plain - fused) / largest(plain), bound)
 
@@ -150,7 +150,7 @@ def test_tubes_across_the_angle(dtype, holds):
     assert whole - 1e-3 <= leaves <= border + 1e-3
     picture, outside = sheet.collect(corners, screen)
     won = abs(float(picture.detach().sum()) - whole)
-    holds("light that tubes across the angle lose or gain", won, n * eps(torch.float64))
+    holds("light that tubes across the critical angle lose or gain", won, n * eps(torch.float64))
     (g,) = torch.autograd.grad(picture.square().sum() + outside, lens.back.heights)
     assert torch.isfinite(g).all()
-    holds("sum of the ledger across the angle, minus 1", abs(sum(told.values()) - 1), 400 * eps(torch.float64))
+    holds("sum of the ledger across the critical angle, minus 1", abs(sum(told.values()) - 1), 400 * eps(torch.float64))

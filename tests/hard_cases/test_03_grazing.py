@@ -71,7 +71,7 @@ def test_a_ray_beside_a_ball_hits_or_passes(offset, degrees, dtype, holds):
     x, y, z = places(at)[:, 0].tolist()
     error = abs(math.hypot(x, y, z - 15.0 - R) - R)
     # cos² is a difference; a path is known to its square root, and the hit leaves the ball by cos times that
-    holds(f"distance of a grazing hit from the ball, {NAMES[dtype]}", error, 16 * R * eps(dtype), "mm")
+    holds(f"distance of a grazing hit from the sphere, {NAMES[dtype]}", error, 16 * R * eps(dtype), "mm")
     inside = deflect(at, z_x, z_y, Refract(1.0, N)).rays
     normal = torch.stack([-z_x, -z_y, torch.ones_like(z_x)])
     before, behind = ((b.direction * normal).sum(0) for b in (at, inside))
@@ -97,7 +97,7 @@ def test_along_the_axis_at_the_equator(curvature, dtype, holds):
     turned = torch.asin(sine / N) - torch.asin(sine)
     off = (inside.direction[0, at].double() - torch.sin(turned)).abs()
     # cos² is known to some units, so the angle to units over the cosine
-    figure = f"error of the refraction near the equator, times the cosine, {NAMES[dtype]}"
+    figure = f"error of the direction refracted near a sphere's equator, times the cosine of incidence, {NAMES[dtype]}"
     holds(figure, largest(off * cosine), 8 * eps(dtype))
     if dtype == torch.float64:
         found = forward.land(Collimated(Circle(30.0)), lens, LevelPlane(300.0), radius, torch.zeros_like(radius))

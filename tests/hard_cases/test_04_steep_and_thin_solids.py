@@ -90,9 +90,9 @@ def test_the_solid_is_valid_and_its_face_is_the_designed_one(holds, written):
     lens = replace(written.lens, back=written.lens.back.to(torch.float64))
     found = {check.id: check for check in step_checks.check(written.path, lens, 1e-9, 1 << 14)}
     assert all(check.passed for check in found.values()), found
-    holds("deviation of the face of the re-read solid", found["form"].value, 1e-9, "mm")
-    holds("deviation of the normals of the re-read solid", found["normals"].value, 1e-9, "rad")
-    holds("gaps bridged by edges", found["gaps"].value, 5e-7, "mm")
+    holds("deviation of the back of the solid as read again", found["form"].value, 1e-9, "mm")
+    holds("deviation of its normals", found["normals"].value, 1e-9, "rad")
+    holds("largest gap at an edge", found["gaps"].value, 5e-7, "mm")
 
 
 def test_a_parser_that_is_not_occ_finds_the_same_net_and_each_edge_twice(holds, written):

@@ -1,4 +1,4 @@
-"""5. Two roots, a start behind the surface, a negative residual.
+"""5. Rays that cross a face twice, or only behind their start.
 
 A line may meet a face twice or more, or behind its start.  Newton's method takes whichever root it falls into (rayx
 #467), a closed form the one its sign was written for (DeepLens #66), and a hit behind the start is taken for one ahead

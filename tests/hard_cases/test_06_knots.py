@@ -1,4 +1,4 @@
-"""6. On a knot and one rounding beside it, in a corner, outside the net.
+"""6. Points on a knot, one rounding beside it, in a corner and outside the net.
 
 At a knot the formula changes, and a rounding decides which side is taken: scipy (#20888) gave the last knot to a span
 that is not there, NURBS.jl (#9) read past the end of its net.  Here the three formulas of t(u) meet at the knots with
@@ -51,8 +51,8 @@ def test_the_basis_is_one_altogether(m, dtype, holds):
     assert bool(((k >= 0) & (k <= m - 3)).all())
     assert min(float(w.min()) for w in weights) >= 0.0
     # three numbers that are added: one unit; slopes of at most 2, so two
-    holds(f"sum of the basis minus 1, {NAMES[dtype]}", largest(sum(weights) - 1), eps(dtype))
-    holds(f"sum of the derivatives, {NAMES[dtype]}", largest(sum(slopes)), 2 * eps(dtype))
+    holds(f"sum of the basis functions, minus 1, {NAMES[dtype]}", largest(sum(weights) - 1), eps(dtype))
+    holds(f"sum of the basis functions' derivatives, {NAMES[dtype]}", largest(sum(slopes)), 2 * eps(dtype))
     abscissa = sum((k + i).to(dtype) * w for i, w in enumerate(weights))
     # t is known to the unit of m, and so is what is summed
     figure = f"x(t(x)) minus x, relative to the width of the net, {NAMES[dtype]}"
@@ -73,7 +73,7 @@ def test_value_and_slope_go_on_across_every_knot(m, dtype, evaluate, holds):
         # net within ±1: slopes up to 2, second derivatives up to 16 (in the end spans); 8 units of a sum of nine
         for value, rate in ((h, 4.0), (h_u, 32.0), (h_v, 32.0)):
             jump = (value[1:] - value[:-1]).abs() - rate * step
-            figure = f"jump across a knot beyond what the curvature allows, {NAMES[dtype]}"
+            figure = f"jump of height or slope across a knot, beyond what the curvature explains, {NAMES[dtype]}"
             holds(figure, float(jump.max()), 8 * eps(dtype))
 
 

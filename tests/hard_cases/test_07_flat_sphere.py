@@ -57,7 +57,7 @@ def test_sag_and_slope_have_all_their_digits(curvature, dtype, holds):
     h, z_x, z_y = Sphere(15.0, curvature).relative_sag_and_slope(x, y)
     truth = [exact_sag(curvature, a, b) for a, b in zip(x.tolist(), y.tolist(), strict=True)]
     sag = torch.tensor([float(abs(exact.number(a) - b[0])) for a, b in zip(h.tolist(), truth, strict=True)])
-    holds(f"error of the sag to 14 mm from the axis, {NAMES[dtype]}", float(sag.max()), BOUND[dtype], "mm")
+    holds(f"error of the sag, up to 14 mm from the axis, {NAMES[dtype]}", float(sag.max()), BOUND[dtype], "mm")
     size = torch.tensor([float(abs(b[0])) for b in truth])
     relative = (sag / size.clamp(min=1e-300))[size > 1e-30]
     # eight operations, of which the root halves what is before it: relative to the sag itself, however small

@@ -90,7 +90,7 @@ def test_a_landing_is_wrong_by_the_last_digits_of_an_angle(kind, throw, distance
         for _, landed in engines(source, lens, x, y, z):
             assert landed.alive.all()
             error, bound = off(landed.position, truth), UNITS * unit(lens, throw, dtype)
-            figure = f"landing error, relative to the shift by half a unit in the last place, {NAMES[dtype]}"
+            figure = f"landing error, divided by the shift due to rounding in the last place, {NAMES[dtype]}"
             holds(figure, error / bound * UNITS, UNITS)
             if throw in (0.1, 1e3, 1e7) and distance == 15.0:
                 holds(f"landing error, throw {throw:g} mm, {NAMES[dtype]}", error, bound, "mm")

@@ -92,7 +92,7 @@ def test_tubes_cut_by_a_border_leave_no_light_beside(holds, compiled):
     lit[1:3, 1:3] = True
     bound = 6 * 2 * n / width * ROUND
     error, dark = float((4 * image[lit] / n**2 - 1).abs().max()), float(image[~lit].abs().max()) / n**2
-    holds("tubes cut by a pixel border: error in their own pixels", error, bound)
+    holds("tubes cut by a pixel border: relative error of the flux in their pixels", error, bound)
     holds("tubes cut by a pixel border: light in dark pixels", dark, bound, "of the light")
 
 

@@ -1,4 +1,4 @@
-"""10. Other chunks, other numbers of threads, compiled or not.
+"""10. Rays divided into other parts, other numbers of threads, compiled or plain.
 
 optiland #739: 1 W became 1.405 W when rays were traced in batches.  And where each thread has a sum of its own, the
 last bit depends on the number of threads, which a line search turns into another lens.  Here the number of parts of a
@@ -172,10 +172,10 @@ def test_strips_and_bands(holds, monkeypatch):
         found = by_rays(simulated_plain(SOURCE, lens(), SCREEN, RAYS, 0))
         found |= {"image, tubes": tubes.picture(SOURCE, lens(), SCREEN, TUBES)}
         for name, image in found.items():
-            figure = "other bands of tubes: image" if name == "image, tubes" else f"other strips: {name}"
+            figure = "tubes in other bands: image" if name == "image, tubes" else f"rays in other strips: {name}"
             holds(figure, apart(name, image, images.setdefault(name, image)), 1e-12)
     whole, again = (float(pictures["image, tubes"].sum()) for pictures in (images, found))
-    holds("other bands of tubes: flux", abs(again / whole - 1), 1e-12)
+    holds("tubes in other bands: flux", abs(again / whole - 1), 1e-12)
 
 
 # float64: sums in another order, and a hit found to 1e-13 mm by the one and a step better by the other.
@@ -192,7 +192,7 @@ def test_compiled_or_not(holds, monkeypatch, dtype):
     monkeypatch.setattr(ops, "ENABLED", False)
     for name, found in image_and_gradient(dtype).items():
         bound = (JUMPS if name == "gradient, rays" else AGREE)[dtype]
-        holds(f"compiled or plain, {str(dtype)[6:]}: {name}", apart(name, found, wanted[name]), bound)
+        holds(f"compiled against plain, {str(dtype)[6:]}: {name}", apart(name, found, wanted[name]), bound)
 
 
 # --- the design itself ------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""11. Light off the screen, lost through the sides, past the lens, totally reflected.
+"""11. Light beside the screen, through the sides, past the lens, totally reflected.
 
 DiffOptics' caustic example clamps pixel indices, so that light beside the screen piles up on its border pixels and the
 optimiser pulls at it; optiland #870 lost rays without saying so.  Here every ray ends in one line of a ledger that is
@@ -93,11 +93,11 @@ def test_every_ray_is_in_its_line(holds, dtype):
     wanted = counted(rays, SMALL)
     assert all(value > 0.003 for value in wanted.values()), wanted  # none of the lines is empty
     found = irradiance.ledger(rays, SMALL)
-    holds("a line of the ledger against the sum over its rays", wrong(found, wanted), 1e-12)
+    holds("difference between a line of the ledger and the sum over its rays", wrong(found, wanted), 1e-12)
     closure = abs(math.fsum(found.values()) - math.fsum(rays.flux.double().tolist()))
-    holds("ledger: its sum against the light that was launched", closure, 1e-12)
+    holds("difference between the ledger's sum and the launched light", closure, 1e-12)
     off = abs(found["on target"] - float(irradiance.box(rays, SMALL).sum()))
-    holds("ledger: on target against the picture", off, 1e-12)
+    holds("difference between the ledger's light on the target and the picture's", off, 1e-12)
 
 
 @FORMS
@@ -106,8 +106,8 @@ def test_the_ledger_of_a_simulation(holds, form):
     found, rays = form(SOURCE, lens(), SMALL, RAYS, 0), traced(torch.float64)
     wanted = counted(rays, SMALL)
     wanted["missed the lens"] += 1 - math.fsum(wanted.values())
-    holds("a line of the ledger against the sum over its rays", wrong(found.flux, wanted), 1e-12)
-    holds("ledger of a simulation: distance of its sum from 1", abs(math.fsum(found.flux.values()) - 1), 1e-12)
+    holds("difference between a line of the ledger and the sum over its rays", wrong(found.flux, wanted), 1e-12)
+    holds("sum of the ledger of a simulation, minus 1", abs(math.fsum(found.flux.values()) - 1), 1e-12)
 
 
 PICTURES = {
@@ -125,7 +125,7 @@ def test_nothing_is_piled_on_the_border(holds, monkeypatch, light, form):
     small, large = (PICTURES[light](screen, form) for screen in (SMALL, LARGE))
     assert float(large.sum()) > 1.1 * float(small.sum())  # light does leave the small screen
     piled = (border(small) - border(cut(large))).abs().max()
-    figure = f"border pixels against a larger screen, {light.split(',')[0]}"
+    figure = f"difference of border pixels from those of a larger screen, {light.split(',')[0]}"
     holds(figure, float(piled / small.max()), 1e-12, "of the brightest")
 
 

@@ -86,7 +86,7 @@ def test_the_error_of_rays_falls_with_its_power(holds, name, rays, form, power, 
         found = [rrmsd(rays(form, n, seed, dtype), wanted) for seed in range(SEEDS)]
         errors.append(float(sum(e**2 for e in found) / SEEDS) ** 0.5)
     off = abs(slope(errors, [n * n for n in sides]) - power)
-    holds(f"slope of the error of {name} rays, distance from {power:g}", off, 0.02 if name == "random" else 0.04)
+    holds(f"exponent of the error of {name} rays, distance from {power:g}", off, 0.02 if name == "random" else 0.04)
 
 
 def light(target: torch.Tensor) -> Light:
@@ -111,4 +111,4 @@ def test_a_figure_is_right_where_it_is_resolved_and_fails_where_not(holds, share
     assert (found.rrmsd < checks.RESOLVED * found.standard_error) is (share == 0.0)
     if share:
         assert size == pytest.approx(share, rel=0.1)
-        holds("a resolved RRMSD against the true one", abs(found.rrmsd / size - 1), 1 / 50, "of it")
+        holds("error of a resolved RRMSD", abs(found.rrmsd / size - 1), 1 / 50, "of it")

@@ -1,4 +1,4 @@
-"""14. Killed, interrupted, starved of disk, fed with values that are not finite.
+"""14. Killed and interrupted runs, full disks, values that are not finite.
 
 Checkpoints that are written in place are lost with the process that writes them (Lightning #688), and a design that
 goes on from one is often another design (the minimiser's memory is left out).  Here a checkpoint changes places in
@@ -134,7 +134,7 @@ def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(tmp_path, monkey
     assert cli.run(["generate", str(scene), "-o", str(folder), "--resume"]) in (0, 1)
     found, whole = (np.load(place / "design.npz")["control_points"] for place in (folder, small_design.folder))
     off = float(np.abs(found - whole).max())
-    holds("resumed after Ctrl-C against the undisturbed run, control points", off, 0.0, "mm")
+    holds("difference of control points between a resumed and an undisturbed design", off, 0.0, "mm")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["lens", "small.toml"]
 
 
@@ -203,4 +203,4 @@ def test_a_gradient_that_is_not_finite_is_counted_and_left_out(bad, small_scene,
     assert found.making.skipped_steps == 2 and small_design.report["skipped_steps"] == 0
     assert bool(torch.isfinite(found.lens.back.heights).all())
     ratio = found.making.history[-1].rrmsd / small_design.report["history"][-1]["rrmsd"]
-    holds("RRMSD with two gradients not finite, over that without", ratio, 1.5)
+    holds("RRMSD with two gradients that are not finite, divided by that without", ratio, 1.5)

@@ -1,4 +1,4 @@
-"""14. Truncated, hostile or huge input.
+"""15. Truncated, hostile and huge files.
 
 Here a folder that somebody sent: claims, bombs and holes of gigabytes, each found before memory is spent; an earlier
 report that says anything; pipes, devices and links, and names that would lead out of the folder that is written.
@@ -123,7 +123,7 @@ FILES = {  # changes of a file of the folder, and the sentence of the refusal
 def test_a_file_that_is_or_claims_or_unfolds_to_gigabytes_is_not_read(quick_folder, refused, file):
     change, sentence = FILES[file]
     change(quick_folder)
-    refused(lambda: commands.verify(quick_folder), sentence, "a file of gigabytes, or that claims them")
+    refused(lambda: commands.verify(quick_folder), sentence, "a file of gigabytes, or whose header claims gigabytes")
 
 
 def tiff(tile):
@@ -164,7 +164,7 @@ PICTURES = {
 def test_a_picture_that_claims_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, picture, refused):
     make, sentence = PICTURES[picture]
     (tmp_path / "p").write_bytes(make())
-    refused(lambda: read_picture(tmp_path / "p"), sentence, "pictures that claim millions of pixels")
+    refused(lambda: read_picture(tmp_path / "p"), sentence, "pictures whose headers claim millions of pixels")
 
 
 # ---- report.json, which an earlier run may have left, or anybody -----------------------------------------------------
@@ -250,7 +250,7 @@ def test_a_report_is_not_written_through_links_and_a_title_is_no_markup(quick_fo
     (quick_folder / ".report.json.new").symlink_to(victim)
     commands.verify(quick_folder, options=ProofOptions(drawing=flat_pictures()))
     assert victim.read_text() == "mine" and not (quick_folder / "report.json").is_symlink()
-    holds("a folder from somebody else: files written outside it", len(list(elsewhere.iterdir())), 0)
+    holds("a folder of a stranger: files written outside it", len(list(elsewhere.iterdir())), 0)
     assert list((quick_folder / "figures").iterdir())
     page = (quick_folder / "report.html").read_text()
     assert "<script>alert" not in page and "&lt;script&gt;alert" in page

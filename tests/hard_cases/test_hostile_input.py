@@ -1,4 +1,4 @@
-"""14. Truncated, hostile or huge input.
+"""15. Truncated, hostile and huge files.
 
 Readers get wrong input by the hundred (fuzz.py), and texts that drive patterns which backtrack into hours.  An answer
 is a sane result or one sentence, at once and within bounds of memory; nothing is written or started.
@@ -153,8 +153,8 @@ def test_wrong_input_is_one_sentence(reader, count, small_step, tmp_path, seen, 
     assert ends["passed"] > LEAST_PASSED * count and len(ends) > ways, ends
     assert capfd.readouterr() == ("", "")  # no decoder or library said anything of its own
     holds(f"{reader}: files written", len(seen), 0)
-    holds(f"{reader}: slowest of {count} wrong inputs (an indication)", slowest, SECONDS, "s")
-    holds(f"{reader}: memory above the libraries'", memory("VmHWM") - before, MEGABYTES / 2, "MB")
+    holds(f"{reader}: slowest of {count} damaged inputs (an indication)", slowest, SECONDS, "s")
+    holds(f"{reader}: memory besides that of the libraries", memory("VmHWM") - before, MEGABYTES / 2, "MB")
 
 
 # ---- texts that drive patterns ---------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""14. Truncated, hostile or huge input.
+"""15. Truncated, hostile and huge files.
 
 Here the STEP file of a design that `verify` is asked about: damaged by a hair or by half.  OCC reads in its own
 process, as the program has it do, so that what ends that process does not end the test.
