@@ -39,7 +39,7 @@ WHOLE_PATHS = [("net", True)], [("revolved", False), ("net", False)]
 
 
 def kernel(name: str, *tensors: Tensor) -> Callable[..., Any] | None:
-    """Return the kernel of a function for tensors of one device and dtype; None if only the plain form exists."""
+    """Return the kernel of a function for these tensors (of one device and one of DTYPES); None: use the plain form."""
     device, dtype = tensors[0].device.type, tensors[0].dtype
     found = KERNELS[name].get(device) if ENABLED else None
     if found is None or dtype not in DTYPES or any(t.device.type != device or t.dtype != dtype for t in tensors):

@@ -113,7 +113,7 @@ def is_transmitted(rays: Rays, lens: Lens) -> Tensor:
 
 
 def window(source: Emitter, lens: Lens) -> Rectangle:
-    """Return the rectangle that all useful light crosses on the plane z = const through the first surface's vertex."""
+    """Return the rectangle, on the plane z = const of the first vertex, crossed by all light that can meet the lens."""
     first, aperture = lens.entrance, lens.interfaces[0].outline
     area = source.window(aperture, first.z, first.sags(aperture))
     if not lens.before:

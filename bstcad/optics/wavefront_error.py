@@ -190,7 +190,7 @@ def residual(pupil: ExitPupil, wave: Wave, nm: float) -> Tensor:
 
 
 def _compare(pupil: ExitPupil, wave: Wave, nm: float) -> tuple[Tensor, Tensor, _Fit, Tensor]:
-    """Return (compared rays (n, n); for these: OPD without piston in mm, its plane fit, flux divided by their sum)."""
+    """Return (compared rays (n, n); for these: OPD without piston in mm, its plane fit, flux divided by its sum)."""
     compared = pupil.alive & wave.contains(pupil.x, pupil.y)
     if int(compared.sum()) < 3:
         raise ValueError(f"no light reaches the goal wave on the plane z = {wave.z:g} mm; change z or the circle")

@@ -269,7 +269,7 @@ def _density(sums, thinnest, a, b, c, flux):
 def _add_row(sums, thinnest, corner, flux, k, upper):
     """Add row k of tubes and the edges between it and the row before, whose densities `upper` (m,) contains.
 
-    Corners 0 and 3 of a tube lie in row k, 1 and 2 in row k + 1; the tube before shares 0 and 1.  Its triangles are 012
+    Corners 0 and 3 of a tube lie in row k, 1 and 2 in row k + 1; the tube before shares 0 and 1.  The triangles are 012
     and 023, or 013 and 123 where the diagonal runs the other way.  Returns Σ flux · (mean square of the corners'
     distance outside the border), and stores in `upper` the densities for the next row.
     """
@@ -494,7 +494,7 @@ def _add_rest_of_row(g, corner, flux, k, flags, g_far, d_corner, d_flux):
 
 @compiled(parallel=True)
 def clip_adjoint(corner, flux, thinnest, g, below_g, g_far, d_corner, d_flux):
-    """Add the gradient in the corners to d_corner, and store the gradient in the flux in d_flux (n, m) or (0, 0).
+    """Add the gradient in the corners to d_corner; store that in the flux in d_flux (n, m), unless it is (0, 0).
 
     g (columns, rows), below_g (columns, rows + 1).  The even strips of rows of tubes are computed first, then the odd
     ones, so that no two threads write one corner.

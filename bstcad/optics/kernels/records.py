@@ -37,7 +37,7 @@ NO_TABLE = LightTable(0, 0, 0.0, 0.0, 0.0, 0.0, *3 * (np.zeros(0),))
 
 
 class Beam(NamedTuple):
-    """E = peak exp(-fall r²) / d^power on the plane of the front's vertex, r from (x, y), d from the source.
+    """E = peak exp(-fall r²) / d^power on the plane of the front's vertex; r: distance from (x, y), d: from the source.
 
     The irradiance of a tilted point source is `Point._tilted_irradiance`: peak times c / d^4, 1 / d³ or
     exp(-fall (d² - c²) / c²) / c³ for the powers 4, 3 and 0.  With a table E is peak times the table's irradiance.

@@ -55,7 +55,7 @@ def _splat(position, flux, frame, image, touched, outside):
 
 @compiled(parallel=True)
 def _splat_adjoint(position, flux, frame, g, g_outside, d_position):
-    """Compute the gradient in the positions from the gradients g (rows, columns) in the image and g_outside."""
+    """Compute the gradient in the positions from the gradients g (rows, columns) in image and g_outside in outside."""
     rows, columns = g.shape
     n = flux.size
     for c in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):
