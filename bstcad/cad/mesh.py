@@ -5,7 +5,7 @@ The chordal error falls with the square of the node spacing; the grid is refined
 
 Files: STL, which states no unit (its user must set mm), 3MF, which states millimetres, and previews for web pages and
 slicers.  CPU seconds for two million triangles, with those of this module in parentheses: trimesh writes STL in 2
-(0.3), reads it in 8 (1) and finds in 2 that it is closed (0.7); lib3mf writes 3MF in 2.3 (2.5, always equal bytes).
+(0.3), reads it in 8 (1) and tests in 2 (0.7) whether it is closed; lib3mf writes 3MF in 2.3 (2.5).
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ MIN_MESH_CELLS = 16  # smallest number of grid cells per side
 DEFAULT_MAX_TRIANGLES = 2_000_000  # largest number of triangles by default: 100 MB of STL
 MAX_TRIANGLES = 32_000_000  # largest number of triangles if a scene states a tolerance: 1.6 GB of STL
 GOAL_FRACTION = 0.95  # goal of the chordal error, as a fraction of the tolerance, because float32 rounds vertices
-CELL_MARGIN = 1.1  # ratio of estimated to allowed cells above which no finer mesh is tried; estimates have errors
+CELL_MARGIN = 1.1  # ratio of estimated to allowed cells per side above which no finer mesh is tried; estimates err
 WALL_NORMAL_Z = 1e-6  # largest |z| of the unit normal of a facet of the wall
 MAX_FACET_SAMPLES = 100_000_000  # largest number of points at which the facets of a mesh are compared with the lens
-FACETS_PER_BLOCK = 1 << 15  # facets processed at a time, so that their corners stay in the cache
+FACETS_PER_BLOCK = 1 << 15  # number of facets processed at a time, so that their corners stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Mesh:
     faces: np.ndarray  # indices of the vertices of each triangle, (k, 3), int32
 
     def facets(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield corners (n, 3, 3) and normals (n, 3), whose length is twice the area, FACETS_PER_BLOCK at a time."""
+        """Yield corners (n, 3, 3) and normals (n, 3; length: twice the area) of facets, FACETS_PER_BLOCK at a time."""
         for first in range(0, len(self.faces), FACETS_PER_BLOCK):
             corners = self.vertices[self.faces[first : first + FACETS_PER_BLOCK]]
             yield corners, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -106,7 +106,7 @@ def nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _triangles(grid: np.ndarray, rising: np.ndarray) -> np.ndarray:
-    """Return two triangles per cell, (2 n², 3), counterclockwise.  rising (n, n): see `_diagonals`."""
+    """Return the nodes of two triangles per cell, (2 n², 3), counterclockwise.  rising (n, n): see `_diagonals`."""
     a, b, c, d = _cell_corners(grid)
     rising = rising[..., None]
     first = np.where(rising, np.stack([a, b, c], axis=-1), np.stack([a, b, d], axis=-1))
@@ -161,8 +161,8 @@ def _has_plane_front(lens: Lens) -> bool:
 def fit_mesh(lens: Lens, tolerance: float, max_triangles: int | None = None) -> tuple[int, Mesh]:
     """Return nearly the smallest number of cells per side that meets a chordal tolerance (mm), and the mesh.
 
-    If `max_triangles` (default DEFAULT_MAX_TRIANGLES) do not suffice, the finest mesh of at most that many triangles is
-    returned, but of at most DEFAULT_MAX_TRIANGLES.
+    If `max_triangles` (None: DEFAULT_MAX_TRIANGLES) do not suffice, the finest mesh with at most this number of
+    triangles, and at most DEFAULT_MAX_TRIANGLES, is returned.
     """
     allowed = DEFAULT_MAX_TRIANGLES if max_triangles is None else max_triangles
     cells, last, goal = MIN_MESH_CELLS, max_cells(lens, allowed), chordal_error_goal(lens, tolerance)
@@ -285,7 +285,7 @@ class FaceNumbers(NamedTuple):
 
 @njit(inline="always")
 def _basis(u, m):
-    """Return the span of u and its control points' weights; a copy of bspline.basis, since numba caches per file."""
+    """Return (k, B_k, B_{k+1}, B_{k+2}) at u; a copy of bspline.basis, since numba caches per file."""
     if u < 1.5:
         k, s = 0, 2.0 - math.sqrt(4.0 - 2.0 * u)
     elif u > m - 2.5:
@@ -300,7 +300,7 @@ def _basis(u, m):
 
 @njit(inline="always")
 def _sag(face, x, y):
-    """Return z (mm) of a face."""
+    """Return z (mm) of a face at (x, y)."""
     net = face.net
     m, n = net.shape
     if m == 0:
@@ -316,7 +316,7 @@ def _sag(face, x, y):
 
 @njit(cache=True, nogil=True)
 def _distance_from_face(a, b, c, parts, face):
-    """Return the largest distance along z (mm) of a face from a triangle, with 2 `parts` steps per edge."""
+    """Return the largest distance along z (mm) of a face from the triangle a b c, with 2 `parts` steps per edge."""
     n = 2 * parts
     worst = abs(_sag(face, (a[0] + b[0] + c[0]) / 3, (a[1] + b[1] + c[1]) / 3) - (a[2] + b[2] + c[2]) / 3)
     for i in range(n):
@@ -359,7 +359,7 @@ METRES_PER_MM = 1e-3  # unit conversion for glTF, which is in metres
 VERTEX_XML = b'<vertex x="%.10g" y="%.10g" z="%.10g"/>\n'
 TRIANGLE_XML = b'<triangle v1="%d" v2="%d" v3="%d"/>\n'
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-MAX_PROBES = 4096  # largest number of occupied slots that a corner may meet in the hash table, half of which is free
+MAX_PROBES = 4096  # largest number of occupied slots that a corner may meet in the hash table, which is half free
 STL_HEADER = b"bstcad, binary STL, lengths in mm"  # header, which must not start with "solid"
 MAX_LINE_BYTES = 90  # longest line of a 3MF model (bytes)
 CLEAR_RGBA, MIRROR_RGBA = "#A9D3EE80", "#C9CED4FF"  # sRGB and opacity of clear material and of a mirror
@@ -371,7 +371,7 @@ class Label:
     """Name and appearance of a mesh in a file."""
 
     name: str = "lens"
-    title: str = ""
+    title: str = ""  # title of a 3MF file or glTF scene; "": 3MF states the name
     material: str = "glass"
     colour: str = CLEAR_RGBA  # #RRGGBBAA
     remark: str = ""  # description, a sentence; "" for none
@@ -401,7 +401,7 @@ def read_stl(path: str | Path) -> Mesh:
     count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
     if len(data) != 84 + STL_TRIANGLE.itemsize * count or not count:
         raise ValueError(
-            f"{path.name}: is not a binary STL of {max(count, 0)} triangles ({len(data)} bytes); write it again"
+            f"{path.name}: is not a binary STL of {max(count, 0)} triangles: it has {len(data)} bytes; write it again"
         )
     corners = np.frombuffer(data, STL_TRIANGLE, offset=84)["corners"].reshape(-1, 3)
     if not np.isfinite(corners).all():
@@ -416,7 +416,7 @@ def read_stl(path: str | Path) -> Mesh:
 
 @njit(cache=True, nogil=True)
 def _weld(bits):
-    """Group equal corners, float32 (n, 3) seen as uint32, by hash: (first corner of each group, group of each corner).
+    """Group equal corners, float32 (n, 3) as uint32, by hash; return each group's first corner and each corner's group.
 
     The two arrays are empty if a corner meets MAX_PROBES occupied slots, which no real surface causes.
     """
@@ -524,7 +524,7 @@ def preview_files(lens: Lens, label: Label) -> Iterator[tuple[str, bytes]]:
 def _glb(mesh: Mesh, lens: Lens, label: Label, off: float) -> bytes:
     """Encode the mesh as binary glTF, in metres, y upwards; off: chordal error (mm), which the extras state.
 
-    A vertex on an edge of the lens is repeated with the normal of each face, and of each facet of the wall, there.
+    A vertex on an edge of the lens is repeated with the normal of each face and each facet of the wall that meet there.
     """
     import trimesh  # takes most of a second
     from trimesh.visual import TextureVisuals

@@ -129,7 +129,7 @@ class _Opening:
         return cls(lens, name, z, loops, location=location, outline=rim.translate((x, y, 0.0)), draft=placed.draft)
 
     def prism(self, body: cadquery.Shape) -> cadquery.Solid:
-        """Return the prism over the rim, higher than the body."""
+        """Return the prism over the rim, from 1 mm below the body to 1 mm above it."""
         import cadquery
 
         box = body.BoundingBox()
@@ -166,7 +166,7 @@ class _Opening:
         return all(cadquery.Vertex.makeVertex(p.x, p.y, 0).distance(self.outline) <= WALL_TOLERANCE for p in points)
 
     def fill(self, upper: float, lower: float) -> tuple[list[NamedFace], list[Loop], list[Loop]]:
-        """Return the faces of the lens, and the loops around it in the body's planes at z = upper and lower (mm)."""
+        """Return the faces of the lens, and the loops around it in the body's planes z = upper and z = lower (mm)."""
         lens, (rim, *holes) = self.lens, self.loops
         above_back, below_front = check_fit(lens, rim, (lower - self.z, upper - self.z), self.name)
         if self.draft and below_front is not False:
@@ -232,7 +232,7 @@ def check_fit(lens: Lens, rim: Sequence[LoopPiece], planes: tuple[float, float],
 
 
 def _replace_loops(face: cadquery.Face, replacements: dict[int, list[Loop]] | None) -> TopoDS_Face:
-    """Return a plane face of the body with loops in place of some wires, by index of the wire; None: of no wire."""
+    """Return a plane face of the body; replacements: loops in place of some wires, by index of the wire; None: none."""
     if replacements is None:
         return face.wrapped
     loops: list[Loop] = []
@@ -296,7 +296,7 @@ def body(flange: Flange) -> cadquery.Workplane:
 
 
 def _bevelled(plate: cadquery.Solid, bevel: float, lean: float) -> cadquery.Solid:
-    """Return a plate with bevels of a height (mm) along z, at 45 degrees; lean: inward slope of its walls, mm per mm.
+    """Return a plate bevelled at 45 degrees; bevel: height along z (mm); lean: inward slope of its walls, mm per mm.
 
     Workplane.chamfer is not used, because it does not define which of its two lengths belongs to which face.
     """

@@ -77,7 +77,7 @@ def _check_round(surface: BSplineSurface, radius: float) -> None:
     reach = min(-x0, x1, -y0, y1) - 1.5 * dx  # the end spans, where x(u) is quadratic, are 1.5 pitches wide
     if radius > reach + 1e-9 * dx:
         raise ValueError(
-            f"lens: the net's linear part ends at {reach:g} mm, inside the rim at {radius:g} mm; "
+            f"lens: x(u) of the net is linear only up to {reach:g} mm, which is inside the rim at {radius:g} mm; "
             "extend the net to two spans beyond the rim"
         )
 
@@ -124,9 +124,9 @@ def _sphere_patch(front: Sphere, outline: Outline) -> Patch:
 def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]:
     """Return poles (3, 3, 3) in mm and weights (3, 3) of a conic for |u| <= a, |v| <= b (mm).
 
-    With K = (1 + k) c², w = 1 + K (u² + v²) / 4: x = u / w, y = v / w, z = z0 + c/2 (u² + v²) / w.  In homogeneous
-    coordinates these are quadratic, so that a rational patch of degree 2 x 2 is exactly the conic; (u, v) is the
-    projection of (x, y, z) from the conic's far vertex.  The blossom of u² on [-a, a] is a² (1, -1, 1).
+    With K = (1 + k) c², w = 1 + K (u² + v²) / 4: x = u / w, y = v / w, z = z0 + c/2 (u² + v²) / w.  Since w x, w y, w z
+    and w are quadratic in u and v, a rational patch of degree 2 x 2 is exactly the conic; (u, v) is the projection
+    of (x, y, z) from the conic's far vertex.  The blossom of u² on [-a, a] is a² (1, -1, 1).
     """
     ends, blossom = np.array([-1.0, 0.0, 1.0]), np.array([1.0, -1.0, 1.0])
     square = a * a * blossom[:, None] + b * b * blossom[None, :]
@@ -139,7 +139,7 @@ def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]
 
 
 def _conic_patch(front: Conic, outline: Outline) -> Patch:
-    """Return a rational patch (`conic_net`).  Circles about the axis are circles in (u, v), straight sides are arcs."""
+    """Return the patch of `conic_net`.  In (u, v), circles about the axis are circles and straight sides are arcs."""
     (c, k), (a, b) = front.conic(), outline.half_extent
     bend = (1 + k) * c**2  # K
 
@@ -147,7 +147,7 @@ def _conic_patch(front: Conic, outline: Outline) -> Patch:
         scale = 2 / (1 + np.sqrt(1 - bend * (x * x + y * y)))
         return np.stack([x * scale, y * scale], axis=-1)
 
-    # extent of the outline along u and v: at its corners, on its axes
+    # largest u and v on the outline: at its corners or on the axes
     ends = np.maximum(uv(a, 0.0) + uv(0.0, b), 0.0 if outline.is_round else uv(a, b))
     if not np.isfinite(ends).all() or not (abs(bend) / 4 * (PATCH_MARGIN * ends) ** 2).sum() < 1:
         raise ValueError(
@@ -197,7 +197,7 @@ def _knot_arrays(full: np.ndarray) -> tuple[TColStd_Array1OfReal, TColStd_Array1
 def bspline_surface(
     net: np.ndarray, knots_u: np.ndarray, knots_v: np.ndarray, weights: np.ndarray | None = None
 ) -> Geom_BSplineSurface:
-    """Return the B-spline surface of a net (m, n, 3) in mm and full knot vectors, rational with weights (m, n)."""
+    """Return the B-spline surface of a net (m, n, 3) in mm and full knot vectors; weights (m, n) make it rational."""
     m, n = net.shape[:2]
     if weights is None and m * n > SMALL_NET:
         return _surface_of(surface_bytes(net, knots_u, knots_v))
@@ -294,11 +294,11 @@ def _face_on(surface: Geom_Surface) -> TopoDS_Face:
 
 
 def _surface_of(own: bytes) -> Geom_BSplineSurface:
-    """Decode a surface: its bytes replace the bytes of a placeholder surface in the file of a face."""
+    """Decode a surface from its bytes, `own`, which replace those of a placeholder surface in the file of a face."""
     data = _PLACEHOLDER_FILE.replace(surface_bytes(*_PLACEHOLDER_NET), own, 1)
     return BRep_Tool.Surface_s(TopoDS.Face_s(from_bytes(data)))
 
 
 _PLACEHOLDER_NET = (np.zeros((2, 2, 3)), *[np.array([0.0, 0.0, 1.0, 1.0])] * 2)  # control net and knot vectors
 _PLACEHOLDER_FILE = to_bytes(_face_on(bspline_surface(*_PLACEHOLDER_NET)))
-SURFACE_OFFSET = _PLACEHOLDER_FILE.index(surface_bytes(*_PLACEHOLDER_NET))  # offset (bytes) of a surface in its file
+SURFACE_OFFSET = _PLACEHOLDER_FILE.index(surface_bytes(*_PLACEHOLDER_NET))  # offset (bytes) in a face's file

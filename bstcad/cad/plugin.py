@@ -32,11 +32,11 @@ def mounted(
 ) -> cadquery.Workplane:
     """Return a Workplane with one solid: the chain's solid joined with a lens at each point; see bstcad.mounted.
 
-    Only x and y of the points are used.  z: height (mm) of the origin of the lens's scene.
+    Only x and y of the points are used.  z: height (mm) of the origin of the lens's scene in the solid's frame.
     """
     lenses: list[PlacedLens] = []
 
-    def place(location: cadquery.Location) -> cadquery.Vertex:  # eachpoint needs a shape
+    def place(location: cadquery.Location) -> cadquery.Vertex:  # eachpoint expects a shape
         x, y, _ = location.toTuple()[0]
         lenses.append(PlacedLens(getattr(design, "lens", design), trim, holes, (x, y, z)))
         return cadquery.Vertex.makeVertex(0, 0, 0)

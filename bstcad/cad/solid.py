@@ -33,10 +33,10 @@ from bstcad.scene.mount import parting
 if TYPE_CHECKING:
     import cadquery
 
-EXTRA_POINTS = 4  # control points beyond the rim at each end: two spans, and two more until x(u) is linear
-RIM_POINTS_PER_CELL = 8  # points on each piece of a rim, per control point of the back's longer side
-IMAGE_TOLERANCE = 1e-12  # relative deviation from a line or circle below which an image is written as such
-IMAGE_SAMPLES = 65  # points of an image that are compared with a line and a circle
+EXTRA_POINTS = 4  # number of control points beyond the rim at each end: two spans, and two until x(u) is linear
+RIM_POINTS_PER_CELL = 8  # number of points on each piece of a rim per control point along the back's longer side
+IMAGE_TOLERANCE = 1e-12  # relative deviation below which an edge's image in (u, v) is written as a line or circle
+IMAGE_SAMPLES = 65  # number of points of an image that are compared with a line and a circle
 INVALID_LENS = (
     "lens: front, back and walls do not bound a valid solid; check that the back lies above the front, and move wires "
     "apart or make them simpler"
@@ -56,7 +56,7 @@ def lens_solid(
     """Return the lens inside `trim` (None: its outline) without `holes` as a cadquery solid, faces oriented outwards.
 
     trim: a closed plane wire, of which x and y are used; holes: such wires, or (x, y, diameter) in mm.  Walls are
-    parallel to z.  With `draft`, the outer walls lean inwards below a plane at scene.mount.LAND under the back's rim.
+    parallel to z.  With a draft angle, the outer walls lean inwards below a plane under the back's rim (mount.parting).
     Raises ValueError in one sentence if a wire is open, crosses itself or another, or leaves the lens, if walls would
     meet, or if no valid solid exists.
     """
@@ -132,7 +132,7 @@ def check_thickness(lens: Lens) -> None:
     i = int(thickness.argmin())
     if not thickness[i] > MIN_WALL:
         at = "({:g}, {:g}) mm".format(*(p[i] for p in points))
-        raise ValueError(f"lens: the back lies {thickness[i]:g} mm above the front at {at}; move the front down")
+        raise ValueError(f"lens: its thickness is {thickness[i]:g} mm at {at}; move the front down")
 
 
 # ---- the wires -----------------------------------------------------------------------------------------------------
@@ -185,7 +185,7 @@ def _hole_loop(name: str, hole: cadquery.Wire | Sequence[float]) -> list[LoopPie
 
 
 def cap(patch: Patch, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
-    """Return the back or front inside the first rail and outside the others; along: True to use rails forwards."""
+    """Return the back or front inside the first rail and outside the others; along: use rails forwards."""
     loops = [rail.along() if along else rail.against() for rail in rails]
     face = face_inside(patch.surface, patch.outward, *loops)
     for rail in rails if patch.uv is not None else ():
@@ -215,7 +215,7 @@ def image(patch: Patch, curve: RailCurve) -> Geom2d_Curve:
     """Return the image in (u, v) of a curve on a patch, with the curve's parameter: a line, a circle or a spline."""
     piece, uv = curve.piece, patch.uv
     assert uv is not None  # a plane needs no image
-    cubic = curve.knots if curve.knots is not None and len(curve.knots) == len(curve.poles) + 4 else None  # its knots
+    cubic = curve.knots if curve.knots is not None and len(curve.knots) == len(curve.poles) + 4 else None
     t = np.linspace(0.0, piece.end, IMAGE_SAMPLES) if cubic is None else np.unique(cubic)
 
     def points(t: np.ndarray) -> np.ndarray:

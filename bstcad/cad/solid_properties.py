@@ -1,8 +1,8 @@
 """Area, volume and centroid of a part with lenses, from its faces and edges, with a relative error of 1e-8.
 
-Each face is integrated along its boundary with Green's theorem: a large net in x and y (optics.quadrature), any other
-face in its parameters u and v.  OCC's own integrals take minutes for a large net.  They have errors of 1e-5 for a face
-that shares an edge with a large net, since this edge is a curve of thousands of knots.
+Each face is integrated along its boundary with Green's theorem: a freeform net in x and y (optics.quadrature), any
+other face in its parameters u and v.  OCC's own integrals take minutes for a large net.  They have errors of 1e-5 for
+a face that shares an edge with a large net, since this edge is a curve of thousands of knots.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ if TYPE_CHECKING:
 
 Coordinates = tuple[float, float, float]
 
-STRAIGHT_POINTS = 2  # Gauss points along v if r and its derivatives are linear in v, and r (r · n) at most cubic
+STRAIGHT_POINTS = 2  # number of Gauss points along v if r and ∂r/∂u are linear in v, so that r (r · n) is cubic
 STRAIGHT_KINDS = (Kind.GeomAbs_Plane, Kind.GeomAbs_Cylinder, Kind.GeomAbs_Cone, Kind.GeomAbs_SurfaceOfExtrusion)
-# Gauss points along v for each kind of face; only rounding errors remain
+# Number of Gauss points along v for each kind of face; only rounding errors remain.
 GAUSS_POINTS_V = dict.fromkeys(STRAIGHT_KINDS, STRAIGHT_POINTS)
 GAUSS_POINTS_V |= {Kind.GeomAbs_Sphere: 12, Kind.GeomAbs_Torus: 12, Kind.GeomAbs_BSplineSurface: 32}
-ARC_PARTS, ARC_POINTS = 8, 12  # intervals, and Gauss points in each, of a line or an arc on a smooth face
+ARC_PARTS, ARC_POINTS = 8, 12  # numbers of intervals, and of Gauss points in each, of a line or an arc
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,10 @@ def whole_part(reread: StepLens, properties: MassProperties | None) -> WholePart
 
 
 def of_solid(solid: cadquery.Shape | TopoDS_Shape) -> MassProperties | None:
-    """Return area, volume and centroid of a part with lens axes along z; None if a face is of an unknown kind."""
+    """Return area, volume and centroid of a part with lens axes along z; None if a face is damaged or unknown."""
     shape: TopoDS_Shape = getattr(solid, "wrapped", solid)
     vertex = TopoDS.Vertex_s(parts_of(shape, TopAbs_VERTEX)[0])
-    z_ref = BRep_Tool.Pnt_s(vertex).Z()  # origin of the sums, near the part: errors by gaps grow with the distance
+    z_ref = BRep_Tool.Pnt_s(vertex).Z()  # origin of the sums, near the part: errors due to gaps grow with the distance
     try:
         total = sum((_of_face(TopoDS.Face_s(face), z_ref) for face in parts_of(shape, TopAbs_FACE)), Sums())
         return MassProperties.of(total, z_ref)

@@ -26,9 +26,9 @@ from bstcad.cad.step_reading import parts_of
 
 FIXED_FORMAT, SCIENTIFIC_FORMAT = "%.14f", "%.16E"  # formats of numbers in [FIXED_MIN, FIXED_MAX), and of all others
 FIXED_MIN, FIXED_MAX = 0.1, 1e3  # limits of the absolute values that are written in FIXED_FORMAT
-PLACEHOLDER_X = 1e60  # mm; placeholder k has its first control point at x = (k + 1) PLACEHOLDER_X, far from any lens
-REFERENCES_PER_LINE = 16  # entries per line of a list
-OTHER_FORM = "UNSPECIFIED"  # name in Part 21 of any other form of a knot vector
+PLACEHOLDER_X = 1e60  # x (mm), beyond any lens; the first control point of placeholder k is at (k + 1) PLACEHOLDER_X
+REFERENCES_PER_LINE = 16  # number of entries per line of a list
+OTHER_FORM = "UNSPECIFIED"  # name in Part 21 of a knot vector whose form is not in KNOT_FORMS
 KNOT_FORMS = {  # names in Part 21 of the forms of knot vectors
     Distribution.GeomAbs_Uniform: "UNIFORM_KNOTS",
     Distribution.GeomAbs_QuasiUniform: "QUASI_UNIFORM_KNOTS",
@@ -52,7 +52,7 @@ class LargeNet:
 
 
 def with_placeholders(shape: TopoDS_Shape) -> tuple[TopoDS_Shape, list[LargeNet]]:
-    """Return a copy of the shape with a placeholder for each large net (the shape itself if none), and the nets."""
+    """Return a copy of the shape with a placeholder for each large net (itself if it has none), and these nets."""
     nets: list[LargeNet] = []
     data = b""
     for face in parts_of(shape, TopAbs_FACE):
@@ -119,7 +119,7 @@ def fill_in_nets(text: bytes, placeholders: Sequence[int], nets: Sequence[LargeN
 
 
 def _surface_statement(name: int, net: LargeNet, first: int) -> Iterator[bytes]:
-    """Yield statement number `name` of a net whose points have numbers from `first` on, v changing fastest."""
+    """Yield the text of statement `name`: a net whose points are numbered from `first` on, v changing fastest."""
     m, n, _ = net.control_points.shape
     yield b"#%d = B_SPLINE_SURFACE_WITH_KNOTS('',%d,%d,(\n" % (name, *net.degrees)
     for i in range(m):
@@ -154,7 +154,7 @@ def _point_statements(net: np.ndarray, first: int) -> Iterator[bytes]:
 
 
 def _format_reals(values: np.ndarray) -> list[str]:
-    """Format numbers with FIXED_FORMAT or SCIENTIFIC_FORMAT, as OCC does: 15 to 17 digits."""
+    """Format numbers with FIXED_FORMAT or SCIENTIFIC_FORMAT, as OCC does: 14 to 17 significant digits."""
     size = np.abs(values)
     fixed = (size >= FIXED_MIN) & (size < FIXED_MAX)
     forms = np.where(fixed, FIXED_FORMAT, SCIENTIFIC_FORMAT).tolist()

@@ -1,9 +1,9 @@
 """Reading of the lens in a STEP file by OCC, in a second process, because a damaged file may crash OCC.
 
-A lens that another program has moved is read in its own frame, together with the placement of that frame: the axis is
-z, and light enters through the front, towards +z.  Outline and clear apertures follow from the edges.  The edges are
-compared with the faces that they bound: OCC's own checks examine only the ends of an edge and a few points between
-them, and accept a solid whose rim runs the wrong way around its circle.
+A lens that another program has moved is read in its own frame, in which its axis is z and its back faces +z, together
+with the placement of this frame in the file.  The outline follows from the walls or from the edge of the back, the
+clear apertures from the edges of both faces.  Edges are compared with the faces that they bound, because OCC's own
+checks examine only a few points of an edge, and accept a solid whose rim runs the wrong way around its circle.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ from bstcad.optics.sides import MIN_SIDE
 from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, sag
 from bstcad.step_text.placement import Placement, identity, own_frame
 
-GRID_TOLERANCE = 1e-9  # largest deviation (mm) of a net of bstcad from a uniform grid in x and y
-AXIAL_TOLERANCE = 1e-9  # largest deviation (mm or rad) of a wall from an outline about the axis
+GRID_TOLERANCE = 1e-9  # largest deviation (mm) of a net from a uniform grid in x and y, or from the net of a conic
+AXIAL_TOLERANCE = 1e-9  # largest offset (mm) of a surface from the axis, and largest 1 - cosine of its angle
 CIRCLE_TOLERANCE = 1e-6  # largest deviation (mm) of an edge from its circle or rectangle
 LEVEL_TOLERANCE = 1e-7  # largest distance (mm) of the plane around a front from the front's edge
 APERTURE_DECIMALS = 9  # decimals of a clear aperture (mm); further ones are rounding errors of the coordinates
 POINTS_PER_EDGE = 129  # number of points sampled along each edge of a face
-POINTS_PER_SPAN = 4  # number of points sampled per knot span of an edge; one pole of a curve affects three spans
+POINTS_PER_SPAN = 4  # number of points sampled on an edge per knot span; a wrong pole affects at least three spans
 
 OccFace = tuple[TopoDS_Face, BRepAdaptor_Surface]
 
@@ -108,7 +108,7 @@ def solid(path: Path) -> TopoDS_Solid:
 
 
 def read(path: str | Path, shape: TopoDS_Solid | None = None) -> StepLens:
-    """Read the lens in a STEP file.  shape: solid of the file, if already read.  ValueError unless it has one lens."""
+    """Read the lens in a STEP file; ValueError unless the file has one lens.  shape: its solid, if already read."""
     path = Path(path)
     try:
         found, placement = in_own_frame(shape or solid(path))
@@ -128,7 +128,7 @@ def is_valid(solid: TopoDS_Solid) -> bool:
 
 
 def gaps(solid: TopoDS_Solid) -> float:
-    """Return the largest tolerance (mm) of edges and vertices; OCC's reader increases each until curves meet faces."""
+    """Return the largest tolerance (mm) of edges and vertices; OCC's reader increases it until curves meet faces."""
     return ShapeAnalysis_ShapeTolerance().Tolerance(solid, 1)
 
 
@@ -177,7 +177,7 @@ def _lens_in(solid: TopoDS_Solid) -> StepLens:
     faces = _faces(solid)
     nets = _freeform_faces(faces)
     if (found := _back_face(nets)) is None:
-        raise ValueError(f"{len(nets)} B-spline faces; give a lens with one, or two that face away from each other")
+        raise ValueError(f"it has {len(nets)} freeform faces; give a lens with one, or two facing opposite ways")
     (back_face, back), fronts = found, [face for face in nets if face is not found]
     net = patches.net_of(back.BSpline())
     middle = (net[0, 0, :2] + net[-1, -1, :2]) / 2
@@ -206,13 +206,13 @@ def _freeform_faces(faces: Sequence[OccFace]) -> list[OccFace]:
 
 
 def _back_face(nets: Sequence[OccFace]) -> OccFace | None:
-    """Return the only freeform face, or of two the face that points along its net's normal; None if there is none."""
+    """Return the only freeform face, or of two the only one that points along its net's normal; None: there is none."""
     backs = [face for face in nets if len(nets) == 1 or _looks_along_net(face[0])]
     return backs[0] if len(backs) == 1 and len(nets) <= 2 else None
 
 
 def _looks_along_net(face: TopoDS_Face) -> bool:
-    """True if the outward normal of a face is ∂u x ∂v of its surface, as for a height over (x, y) seen from above."""
+    """True if the outward normal of a face is ∂u x ∂v of its surface, as on the back of a lens."""
     return face.Orientation() != TopAbs_Orientation.TopAbs_REVERSED
 
 
@@ -226,7 +226,7 @@ def _is_patch(surface: BRepAdaptor_Surface) -> bool:
 
 
 def freeform_surface(face: TopoDS_Face) -> BSplineSurface:
-    """Return the surface of a face, heights from its vertex; ValueError unless bstcad could have written its net."""
+    """Return the surface of a face, heights from its vertex; ValueError unless its net is as bstcad writes nets."""
     surface = BRepAdaptor_Surface(face)
     return _uniform_net(surface, patches.net_of(surface.BSpline())).from_vertex()
 
@@ -243,7 +243,7 @@ def _uniform_net(surface: BRepAdaptor_Surface, net: np.ndarray) -> BSplineSurfac
     for axis, full, count in zip("xy", patches.knots_of(patch), (m, n), strict=True):
         off = np.abs(full - knots(count))
         if off.max() > 1e-12 * count:
-            worst = f"{knots(count)[off.argmax()]:g} is {full[off.argmax()]:.15g}"
+            worst = f"knot {knots(count)[off.argmax()]:g} is {full[off.argmax()]:.15g}"
             raise ValueError(f"knots in {axis} are not 0 … {count - 2} ({worst}); give a file written by bstcad")
     found = BSplineSurface.from_control_points(net)
     off = np.abs(net - found.control_points())[..., :2].max(axis=-1)
@@ -273,7 +273,7 @@ def _front_face(rest: Sequence[OccFace]) -> OccFace:
         level = sorted(facing_down, key=lambda face: float(np.hypot(*outer_edge(face[0]).T).max()))
     curved = [face for face in rest if face[1].GetType() == Kind.GeomAbs_Sphere or _is_patch(face[1])]
     if not (curved or level):
-        raise ValueError("no plane, sphere or conic faces the light; give a file written by bstcad")
+        raise ValueError("it has no plane, sphere or conic as a front; give a file written by bstcad")
     return (curved or level)[0]
 
 
@@ -306,7 +306,7 @@ def _front_surface(face: TopoDS_Face, surface: BRepAdaptor_Surface, others: Sequ
 def _sphere(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> Sphere:
     centre, radius = surface.Sphere().Location(), surface.Sphere().Radius()
     if max(abs(centre.X()), abs(centre.Y())) > AXIAL_TOLERANCE:
-        raise ValueError(f"the sphere's centre is at ({centre.X():g}, {centre.Y():g}), off the axis; centre the lens")
+        raise ValueError(f"the sphere's centre, ({centre.X():g}, {centre.Y():g}) mm, is off the axis; centre the lens")
     rim = BRep_Tool.Pnt_s(TopoDS.Vertex_s(parts_of(face, TopAbs_VERTEX)[0]))
     side = 1.0 if centre.Z() > rim.Z() else -1.0
     return Sphere(centre.Z() - side * radius, side / radius)
@@ -316,7 +316,7 @@ def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
     """Return the conic with the poles and weights of a patch of 3 x 3 (see patches.conic_net).
 
     Let Q = a² + b² for half widths a and b, and scale the weights at corner and centre to the mean 1.  They are then
-    w = 1 ± K Q / 4 with K = (1 + k) c², and the heights there are z0 ± c/2 Q / w.  The parabola that represents a
+    w = 1 ± K Q / 4 with K = (1 + k) c², and the poles there have z = z0 ± c/2 Q / w.  The parabola that represents a
     nearly flat sphere is read as the sphere.
     """
     net, weights = patches.net_of(patch), patches.weights_of(patch)
@@ -332,7 +332,7 @@ def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
     poles, expected = patches.conic_net(found, a, b)
     if not (np.abs(poles - net).max() <= GRID_TOLERANCE and np.abs(expected - weights).max() <= GRID_TOLERANCE):
         raise ValueError("the front is a patch of 3 x 3 but not a conic; give a file written by bstcad")
-    deviation = abs(c) ** 3 * size**2 / 8  # deviation from its parabola, on a patch wider than a round front
+    deviation = abs(c) ** 3 * size**2 / 8  # deviation of the sphere from its parabola at the patch's corner
     return Sphere(z, c) if bend == 0 and deviation < 10 * patches.PARABOLA_TOLERANCE else found
 
 
@@ -418,7 +418,7 @@ def clear_apertures(front: np.ndarray, back: np.ndarray) -> tuple[Outline, Outli
         corner = round(corner, APERTURE_DECIMALS) if corner > CIRCLE_TOLERANCE else 0.0
         rim = Rounded(width, height, corner_radius=corner) if corner else Rectangle(width, height)
     if not (off := np.abs(rim.depth(*back.T)).max()) <= CIRCLE_TOLERANCE:
-        raise ValueError(f"the back's edge is up to {off:.2g} mm off a circle or rectangle about the axis; give it one")
+        raise ValueError(f"the back's edge is {off:.2g} mm off a circle or rectangle about the axis; make it one")
     inset = float(rim.depth(*front.T).max())
     return rim.inset(round(inset, APERTURE_DECIMALS)) if inset > CIRCLE_TOLERANCE else rim, rim
 
@@ -437,12 +437,12 @@ def _bounding_outline(points: np.ndarray) -> Outline:
 def points_on_edges(solid: TopoDS_Shape) -> np.ndarray:
     """Return the ends and midpoints of all edges, (n, 3), mm, in any order."""
     edges = map(TopoDS.Edge_s, parts_of(solid, TopAbs_EDGE))
-    curves = (BRepAdaptor_Curve(edge) for edge in edges if not BRep_Tool.Degenerated_s(edge))  # the apex of a cone is
+    curves = (BRepAdaptor_Curve(edge) for edge in edges if not BRep_Tool.Degenerated_s(edge))  # except a cone's apex
     return np.concatenate([_curve_points(curve, np.array([0.0, 0.5, 1.0])) for curve in curves])
 
 
 def edge_deviations(shape: TopoDS_Shape, lens: Lens) -> tuple[tuple[float, str], tuple[float, str]]:
-    """Return the largest distances (mm) of edges from faces they bound, and from the wall, each with its position."""
+    """Return the largest distances (mm) of edges from the faces they bound, and from the wall, each with its place."""
     spans = max(max(lens.back_net.shape) - 2, math.ceil(2 * max(lens.outline.half_extent) / lens.front.detail))
     fractions = np.linspace(0.0, 1.0, POINTS_PER_SPAN * spans + 1)
     from_faces, from_wall = [], []
@@ -476,4 +476,4 @@ def _distance_from_wall(points: np.ndarray, lens: Lens) -> np.ndarray:
     off = np.maximum(np.abs(lens.outline.depth(x, y)), outside)
     if (dome := lens.front.outline) is None:
         return off
-    return np.minimum(off, np.hypot(dome.depth(x, y), z - lens.front.around.z))  # distance from its edge
+    return np.minimum(off, np.hypot(dome.depth(x, y), z - lens.front.around.z))  # distance from the edge of the front

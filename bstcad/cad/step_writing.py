@@ -72,7 +72,7 @@ if TYPE_CHECKING:
 
 SCHEMAS = {"AP242": "AP242DIS", "AP214": "AP214IS"}  # schema -> its name in OCC
 NO_FACTS = Part()
-TIME_VARIABLE = "SOURCE_DATE_EPOCH"  # variable that fixes the file's time (seconds since 1970), for equal bytes
+TIME_VARIABLE = "SOURCE_DATE_EPOCH"  # environment variable: the file's time (s since 1970), for equal bytes
 MILLI, METRE = StepBasic_SiPrefix.StepBasic_spMilli, StepBasic_SiUnitName.StepBasic_sunMetre
 DENSITY_EXPONENT = -3.0  # exponent of the length in a density
 
@@ -112,7 +112,7 @@ def encode(
 ) -> Iterator[bytes]:
     """Yield parts of the text of a shape's STEP file, with one product called `name`.
 
-    part: number, author, colour and material, and the tolerances of the faces "back" and "front".
+    part: schema, number, author, colour, material and density, and the tolerances of the faces "back" and "front".
     faces: names of all faces, in the order of shape.Faces(); (): no names.
     properties: area, volume and centroid, with which a reader of the file can check the shape.
     """
@@ -268,7 +268,7 @@ def _measure(name: str, kind: str, value: float, exponent: float) -> StepRepr_Me
 
 
 def _label(model: StepData_StepModel, name: str, part: Part) -> None:
-    """Set the product's name and number, and the header (OCC would number a name that it has written before)."""
+    """Set the product's name and number, and the header (OCC adds a number to a name that it has used before)."""
     text = Text(part21_string(name))
     product = _first_entity(model, StepBasic_Product)
     product.SetId(text if part.number is None else Text(part21_string(part.number)))

@@ -44,10 +44,10 @@ RIM_TOLERANCE = 1e-8  # largest deviation (mm) of an edge from the exact curve
 MIN_WALL = 1e-3  # smallest height of a wall (mm)
 SMOOTH_TURN = 1e-7  # angle (rad) between successive pieces below which they join smoothly
 MIN_CORNER = 0.05  # smallest 1 + cos of the exterior angle at a corner; a mitre is then at most 6.3 times the offset
-MAX_NEWTON_STEPS, NEWTON_TOLERANCE = 50, 1e-13  # number of Newton steps; step (mm) at which they have converged
+MAX_NEWTON_STEPS, NEWTON_TOLERANCE = 50, 1e-13  # largest number of steps; size of the last one, relative to 1 mm + |z|
 WALL_SAMPLES = 129  # number of points along a piece at which its wall is checked
 
-NamedFace = tuple[TopoDS_Face, str]  # face and its name: "back", "front", "underside", "rim", "bevel" or "hole"
+NamedFace = tuple[TopoDS_Face, str]  # face and its name, as in solid.NamedSolid
 Loop = list[tuple[TopoDS_Edge, bool]]  # edges, each with True if used forwards
 
 
@@ -189,7 +189,7 @@ class WallSurface:
         end = curve.piece.end
         if curve.knots is None:
             knots, t = np.array([0.0, 0.0, end, end]), np.array([0.0, end])
-        else:  # the poles of t are means of as many knots as the degree
+        else:  # Greville abscissae: means of as many knots as the degree
             knots = curve.knots
             t = sliding_window_view(knots[1:-1], len(knots) - len(curve.poles) - 1).mean(axis=1)
         return self.curve((t, curve.poles[:, 2], np.full(len(t), up)), knots)
@@ -263,7 +263,7 @@ def _faces_between(surfaces: Sequence[WallSurface], low: Rail, high: Rail, outwa
 def upright_walls(
     loop: Sequence[LoopPiece], low: Rail, high: Rail, name: str = "rim", outward: bool = True
 ) -> list[NamedFace]:
-    """Return the upright walls over a loop between two rails."""
+    """Return the upright walls over a loop between two rails, each called `name`; outward: see `_faces_between`."""
     return [(wall, name) for wall in _faces_between([_upright_surface(piece) for piece in loop], low, high, outward)]
 
 
@@ -320,7 +320,7 @@ class LeaningPiece:
         return start + (t / self.piece.end)[:, None] * (end - start)
 
     def ends(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return points (n, 3), mm, of the lower edges of wall and bevel (on the front); equal without a bevel."""
+        """Return points (n, 3), mm, on the lower edges of wall and bevel; without a bevel, both lie on the front."""
         start, m, tangent = self.piece.points(t), self.inwards(t), self.draft.tangent
         depth = self._depth(start, m, tangent, np.full(len(t), self.z)) - self.draft.bevel
         upper = np.column_stack([start + tangent * depth[:, None] * m, self.z - depth])

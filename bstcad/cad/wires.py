@@ -26,10 +26,10 @@ WIRE_TOLERANCE = 1e-7  # largest deviation (mm) of a wire from its plane z = con
 MIN_CLEARANCE = 1e-6  # distance (mm) below which wires are said to touch
 POLYGON_SIDES = 400  # number of sides of the polygon that represents a loop in checks
 MIN_INTERVALS = 64  # smallest number of intervals of a spline over a piece
-MAX_INTERVALS, MAX_HALVINGS = 1 << 14, 4  # limits of a cubic: intervals, or halvings if they give more intervals
+MAX_INTERVALS, MAX_HALVINGS = 1 << 14, 4  # limits of a cubic: number of intervals, or of halvings if these give more
 QUINTIC_INTERVALS = 256  # intervals of a quintic; along half a circle on a sphere or conic its error is 1e-12 mm
 MIN_BREAK_DISTANCE = 1e-7  # smallest distance of two breaks, relative to the length of the piece
-ONE_SIDED_SLOPE = np.array([-25, 48, -36, 16, -3]) / 12  # weights for the slope at the first value; error h⁴ f⁽⁵⁾ / 5
+ONE_SIDED_SLOPE = np.array([-25, 48, -36, 16, -3]) / 12  # weights of 5 values for the first one's slope
 CROSSING_BISECTIONS = 50  # number of bisections, which leave only rounding errors
 
 Locus = Callable[[np.ndarray], np.ndarray]  # function of t (n,) that returns points (n, k)
@@ -91,7 +91,7 @@ def wire_loop(given: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list
 
 
 def shape_in(given: Any) -> tuple[Any, str]:
-    """Return the given shape, or the only object of a Workplane (None: not one), and its type or their number."""
+    """Return the given shape, or the only object of a Workplane, and its type; if not one, None and their number."""
     values = given.vals() if hasattr(given, "vals") else [given]
     if len(values) != 1:
         return None, f"a Workplane of {len(values)} objects"
@@ -131,7 +131,7 @@ def _pieces(edge: cadquery.Edge) -> list[LoopPiece]:
         starts = (angle + turn * k * span for k in range(halves))
         pieces = [_arc((x, y), curve.Circle().Radius(), each, span=span, turn=turn) for each in starts]
     else:
-        parts = 1 if math.dist(start, end) > WIRE_TOLERANCE else 2  # two over a closed edge: no wall has a seam
+        parts = 1 if math.dist(start, end) > WIRE_TOLERANCE else 2  # two for a closed edge: no wall has a seam
         ends = np.linspace(first, last, parts + 1).tolist()
         pieces = [_freeform(curve, *span) for span in zip(ends[:-1], ends[1:], strict=True)]
     return reversed_loop(pieces) if edge.wrapped.Orientation() == TopAbs_Orientation.TopAbs_REVERSED else pieces
@@ -256,7 +256,7 @@ def fit_spline(points: Locus, t: np.ndarray, tolerance: float, smooth: bool = Fa
 
 
 def _hermite(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return poles and full knots of the piecewise cubic through values at t, with slopes from values at quarters."""
+    """Return poles and full knots of a piecewise cubic; values: the curve at t and at the quarters of each interval."""
     parts, length = sliding_window_view(values, 5, axis=0)[::4], np.diff(t)[:, None]
     first, last = 4 * parts @ ONE_SIDED_SLOPE / length, -4 * parts @ ONE_SIDED_SLOPE[::-1] / length
     slope = np.concatenate([first[:1], (last[:-1] + first[1:]) / 2, last[-1:]])

@@ -34,7 +34,7 @@ from bstcad.optics.surfaces import sag, sampled
 MAX_GAUSS_NEWTON_STEPS = 30  # maximum number of Gauss-Newton steps
 MAX_OUTLIER_ROUNDS = 6  # maximum number of rounds of outlier rejection
 STEP_TOLERANCE = 1e-10  # largest component (mm at the rim) of a step that ends the iteration
-FOOT_ITERATIONS = 3  # iterations for the foot of a perpendicular; each scales the error by distance x curvature
+FOOT_ITERATIONS = 3  # iterations for the foot of a perpendicular; each multiplies the error by distance x curvature
 INDEPENDENT_PATCHES = 100  # assumed number of patches of a face with independent form errors
 SCALE_PATCHES = 16  # assumed number of patches with independent form errors that resemble a scale, such as power
 MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty from form errors, in half widths, above which a motion is not determined
@@ -88,7 +88,7 @@ class BackFace:
         return points[:, 2] - sag(self.lens.back, *points[:, :2].T)
 
     def columns(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return the change (n, 6) of each distance per mm of shift along x, y, z, and of rotation, at the rim."""
+        """Return changes (n, 6) of the distances per mm of shift along, or rotation (at the rim) about, x, y and z."""
         return np.hstack([normals, np.cross(points - self.pivot, normals) / self.reach])
 
 
@@ -105,7 +105,7 @@ class Pose:
         return (points - self.pivot - self.shift) @ self.rotation + self.pivot
 
     def compose(self, motion: np.ndarray, reach: float) -> Pose:
-        """Return the pose whose `to_design` is that of this pose, then `motion` (6,), as in BackFace.columns."""
+        """Return the pose whose `to_design` applies this pose's, then `motion` (6,) as in BackFace.columns."""
         turn = Rotation.from_rotvec(motion[3:] / reach).as_matrix()
         rotation = self.rotation @ turn.T
         return Pose(rotation, self.shift - rotation @ motion[:3], self.pivot)
@@ -187,7 +187,7 @@ def _least_squares(face: BackFace, cloud: np.ndarray, pose: Pose) -> Pose:
 def gauss_newton_step(
     face: BackFace, points: np.ndarray, distances: np.ndarray, normals: np.ndarray, weight: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a Gauss-Newton step (6,) towards zero distances, and the orthonormal motions (6, k) determined."""
+    """Return a Gauss-Newton step (6,) towards zero distances, and orthonormal motions (6, k) that points determine."""
     columns = face.columns(points, normals)
     weight = np.full(len(points), 1 / len(points)) if weight is None else weight / weight.sum()
     weighted = columns * weight[:, None]
@@ -237,8 +237,8 @@ def scale(face: BackFace, alignment: Alignment) -> tuple[float, float]:
 # --- outliers ---------------------------------------------------------------------------------------------------------
 
 NEIGHBOURS = 24  # number of nearest points with which each point is compared
-MIN_CLUSTER = 8  # number of neighbours, equally far within 50 %, from which on a point counts as form
-OUTLIER_THRESHOLD = 6.0  # minimum deviation of an outlier in standard deviations (from the MAD), global and local
+MIN_CLUSTER = 8  # number of neighbours within 50 % of a point's distance, from which on the point is form
+OUTLIER_THRESHOLD = 6.0  # minimum deviation of an outlier, in standard deviations of all points and of its neighbours
 MAD_TO_SIGMA = 1.4826  # ratio of standard deviation to median absolute deviation (MAD) of a normal distribution
 CAUCHY_SCALE = 2.0  # residual, in standard deviations, at which a neighbour's weight is one half
 REWEIGHTING_ROUNDS = 3  # iterations of the neighbours' weights
@@ -251,7 +251,7 @@ def find_outliers(
 ) -> tuple[np.ndarray, float]:
     """Return a mask (n,) of the outliers among points (n, 3) at distances (n,) from the face, and the noise; mm.
 
-    candidates: mask (n,) of the points to judge; the others are only neighbours.  noise: of the face; None: estimated.
+    candidates: mask (n,) of the points to judge; the others are only neighbours.  noise (mm); None: estimated.
     """
     outliers, which = np.zeros(len(points), dtype=bool), np.flatnonzero(candidates)
     if len(points) <= NEIGHBOURS or not len(which):
@@ -269,9 +269,9 @@ def find_outliers(
 def _neighbour_planes(
     tree: cKDTree, distances: np.ndarray, part: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compare some points with the planes through their neighbours, fitted with Cauchy weights.
+    """Compare the points with indices `part` with the planes through their neighbours, fitted with Cauchy weights.
 
-    Return each point's distance from its plane, the neighbours' spread about it (mm), and how many are similarly far.
+    Return the distance of each point from its plane, its neighbours' spread (mm), and how many of them are equally far.
     """
     positions = tree.data[part]
     _, near = tree.query(positions, NEIGHBOURS + 1)
@@ -316,7 +316,7 @@ def first_pose(face: BackFace, cloud: np.ndarray) -> tuple[Pose, float]:
 
 
 def find_axis_exchange(face: BackFace, cloud: np.ndarray, original: float) -> tuple[np.ndarray, str] | None:
-    """Return an exchange of axes (matrix (3, 3), words) that moves a cloud far nearer than `original` mm, or None."""
+    """Return an axis exchange (matrix (3, 3), words) after which a cloud is far nearer than `original` mm, or None."""
     sample, fitting = _sample(cloud)[:: START_SAMPLE // AXES_SAMPLE], []
     for matrix, words in sorted(_axis_exchanges(), key=lambda exchange: _rarity(exchange[0])):
         turned = sample @ matrix.T
@@ -355,7 +355,7 @@ def _middle(points: np.ndarray) -> np.ndarray:
 
 
 def _best_start(face: BackFace, sample: np.ndarray, decentres: list[np.ndarray], steps: int) -> tuple[Pose, float]:
-    """Return the best of several starts; a later start only if it is clearly better than all earlier ones."""
+    """Return pose and distance (mm) of the best start; later ones replace it only if they are clearly better."""
     shifts = (np.array([*decentre, height]) for decentre in decentres for height in _heights(face, sample, decentre))
     first, *later = (_refine_start(face, sample, identity_pose(face, shift), steps) for shift in shifts)
     best = first
@@ -378,7 +378,7 @@ def _heights(face: BackFace, sample: np.ndarray, decentre: np.ndarray) -> list[f
 
 
 def _refine_start(face: BackFace, sample: np.ndarray, pose: Pose, steps: int) -> tuple[Pose, float]:
-    """Return a pose refined by Gauss-Newton, weights 1 / (1 + (d / 2 q)²), and the lower quartile q of d (mm)."""
+    """Return a pose refined by Gauss-Newton, weights 1 / (1 + (d / (2 q))²), and the lower quartile q of |d| (mm)."""
     distance = np.inf
     for _ in range(steps):
         points = pose.to_design(sample)

@@ -17,7 +17,7 @@ MAX_CLOUD_SIZE = 1_000_000_000  # largest size of a file (bytes)
 MIN_CLOUD_POINTS = 100  # minimum number of points, to which six degrees of freedom and a form are fitted
 MESH_SUFFIXES = (".ply", ".stl")
 UNIT_SIZES = {"inches": 1 / INCH, "metres": 1e-3, "micrometres": 1e3}  # 1 mm in each unit
-PLAUSIBLE_RATIOS = (0.3, 1.7)  # limits of the ratio of extents, cloud to lens: half a lens, or a lens in a fixture
+PLAUSIBLE_RATIOS = (0.3, 1.7)  # limits of the ratio of extents, cloud to lens; for mm, the upper limit is 5 times this
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Cloud:
     path: Path
     sha256: str = ""  # hash of the file
     without_data: int = 0  # number of points of the file that lack a coordinate and are left out
-    columns: str = ""  # names of the columns that were read, if the heading names nominal and actual ones
+    columns: str = ""  # names of the columns that were read, if others state x, y or z, too, or for a Zygo file
 
 
 def load(path: Path, outline: Outline) -> Cloud:

@@ -26,18 +26,18 @@ from bstcad.optics.bspline import BSplineSurface, basis_matrix, interpolating_ne
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import sag, sampled
 
-POLYNOMIAL_DEGREE = 2
-NET_MARGIN = 0.2  # margin of the field's net around the face, in sides; cosines have zero slope at the net's ends
+POLYNOMIAL_DEGREE = 2  # degree of the polynomial in x and y
+NET_MARGIN = 0.2  # margin of the field's net beyond the lens's, relative to its side; cosines end with zero slope
 POINTS_PER_NET_CELL = 6.0  # mean number of points in a cell of the net
 FIELD_NET_LIMITS = (9, 513)  # minimum and maximum number of control points per side
-MAX_REFINEMENT = 4  # maximum ratio of control points per side, of the field to the lens; the nets are not nested
-BANDS_PER_OCTAVE = 4
+MAX_REFINEMENT = 4  # refinement per side of a lens's net to which a finer field is added; the two nets are not nested
+BANDS_PER_OCTAVE = 4  # number of bands of the spectrum per octave of frequency
 SPECTRUM_ROUNDS = 8  # number of alternating estimates of field and spectrum
 FIRST_MOTION_ROUND = 3  # round from which the spectrum is good enough to weight the motions
 MAX_FIELD_STEPS, FIELD_TOLERANCE = 30, 1e-4  # maximum steps of conjugate gradients, and their relative tolerance
 DETECTION_SIGMAS = 3.0  # excess over noise, in standard deviations, at which a band of frequencies contains form
 UNDETECTED_VARIANCE = 1e-4  # variance of the form in a band without detected form, relative to the noise
-MAX_RELIEF_UNCERTAINTY = 0.001  # uncertainty of a motion from fine relief, in half widths, above which it stays zero
+MAX_RELIEF_UNCERTAINTY = 0.001  # uncertainty from fine relief, in half widths, above which a motion stays zero
 EXTRAPOLATION_BANDS = 6  # number of bands from which the spectrum is extrapolated below the noise
 MIN_NOISE_RATIO = 1e-3  # lower bound of the noise relative to the RMS deviation
 SAMPLING_STRIPS = 32  # number of strips in which a net is sampled, which bounds the memory
@@ -52,7 +52,7 @@ class FormError:
     random_field: BSplineSurface = field(repr=False)
     spread: np.ndarray = field(repr=False)  # standard deviations (m, m) of the field's cosine amplitudes, mm
     noise: float  # RMS noise of the points, mm
-    motion: np.ndarray  # motion (6,) of the fine relief relative to the alignment, which form biases (BackFace.columns)
+    motion: np.ndarray  # motion (6,) of fine relief from the alignment, which form errors bias; see BackFace.columns
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return δz (mm) at (x, y) in mm, relative to the alignment by least squares."""
@@ -62,7 +62,7 @@ class FormError:
         return smooth + sag(self.random_field, x, y) + moved @ self.motion
 
     def add_to(self, surface: BSplineSurface) -> BSplineSurface:
-        """Return `surface` plus this form error, interpolated at the control points of the finer of the two nets."""
+        """Return `surface` plus this form error, interpolated on its net, refined if the field's is finer."""
         sides = [
             own if count <= own else max(count, min(MAX_REFINEMENT * own, FIELD_NET_LIMITS[1]))
             for count, own in zip(self.random_field.shape, surface.shape, strict=True)
@@ -113,7 +113,7 @@ def frequencies(net: BSplineSurface) -> np.ndarray:
 
 
 def _legendre(back: BSplineSurface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the products (n, 6) of Legendre polynomials of x and y up to POLYNOMIAL_DEGREE, -1 to 1 on the net."""
+    """Return the products (n, 6) of Legendre polynomials up to POLYNOMIAL_DEGREE, of x and y scaled to ±1."""
     u, v = (2 * (t - low) / (high - low) - 1 for t, (low, high) in zip((x, y), (back.x, back.y), strict=True))
     i, j = np.indices((POLYNOMIAL_DEGREE + 1, POLYNOMIAL_DEGREE + 1))
     products = np.polynomial.legendre.legvander2d(u, v, (POLYNOMIAL_DEGREE, POLYNOMIAL_DEGREE))
@@ -123,10 +123,10 @@ def _legendre(back: BSplineSurface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _field(
     net: BSplineSurface, rows: scipy.sparse.csr_array, off: np.ndarray, motions: np.ndarray, *, reach: float
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """Return heights (m, m), standard deviations of the cosine amplitudes, noise and motion of the random field.
+    """Return the field's heights (m, m), standard deviations (m, m) of its amplitudes, the noise (mm) and motion (k,).
 
-    motions: changes (n, k) of the deviations `off` by motions of the part, without polynomials.  Generalised least
-    squares gives the motion: the field's fit to `off` has the residual σ² V⁻¹ off, V the covariance of field + noise.
+    rows: basis functions (n, m²).  motions: changes (n, k) of the deviations `off` due to motions, less polynomials.
+    Generalised least squares gives the motion: the fit to `off` leaves σ² V⁻¹ off, V the covariance of field + noise.
     """
     (m, _), n = net.shape, len(off)  # the net is square
     gram = (rows.T @ rows).tocsr()
@@ -170,7 +170,7 @@ def _motion_by_relief(
 
 
 def _variances(energy: np.ndarray, modes: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Estimate the variance of the form in each band from its energy relative to the noise.
+    """Estimate the variance of the form in each band from its energy relative to the noise; modes: cosines per band.
 
     Bands below the noise continue the last bands above the noise with a power law of the frequency, which polished and
     turned faces follow, but stay below the limit of detection.
@@ -198,7 +198,7 @@ def _posterior_mean(
     """Return the posterior mean (m, m) of the amplitudes c, by conjugate gradients.
 
     (1 + sqrt(S) Cᵀ G C sqrt(S) / σ²) c / sqrt(S) = sqrt(S) Cᵀ b / σ² is solved for c / sqrt(S), preconditioned
-    with the square root of the matrix's diagonal for evenly spaced points.
+    with the square root of the matrix's diagonal for evenly spaced points.  C: inverse cosine transform; b: right side.
     """
     m, even = len(variance), 1 + variance * per_mode / noise2
     root = np.sqrt(variance / even)
@@ -242,7 +242,7 @@ def _bands(frequency: np.ndarray) -> tuple[np.ndarray, int]:
 
 DEVIATION_MAP_POINTS = 301  # number of points per side of the deviation map
 ZERNIKE_ORDER = 10  # maximum n + |m| of the 36 terms of the fringe set
-ZERNIKE_FIT_POINTS = 50_000  # approximate number of points to which Zernike terms are fitted
+ZERNIKE_FIT_POINTS = 50_000  # maximum number of points to which Zernike terms are fitted
 MAP_FILES = ("deviation.npz", "deviation.csv")  # file names of the deviation map
 SHORTEST_PERIOD = 2.0  # shortest period of a form error, in pitches of the field's net
 
@@ -283,7 +283,7 @@ def map_files(made: Deviation) -> dict[str, bytes]:
 
 
 def deviation(lens: Lens, alignment: Alignment, form: FormError) -> Deviation:
-    """Return the figures of a made face."""
+    """Return the deviation of the back face of a made part from `lens`."""
     axes = [np.linspace(-a, a, DEVIATION_MAP_POINTS) for a in lens.outline.half_extent]
     x, y = np.meshgrid(*axes)
     inside = lens.outline.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
@@ -306,7 +306,7 @@ def deviation(lens: Lens, alignment: Alignment, form: FormError) -> Deviation:
 
 
 def _octaves(form: FormError, x: np.ndarray, y: np.ndarray, total: np.ndarray) -> tuple[Band, ...]:
-    """Split the form's height and slopes (3, n) into the part without the random field, and octaves of the field."""
+    """Split the form's height and slopes, `total` (3, n), into the part without the field, and octaves of the field."""
     shortest = SHORTEST_PERIOD * max(form.random_field.pitch)
     period = 2 * max(high - low for low, high in (form.random_field.x, form.random_field.y))  # first cosine (mm)
     bands = [_band(None, total - np.stack(sampled(form.random_field, x, y)))]
@@ -349,11 +349,11 @@ def zernike(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 ZONE_TOLERANCE = 1e-3  # distance by which points may lie outside the minimum zone, relative to its half width
 ZONE_CHUNK = 400  # number of points in the first linear program, and added in each round
-MAX_ZONE_ROUNDS = 30
+MAX_ZONE_ROUNDS = 30  # maximum number of linear programs
 
 
 def minimum_zone(face: BackFace, alignment: Alignment) -> tuple[float, Pose]:
-    """Return width (mm) and pose of the narrowest zone between two envelopes of spheres about the design.
+    """Return width (mm) and pose of the narrowest zone between two envelopes of spheres centred on the design.
 
     The width is twice the largest distance, minimised over the motions that the face determines (Chebyshev):
     min t subject to |d_i + n_i · motion| <= t for all points, starting from the alignment by least squares.  Few points

@@ -23,7 +23,7 @@ from bstcad.verify.verdict import Check
 
 MAX_RMS_DISTANCE = 3e-3  # RMS distance after alignment, in half widths, above which a part is of another design
 MIN_RELIEF = 0.5  # fine relief, as a fraction of the design's, below which a part is of another design
-COARSE_DEGREE = 4  # degree of the polynomial without which relief is fine: parts of equal optical power share it
+COARSE_DEGREE = 4  # degree of the polynomial that is removed from relief: parts of equal optical power share it
 MIN_DESIGN_RELIEF = 3e-5  # RMS fine relief of a design, in half widths, below which a part is not judged by relief
 SCALE_TOLERANCE = 2e-4  # relative tolerance of the scale, about the size of a thermal expansion
 SCALE_SIGMAS = 3.0  # tolerance of the scale, in standard uncertainties, if larger than SCALE_TOLERANCE
@@ -40,7 +40,7 @@ class MadePart:
     checks: tuple[Check, ...]
     facts: dict[str, Any]  # entry `measured` of report.json
     deviation: Deviation
-    # Predicted pictures, one for each target (rows, columns), row 0 = y max, with the sum of the target.
+    # Predicted picture on each target, (rows, columns), row 0 = y max, scaled to the sum of the target's picture.
     irradiances: tuple[np.ndarray, ...] = field(repr=False)
     outliers: np.ndarray = field(repr=False)  # points left out of the fit (n, 3), mm, in the frame of the design
 
@@ -48,7 +48,7 @@ class MadePart:
 def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = None) -> MadePart:
     """Judge a made part by the cloud of its back face; raise ValueError if the cloud cannot be aligned with that face.
 
-    lens: the lens as re-read from the STEP file.  effort: effort of the measurement of its light.
+    lens: lens as re-read from the STEP file.  effort: upper limit of the effort of measuring the light (None: FULL).
     """
     lens = replace(lens, outline=lens.apertures[1])  # if a mount cuts the rim, the face ends there
     face = BackFace.of(lens)
@@ -82,9 +82,9 @@ def _cloud_checks(
 ) -> Iterator[Check]:
     """Check that a cloud is in mm and has the design's axes, and that it is of this face, complete, clean and in place.
 
-    axes: exchange of axes that the cloud needs, in words; scale: of the cloud, with uncertainty; decentre: limit (mm).
+    axes: exchange of axes that the cloud needs, in words; scale: scale and its uncertainty; decentre: limit (mm).
     """
-    extent = f"its extent is the lens's in {cloud.unit}"
+    extent = f"its extent fits the lens if its unit is {cloud.unit}"
     yield Check.true("made part: the cloud is in mm", cloud.unit == "mm", extent, id="made-unit")
     yield Check.true("made part: the axes of the cloud are the design's", not axes, axes, id="made-axes")
     yield from _identity_checks(face, alignment)

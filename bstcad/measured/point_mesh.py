@@ -1,7 +1,7 @@
 """Read the vertices of PLY and STL files.
 
 The amount of data that a header declares is compared with the size of the file before memory is allocated.  If the two
-differ, the message states each.
+differ, the message states both.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ PLY_TYPES = {  # names of number types in numpy, by their names in PLY
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
-ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}  # byte order in numpy of each binary format of PLY
 MAX_PLY_HEADER_SIZE = 1 << 20  # largest size of a header (bytes)
 STL_HEADER_SIZE, STL_TRIANGLE_SIZE = 84, 50  # bytes: 80 of text and a count; twelve float32 and two bytes
 
@@ -38,7 +38,7 @@ def read_mesh(data: bytes, ending: str) -> MeasuredPoints:
 
 
 class _Damaged(Exception):
-    """A file does not have the format of its suffix."""
+    """Error of a file that does not have the format of its suffix."""
 
 
 # ---- PLY -------------------------------------------------------------------------------------------------------------
@@ -99,7 +99,7 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
             case _:
                 raise _Damaged(f"its header has the unknown line {line.strip()[:40]!r}")
     if form != "ascii" and form not in ORDERS:
-        raise _Damaged(f"its format is {form[:40]!r}")
+        raise _Damaged(f"its header has the unknown format {form[:40]!r}")
     return form, elements, end.end()
 
 
@@ -173,7 +173,7 @@ Parts = list[tuple[np.dtype, np.dtype | None]]  # types of each property's items
 
 
 def _next_row(data: bytes, parts: Parts, at: int) -> tuple[list[int], int]:
-    """Return the numbers of items of the row at an offset, and the offset after it: after the data if it is cut off."""
+    """Return the number of items of each property in the row at `at`, and the row's end, beyond the data if cut off."""
     sizes = []
     for kind, length in parts:
         size = 1

@@ -1,9 +1,9 @@
 """Read points from text: lines of x, y and z with any common separator, among other columns that a heading names.
 
-Without a heading a file has three columns of numbers, in mm, and optionally names of the points.  A heading states
-columns and units; if it names nominal and actual coordinates, the actual ones are read.  Lines without data, as
-instruments write them ("Bad", "No Data", NaN, an empty height), are counted and left out.  A line that cannot be
-interpreted is an error, which states its number.
+Without a heading a file has three columns of numbers, in mm, and optionally names or numbers of the points.  A heading
+states columns and units; if it names nominal and actual coordinates, the actual ones are read.  Lines without data, as
+instruments write them ("Bad", "No Data", NaN, an empty height), are counted and left out.  If a line cannot be
+interpreted, the error states the line's number.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ NO_DATA = (
     r"[+-]?nan(?:\(\w*\))?|[+-]?1\.#(?:qnan|ind|snan)0*|no[ _]?data|bad|invalid|missing|masked|null|none|n/?a"
     r"|-{1,3}|\*+"
 )
-NON_NUMERIC = re.compile(r"[a-df-zA-DF-Z#*]|-(?![\d.])")
+NON_NUMERIC = re.compile(r"[a-df-zA-DF-Z#*]|-(?![\d.])")  # character that no plain number contains
 NO_DATA_FIELD = re.compile(rf"(?<![^\s,;\"])(?:{NO_DATA})(?![^\s,;\"])", re.IGNORECASE)
 NUMBER_WITH_COMMA = r"[+-]?\d*,\d+(?:[eEdD][+-]?\d+)?"
 EMPTY_FIELD = re.compile(r';[ ]*[;\n]|"[ ]*"|^[ ]*(?=;)', re.MULTILINE)  # empty field between semicolons
@@ -54,7 +54,7 @@ class MeasuredPoints:
 
     positions: np.ndarray  # positions of the points (n, 3), mm, or in an unknown unit if the file states none
     without_data: int = 0  # number of points that lack a coordinate and were left out
-    columns: str = ""  # names of the columns that were read, if the heading names nominal and actual ones
+    columns: str = ""  # names of the columns that were read, if others state x, y or z, too, or for a Zygo file
 
 
 def make_points(positions: np.ndarray, where: Sequence[int] | None = None, columns: str = "") -> MeasuredPoints:
@@ -288,7 +288,7 @@ def _split_role(word: str) -> tuple[str, ...]:
 
 
 def _check_field_counts(heading: _Heading, lines: list[tuple[int, str]], layout: _Layout) -> None:
-    """Raise ValueError for a line that has more fields than the heading, which then names the wrong columns."""
+    """Raise ValueError for a line with more fields than the heading (or the first lines) has columns."""
     mark = layout.separator
     for number, line in lines:
         count_bound = len(line.split()) if mark is None else line.count(mark) + 1
@@ -296,8 +296,8 @@ def _check_field_counts(heading: _Heading, lines: list[tuple[int, str]], layout:
             continue
         if (count := len(layout.fields(line))) > heading.fields:
             raise ValueError(
-                f"line {number} has {count} fields, but its heading names {heading.fields} columns; write decimals "
-                "with points, and names as one word or in quotes"
+                f"line {number} has {count} fields, but its heading or first lines have {heading.fields} columns; "
+                "write decimals with points, and names as one word or in quotes"
             )
 
 

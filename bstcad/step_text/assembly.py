@@ -1,8 +1,8 @@
 """The placements that a STEP file states for its solid, each as defined in ISO 10303-42 and -43.
 
-A shape representation is part of another one by a relationship with an ITEM_DEFINED_TRANSFORMATION, which an assembly
-states for each of its parts, by a MAPPED_ITEM, or by a plain relationship, without a change of coordinates.  The
-transformation maps one AXIS2_PLACEMENT_3D to another.  Nested transformations are composed.
+One of three statements makes a shape representation part of another one: a relationship with a transformation, which
+an assembly states for each of its parts, a MAPPED_ITEM, or a plain relationship, which keeps the coordinates.  An
+ITEM_DEFINED_TRANSFORMATION maps one AXIS2_PLACEMENT_3D to another.  Nested transformations are composed.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def _frame(name: str, entities: Entities) -> Placement:
 
 
 def _axes(location: str, axis: str | None, reference: str | None, entities: Entities) -> Placement:
-    """Return the placement with an origin, z and x direction.  Without z or x, the representation's axis is used.
+    """Return the placement with an origin, z direction and x direction; None: the z or x axis of the representation.
 
     A tilted z without x is refused: ISO 10303-42 projects the x axis, but some readers choose another axis.
     """

@@ -1,7 +1,7 @@
 """Entities of a STEP file: the statements of its DATA section (ISO 10303-21).
 
 Text that is not a token of Part 21, such as NAN or 1.5.2, is refused with the number of its statement.  Other STEP
-readers read zero or hang.
+readers read it as zero or hang.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ import numpy as np
 
 from bstcad.runs.files import one_line
 
-MAX_COORDINATE = 1e12  # largest coordinate of a point (mm); a target may be 1e8 mm away
+MAX_COORDINATE = 1e12  # largest coordinate of a point, in the file's unit; a target may be 1e8 mm away
 MAX_NUMBER_LENGTH = 64  # largest number of characters of a number; a double has 17 digits, a sign and an exponent
 
 ENTITY = r"[1-9]\d{0,17}"  # pattern of an entity's number, which fits into 64 bits
 REAL = r"[-+]?\d+\.\d*(?:E[-+]?\d+)?"
 COORDINATE = rf"[-+]?\d{{1,{MAX_NUMBER_LENGTH}}}+\.\d{{0,{MAX_NUMBER_LENGTH}}}+(?:E[-+]?\d{{1,4}}+)?"
 BLANKS = bytes(code for code in range(256) if chr(code).isspace())
-STRING = re.compile(  # text with empty strings, then a string or comment; few calls of `numbered`
+STRING = re.compile(  # text, which may contain empty strings, then a string or comment: few calls of `numbered`
     r"((?:[^'/]++|''(?!')|/(?!\*))*+)('[^']*(?:''[^']*)*'|/\*.*?(?:\*/|\Z)|'|\Z)", re.DOTALL
 )
 POINT_TEXT = re.compile(rf"(?<=;)#({ENTITY})=CARTESIAN_POINT\('\d*',\(({COORDINATE},{COORDINATE},{COORDINATE})\)\);")
@@ -34,9 +34,9 @@ STATEMENT = re.compile(rf"#({ENTITY})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
 TOKENS = re.compile(  # tokens without blanks: separators, references, numbers, strings, enumerations, keywords
     r"[(),;]++|(?:#\d{1,20}+,)++|#\d{1,20}+(?=[)=])=?|'\d*+'|\.[A-Z_0-9]++\.|[$*](?=[,)])|!?[A-Z_][A-Z_0-9]{0,99}+(?=\()"
     r"|[-+]?\d{1,99}+(?:\.\d{0,99}+(?:[Ee][-+]?\d{1,9}+)?)?(?=[,)])|\"[0-9A-F]*+\""
-)  # each token is bounded, or begins with a character that it cannot contain, so that matching takes linear time
+)  # a token is of bounded length, or begins with a character that it cannot contain, so that matching takes linear time
 LONG_NUMBER = re.compile(rf"(?<=[(,])[-+.\d][-+.\dEe]{{{MAX_NUMBER_LENGTH},}}")
-HUGE_NUMBER = re.compile(r"(?<=[(,])[-+]?\d++\.\d*+[Ee]\+?\d{3,}+")  # number of at least 1e100
+HUGE_NUMBER = re.compile(r"(?<=[(,])[-+]?\d++\.\d*+[Ee]\+?\d{3,}+")  # number whose exponent has three digits or more
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Entities:
         return re.findall(r"#(\d+)", self.bodies[number][1])
 
     def string(self, number: str, index: int) -> str:
-        """Return the first (index 0) or second (1) attribute of an entity in one line; "" if it is not a string."""
+        """Return the first (index 0) or second (1) attribute of an entity as one line; "" if it is not a string."""
         attributes = required(re.match(r"\((?:'(\d*)')?(?:,'(\d*)')?", self.bodies[number][1])).groups()
         return decode(self.strings[int(attributes[index])]) if attributes[index] else ""
 
@@ -88,7 +88,7 @@ def without_blanks(text: str) -> tuple[str, list[str]]:
 
 
 def read_entities(text: str) -> tuple[str, Entities]:
-    """Return the text of a STEP file without blanks and points, and its entities; ValueError if the file is damaged."""
+    """Return a STEP file's text without blanks, strings and rows of points, and its entities; ValueError if damaged."""
     parts = [text] if POINTS_MARK in text else POINT_ROWS.split(text)
     data, strings = without_blanks(POINTS_MARK.join(parts[::2]))
     start, end = data.find("DATA;"), data.rfind("ENDSEC;")
@@ -147,7 +147,7 @@ def decode(string: str) -> str:
 
 
 def _check_tokens(rest: str, hits: Sequence[re.Match[str]]) -> None:
-    """Raise ValueError with the statement if the text contains an unknown token or a number too large for a double."""
+    """Raise ValueError with the statement if the text has an unknown token, or a number too long or beyond a double."""
     if TOKENS.sub("", rest):
         number, kind, body = next(hit.groups() for hit in hits if TOKENS.sub("", hit[3]))
         atoms = (atom for atom in re.split(r"[(),]+", body) if TOKENS.sub("", f"({atom})"))

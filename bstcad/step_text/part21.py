@@ -29,23 +29,23 @@ from bstcad.step_text.placement import Placement, identity
 
 MAX_BYTES = 600_000_000  # largest file (bytes): 2049 x 2049 control points of 130 bytes each, with references to them
 MAX_DEGREE = 25  # largest degree of a spline, as in OCC
-CONIC_NET = 9  # control points of a conic or a nearly flat sphere; a freeform face has more
+CONIC_NET = 9  # number of control points of a conic or a nearly flat sphere; a freeform face has more
 
 REALS = rf"{REAL}(?:,{REAL})*"
 COUNTS = r"\d{1,9}(?:,\d{1,9})*"
 FLAG = r"\.([TFU])\."
 REFERENCES = re.compile(rf"#{ENTITY}(?:,#{ENTITY})*")
-RULED = re.compile(r"\d+,1,")  # degrees of a ruled wall: 1 in v
+RULED = re.compile(r"\d+,1,")  # degrees in u and v of a ruled wall: 1 in v
 SURFACE = re.compile(
     rf"(\d{{1,9}}),(\d{{1,9}}),\(\((.*?)\)\),\.\w+\.,{FLAG},{FLAG},{FLAG},"
     rf"\(({COUNTS})\),\(({COUNTS})\),\(({REALS})\),\(({REALS})\),\.\w+\.\)"
 )
-VALIDATION, MATERIAL = "geometric validation property", "material property"
+VALIDATION, MATERIAL = "geometric validation property", "material property"  # names of kinds of properties
 PREFIXES = {"$": 1.0, ".MICRO.": 1e-6, ".MILLI.": 1e-3, ".CENTI.": 1e-2, ".DECI.": 1e-1, ".KILO.": 1e3}
 UNITS = {"METRE": 1e3, "GRAM": 1.0}  # SI units in mm and g
 PER_CM3 = 1e3  # density of 1 g/mm³ in g/cm³
 UNKNOWN_VALUE = math.nan  # value of a number that cannot be read or has an unknown unit: its check fails
-NUMBER = r"[-+]?\d+(?:\.\d*(?:E[-+]?\d+)?)?"
+NUMBER = r"[-+]?\d+(?:\.\d*(?:E[-+]?\d+)?)?"  # pattern of a number, with or without a decimal point
 UNREADABLE = (LookupError, AttributeError, TypeError, ArithmeticError)  # errors of a missing or malformed entity
 
 
@@ -73,7 +73,7 @@ class ProfileTolerance:
     """A profile tolerance of a surface."""
 
     width: float  # width of the tolerance zone (mm)
-    surface: str  # entity of the toleranced face's surface; "": the file refers to it in an unknown form
+    surface: str  # entity of the toleranced face's surface; "": the reference to the face has an unknown form
     face: str = ""  # name of the toleranced face
 
 
@@ -124,7 +124,7 @@ class StepText:
 
 
 def read(path: str | Path) -> StepText:
-    """Read the STEP file at `path`; ValueError if it is missing, truncated or not one lens."""
+    """Read the STEP file at `path`; ValueError if it is missing, damaged, or has no freeform face or more than two."""
     path = Path(path)
     try:
         data = files.contents(path, MAX_BYTES)
@@ -137,7 +137,7 @@ def read(path: str | Path) -> StepText:
 
 
 def read_lens(path: str | Path, any_unit: bool = False) -> StepText:
-    """Read a lens in millimetres (any_unit: in any unit of length) and radians; ValueError for anything else."""
+    """Read a lens in millimetres (any_unit: in any unit of length) and radians, of one solid; ValueError otherwise."""
     text, name = read(path), f"{Path(path).name}: read as text"
     if not any_unit and text.unit != "millimetre":
         raise ValueError(f"{name}: its lengths are in {text.unit}; export it in millimetres")
@@ -222,7 +222,7 @@ def _unit_name(body: str, entities: Entities) -> str:
         name = one_line(entities.strings[int(index)].lower()[:40])
         return f"{name} with a conversion factor" if "metre" in name or "radian" in name else name
     if body.count("SI_UNIT(") != 1:
-        raise damaged("a unit has no kind, or two kinds")
+        raise damaged("a unit is not based on one SI_UNIT")
     prefix, unit = required(re.search(r"SI_UNIT\((\.\w+\.|\$),\.(\w+)\.\)", body)).groups()
     return (prefix.strip(".$") + unit).lower()[:40]
 
@@ -277,7 +277,7 @@ def _freeform_surfaces(entities: Entities) -> list[FreeformSurface]:
         raise ValueError("the file has no B_SPLINE_SURFACE_WITH_KNOTS; give a file written by bstcad")
     large = [each for each in bodies if each[1].count("#") > CONIC_NET]
     if len(large) > 2:
-        raise ValueError(f"the file has {len(large)} freeform surfaces, but a lens one or two; export only the lens")
+        raise ValueError(f"the file has {len(large)} freeform surfaces, not one or two; export the lens alone")
     surfaces = [_surface(*each, entities) for each in large or bodies[:1]]
     if len(surfaces) > 1:
         (middle, normal), (other, its_normal) = map(_middle_and_normal, surfaces)
@@ -319,7 +319,7 @@ def _surface(entity: str, body: str, entities: Entities) -> FreeformSurface:
 
 
 def _net(text: str) -> np.ndarray:
-    """Return the entity numbers (m, n) of a control net, one line of text per row."""
+    """Return the entity numbers (m, n) of the points of a control net from its list of references."""
     lines = text.split("),(")
     if not all(REFERENCES.fullmatch(line) for line in lines):
         raise ValueError("the control net is damaged; write the file again")
@@ -332,10 +332,10 @@ def _net(text: str) -> np.ndarray:
 def _check_knots(counts: np.ndarray, knots: np.ndarray, points: int, degree: int) -> None:
     """Raise ValueError unless knots of these multiplicities define a spline of this degree and number of points."""
     if not 1 <= degree <= MAX_DEGREE:
-        raise damaged(f"a spline has degree {degree}")
+        raise damaged(f"a spline has degree {degree}, but 1 to {MAX_DEGREE} are possible")
     rising = np.isfinite(knots).all() and (np.diff(knots) > 0).all()
     if not rising or len(counts) != len(knots) or counts.min() < 1 or counts.sum() != points + degree + 1:
-        raise damaged(f"{counts.sum()} knots do not fit {points} control points of degree {degree}")
+        raise damaged(f"the knots do not rise, or {counts.sum()} do not fit {points} control points of degree {degree}")
 
 
 # ---- stated properties of the part ---------------------------------------------------------------------------------
@@ -345,8 +345,8 @@ def _properties(entities: Entities, products: set[str], unit: float) -> Validati
     """Return the properties that a file states; a number that cannot be read is UNKNOWN_VALUE.
 
     unit: unit of length of the file (mm), in which centroids are stated; a measure states its unit.
-    products: product definitions of the lens; if empty, properties of all products are read.  Others, such as an
-    assembly, have centroids in frames of their own.
+    products: product definitions of the lens; if empty, properties of all products are read.  Other products, such
+    as an assembly, have centroids in frames of their own.
     """
     items: dict[tuple[str, str], list[str]] = {}  # (kind of property, its name) -> first items of its representations
     for body in entities.of("PROPERTY_DEFINITION_REPRESENTATION").values():
@@ -403,7 +403,7 @@ def _unit_scale(entities: Entities, unit: str) -> float:
 def _unit_size(entities: Entities, unit: str) -> float | None:
     """Return the size of a named unit of length (mm) or mass (g); None if it is not derived from an SI_UNIT."""
     body, factor = entities.bodies[unit][1], 1.0
-    if converted := re.search(r"CONVERSION_BASED_UNIT\('\d+',#(\d+)\)", body):  # such as an inch, by a measure in mm
+    if converted := re.search(r"CONVERSION_BASED_UNIT\('\d+',#(\d+)\)", body):  # such as an inch, defined in mm
         measure = re.search(rf"\(({NUMBER})\)?,#(\d+)\)", entities.bodies[converted[1]][1])
         if measure is None:
             return None

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 MAX_GRID_DEVIATION = 1e-9  # largest deviation (mm) of an unmoved net from a uniform grid centred on the axis
-FLAT_RMS = 1e-7  # RMS deviation (mm) from a plane below which a net has the normal of that plane
+FLAT_RMS = 1e-7  # RMS deviation (mm) from a plane, below which a net's z axis is the plane's normal
 PARALLEL_SINE = 1e-9  # sine of the angle below which two directions are parallel
 DECIMALS = 9  # decimals of a stated shift (mm) and rotation (degrees); further ones are rounding errors
 

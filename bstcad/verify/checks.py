@@ -40,17 +40,17 @@ from bstcad.verify.verdict import Check
 if TYPE_CHECKING:
     from bstcad.verify.step_checks import ExaminedFile  # this import loads OCC
 
-VERTEX_ROUNDING = 2e-7  # distance of a float32 vertex from a sloped face, relative to the largest coordinate
+VERTEX_ROUNDING = 2e-7  # largest distance of a float32 vertex from a sloped face, relative to the largest coordinate
 VERIFY_SEED = 1_000_003  # offset of the seed, for rays that tailoring has not used
-TARGET_TOLERANCE = 1e-3  # difference of targets by versions of picture libraries, relative to the brightest pixel
-DEFAULT_RRMSD_LIMIT = 0.25  # limit of the RRMSD in remarks, plans and tolerance studies without accept.rrmsd
+TARGET_TOLERANCE = 1e-3  # largest difference of a target due to versions of picture libraries, relative to its maximum
+DEFAULT_RRMSD_LIMIT = 0.25  # limit of the RRMSD in remarks, plans and tolerance studies if accept.rrmsd is not set
 LINE_TUBES = 1031  # smallest number of tubes per side for the picture of one line of a spectrum
-CLEAR_APERTURE_TOLERANCE = 1e-3  # largest distance of two rims (mm), since a scene states only an edge's largest inset
+CLEAR_APERTURE_TOLERANCE = 1e-3  # largest distance (mm) between the rims of measured and designed apertures
 MIN_MOUNT_LOSS = 1e-3  # fraction of the light that a mount must cut away to be given as the reason for a failure
 MAX_FLANGE_LIGHT = 1e-3  # largest fraction of the light through the lens that may meet the flange
 WAVEFRONT = "wavefront error, RMS in waves, piston and tilt removed"
-DRAFT_ACCURACY = 0.01  # relative standard error of the RRMSD of a draft at which sampling ends
-MAX_FLOOR = 0.1  # largest ratio of the wavefront error's rounding to its limit; above it the verdict is uncertain
+DRAFT_ACCURACY = 0.01  # relative standard error of the RRMSD of a draft at which ray tracing ends
+MAX_FLOOR = 0.1  # largest ratio of the wavefront error's rounding error to accept.wavefront, for a certain verdict
 TIME_LIMIT, TIME_LIMIT_PER_MB = 120.0, 3.0  # timeout of OCC (s) and its increase per MB, 100 times the usual time
 
 R = TypeVar("R")
@@ -80,7 +80,7 @@ class Nominal:
         return max(self.channels, key=lambda channel: channel.weight)
 
     def effort(self, given: Effort | None = None) -> Effort:
-        """Return the effort of measuring this design, smaller for a draft; given: upper limit; None: no limit."""
+        """Return the effort of measuring this design, smaller for a draft; given: upper limit (None: FULL)."""
         given, tailoring = given or FULL, self.scene.tailoring
         accuracy = DRAFT_ACCURACY if tailoring.quality == "draft" else FULL.accuracy
         return replace(given, seed=tailoring.seed, accuracy=max(given.accuracy, accuracy))
@@ -107,9 +107,9 @@ class Proof:
     lights: tuple[Light, ...]  # light of the lens on each target
     shape: dict[str, float | None]  # dimensions of the lens within the mount's rim, and volume of lens.step (mm³)
     stability: dict[str, float | int | None]  # margins to numerical limits, see `_stability`
-    blur: Blur | None = None  # blur by the source's size on the worst target; None: the source has no size
+    blur: Blur | None = None  # blur due to the source's size on the worst target; None: the source has no size
     lines: Lines = ()  # pictures of the lines of a spectrum on the worst target
-    at_bounds: dict[str, AtBound] | None = None  # bounds that the lens meets, by key; None: no bounds
+    at_bounds: dict[str, AtBound] | None = None  # bounds that the lens reaches, by key; None: no bound is reached
     wavefront: WavefrontError | None = None  # error of the wavefront; None: not requested, or no light reaches it
 
     @property
@@ -198,7 +198,7 @@ def _check_solids(path: Path, nominal: Nominal, part: Part, points: int, submit:
 
 
 def _read_text(path: Path, read: Future[Lens]) -> StepText:
-    """Read the text of lens.step, whose errors are more precise than OCC's.  read: OCC's job; an error ends it."""
+    """Read the text of lens.step, whose errors are more precise than OCC's.  read: OCC's job, which an error ends."""
     try:
         return part21.read_lens(path)
     except ValueError:
@@ -227,9 +227,9 @@ def _with_design_facts(lens: Lens, designed: Lens) -> Lens:
 
 
 def _mounted_lens(read: Future[Lens], bare: Lens, nominal: Nominal, path: Path) -> tuple[Lens, list[Check], str]:
-    """Return the lens of part.step beside lens.step, checks of its clear apertures, and the light lost there in words.
+    """Return the lens of part.step, checks of its clear apertures and lost light, and the loss in words, "" if small.
 
-    If the part cannot be read, which other checks report, return the lens of lens.step with the designed apertures.
+    bare: lens of lens.step, returned with the designed apertures if the part cannot be read, which checks report.
     """
     designed, mount = nominal.lens, nominal.scene.mount
     flange = None if mount is None else mount.flange
@@ -308,12 +308,12 @@ def time_limit(path: Path) -> float:
 
 
 def _ripple_checks(shape: Mapping[str, float | None]) -> list[Check]:
-    """State the RMS slope of the ripple of each tailored face: control points that lie alternately high and low.
+    """State the RMS slope of the ripple of each tailored face: a checkerboard in its net.
 
     There is no limit: the RRMSD judges the effect on the light, and the bounds of the scene the effect on a tool.
     """
     slopes = {"": shape["ripple_slope"], " of the front": shape.get("front_ripple_slope")}
-    measured = "RMS slope of control points that lie alternately high and low"
+    measured = "RMS slope of the checkerboard in the net"
     named = {f"ripple{of}: {measured}": slope for of, slope in slopes.items()}
     return [Check.at_most(name, slope, None, "rad", id="ripple") for name, slope in named.items() if slope is not None]
 
@@ -330,10 +330,10 @@ def _ripple_rrmsd(lens: Lens, nominal: Nominal) -> dict[str, float]:
 def bound_checks(
     lens: Lens, asked: LensBlank, shape: Mapping[str, float | None]
 ) -> tuple[list[Check], dict[str, AtBound]]:
-    """Check the bounds of a scene on its tailored faces, and return the bounds that these meet, by key.
+    """Check the bounds of a scene on its tailored faces, and return the bounds that the lens reaches, by key.
 
-    The bounds are tool_radius, max_slope and the thicknesses of [lens]; shape: dimensions of the re-read lens.  Those
-    of a tool apply to a tailored front and to the back, each seen from outside: a tool has to fit into its valleys.
+    The bounds are tool_radius, max_slope and the thicknesses of [lens]; shape: dimensions of the re-read lens.
+    tool_radius and max_slope apply to each tailored face, seen from outside: a tool has to fit into its valleys.
     """
     checks: list[Check] = []
     found: dict[str, list[tuple[float, Extreme, str]]] = {}
@@ -392,7 +392,7 @@ def _mesh_checks(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal)
     off_faces, rounding = meshes.vertex_error(mesh, lens), VERTEX_ROUNDING * size
     smallest = error * len(mesh.faces) / meshes.MAX_TRIANGLES  # the error is inversely proportional to their number
     where = (
-        f"no mesh has more than {meshes.MAX_TRIANGLES} triangles, whose error is about {smallest:.1g} mm; "
+        f"a mesh cannot have more than {meshes.MAX_TRIANGLES} triangles, whose error is about {smallest:.1g} mm; "
         "set output.mesh_tolerance to more than that"
     )
     where = where if finest and error > tolerance else ""
@@ -436,7 +436,7 @@ def _light_checks(
 
 
 def _wavefront_checks(lens: Lens, nominal: Nominal) -> tuple[WavefrontError | None, list[Check]]:
-    """Return the wavefront error of the re-read lens, and its checks; None if the scene requests no wave."""
+    """Return the wavefront error of the re-read lens, and its checks; None: not requested, or the lens misses it."""
     wave, accepted = nominal.scene.wavefront, nominal.scene.accept.wavefront
     if wave is None:
         return None, []

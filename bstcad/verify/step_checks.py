@@ -37,7 +37,7 @@ from bstcad.verify.verdict import Check
 
 NORMAL_TOLERANCE = 1e-9  # largest angle (rad) between written and designed normals
 CURVATURE_TOLERANCE = 1e-12  # largest difference (1/mm) of written and designed curvature
-CONIC_TOLERANCE = 1e-9  # largest difference of sag (mm) due to the conic constant, uncertain for a nearly flat front
+CONIC_TOLERANCE = 1e-9  # largest difference of sag (mm) due to the conic constant, which a flat front hardly defines
 GAP_TOLERANCE = 5e-7  # largest gap (mm); shapes are written with a tolerance of 1e-7 mm
 PART_EDGE_TOLERANCE = 1e-6  # largest distance (mm) between edges of two parts, written with a tolerance of 1e-7 mm
 PART_FILE = "part.step"
@@ -94,7 +94,7 @@ def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, .
 
 @functools.lru_cache(maxsize=1)
 def _read(path: Path, stamp: object) -> StepLens:
-    """Read a file by OCC, and cache the result, because `lens` and `check` use the same file in turn.
+    """Read a file with OCC, and cache the result, because `lens` and `check` use the same file in turn.
 
     The second process, which may crash, reads the file while the first one reads its text.  Without a second process,
     the text is read first, to find damage.  stamp: changes if the file changes.
@@ -207,7 +207,7 @@ def _front_checks(reread: Surface, lens: Lens, tolerance: float) -> Iterator[Che
     yield Check.at_most(name, abs(found[0] - curvature), CURVATURE_TOLERANCE, "1/mm", id="front-curvature")
     if constant:
         sag = abs(found[1] - constant) * abs(curvature) ** 3 * math.hypot(*lens.outline.farthest) ** 4 / 8
-        name = f"form: sag at the rim by the front's conic constant, {difference}"
+        name = f"form: sag at the rim due to the front's conic constant, {difference}"
         yield Check.at_most(name, sag, CONIC_TOLERANCE, "mm", id="front-conic")
 
 
@@ -237,7 +237,7 @@ def whole_part(path: Path) -> tuple[Lens, WholePart | None]:
 def lens_of_part(folder: Path, designed: Lens, mount: Mount) -> Lens:
     """Read the lens of the part in a design's folder, in the scene's frame, with the clear apertures of its faces.
 
-    Raises ValueError if there is no such part, or the edges of its faces are not those of a mount.
+    Raises ValueError if there is no such part, or the edge of its back is no circle or rectangle about the axis.
     """
     path = folder / PART_FILE
     if not path.exists():

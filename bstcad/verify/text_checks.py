@@ -20,7 +20,7 @@ from bstcad.step_text.part21 import FreeformSurface, StepText, ValidationPropert
 from bstcad.verify.verdict import Check
 
 SOURCE = "STEP text"  # source of the checked values, at the beginning of the checks' names
-NET_TOLERANCE = 1e-11  # absolute tolerance of control points (mm), for rounding to sixteen digits of text
+NET_TOLERANCE = 1e-11  # absolute tolerance of control points (mm), larger than their rounding in the text
 RELATIVE_ROUNDING = 2e-15  # relative tolerance of coordinates, larger than NET_TOLERANCE beyond 5 m from the origin
 MEASURE_TOLERANCE = 1e-6  # relative tolerance of area, volume and centroid; integrals over a rough back err by 1e-9
 VALUE_TOLERANCE = 1e-12  # absolute tolerance of stated numbers (mm or g/cm³), more than their rounding in the text
@@ -60,7 +60,7 @@ def structure_checks(text: StepText, shape: tuple[int, int], name: str = SOURCE,
         for surface, sides in faces
         for axis, full, values, points in zip("uv", surface.full_knots, surface.knots, sides, strict=True)
     )
-    units = f"{text.solids} solids, lengths in {text.unit}"
+    units = f"number of solids: {text.solids}, unit of length: {text.unit}"
     single, one_solid = text.solids == 1 and (any_unit or text.unit == "millimetre"), f"{name}: one solid"
     return [
         Check.true(one_solid if any_unit else f"{one_solid}, in millimetres", single, units, id="one-solid"),
@@ -79,7 +79,7 @@ def _is_plain(surface: FreeformSurface, shape: tuple[int, int]) -> bool:
 def _open_edge(text: StepText) -> str:
     """Return the first edge that is not used once in each direction, in words."""
     uses = ((n, ahead, back) for n, (ahead, back) in text.edge_uses.items() if (ahead, back) != (1, 1))
-    return next((f"edge #{n}: {ahead} times forwards, {back} times backwards" for n, ahead, back in uses), "no edge")
+    return next((f"edge #{n}: used {ahead} x forwards, {back} x backwards" for n, ahead, back in uses), "no edge")
 
 
 def net_check(name: str, read: np.ndarray, designed: np.ndarray, *, id: str) -> Check:
@@ -104,7 +104,7 @@ def _largest_difference(read: np.ndarray, designed: np.ndarray, name: str) -> tu
 def measure_checks(
     stated: ValidationProperties, shape: MassProperties | None, outline: Outline, name: str = SOURCE
 ) -> Iterator[Check]:
-    """Check the stated properties against the shape's (None: none stated); outline: scales the centroid's tolerance."""
+    """Check stated measures against `shape` (None if none is stated); outline: scales the tolerance of the centroid."""
     if stated.of_shape:
         assert shape is not None
         measures = ("area", "mm²", stated.areas, shape.area), ("volume", "mm³", stated.volumes, shape.volume)

@@ -137,7 +137,7 @@ DAMAGES = {
     "alias": (lambda t: t.replace("#60 =", "#07 ="), "not an entity"),
     "behind": (lambda t: t.replace("'','',());", "'','',())A;"), "not an entity"),
     "no data": (lambda t: t.replace("DATA;", "DATUM;"), "no DATA"),
-    "two units": (lambda t: t.replace("SI_UNIT(.M", "SI_UNIT($,.METRE.) SI_UNIT(.M"), "a unit has no kind"),
+    "two units": (lambda t: t.replace("SI_UNIT(.M", "SI_UNIT($,.METRE.) SI_UNIT(.M"), "not based on one"),
     "ragged": (lambda t: t.replace("#3,#4)", "#3)"), "rectangular"),
     "rational": (lambda t: t.replace("B_SPLINE_SURFACE_W", "RATIONAL_B_SPLINE_SURFACE_W"), "no B"),
     "no surface": (lambda t: t.replace(SIMPLE, ""), "no B_SPLINE_SURFACE_WITH_KNOTS"),
