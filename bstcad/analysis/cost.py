@@ -22,7 +22,7 @@ from bstcad.optics.irradiance import Screen
 # --- the end of the convergence curve ---------------------------------------------------------------------------------
 
 LAST_TENTH_RATIO = 1.1  # RRMSD divided by its final value, below which time counts for the last tenth of the error
-FITTED_FRACTION = 0.5  # fraction of the time of tailoring to the irradiance, at its end, to which the law is fitted
+FITTED_FRACTION = 0.5  # last fraction of the time of tailoring to the irradiance, to which the power law is fitted
 MIN_FIT_POINTS = 5  # smallest number of points for a fit
 MIN_R_SQUARED = 0.9  # smallest R² of the fit in logarithms that counts as a power law
 MAX_HALVING = 10.0  # largest reported factor by which the time grows if the error is halved
@@ -50,7 +50,7 @@ class ConvergenceEnd:
 def ending(history: History, stages: StageResults, since: float = 0.0) -> ConvergenceEnd | None:
     """Return the end of a design's history; None if no stage tailored the irradiance.
 
-    stages: results of all stages; their RRMSD by rays, also in the history, is left out.
+    stages: results of all stages; their RRMSDs by rays, which the history also contains, are left out.
     since: time (s) from the start at which tailoring began to use its final channels of light.
     """
     ends = np.cumsum([seconds for seconds, _ in stages])
@@ -98,7 +98,7 @@ def _fit_power(time: np.ndarray, values: np.ndarray) -> tuple[float | None, floa
     return max(0.0, float(-slope)), float(slope**2 * (x * x).sum() / spread) if spread > 0 else 0.0
 
 
-# --- parts of the target and octaves with the error -------------------------------------------------------------------
+# --- the error by parts of the target and by octaves ------------------------------------------------------------------
 
 RIM_RATIO = 64  # side of the target divided by the width of its rim
 EDGE_QUANTILE = 0.9  # quantile of the gradient above which a pixel is at an edge
@@ -127,7 +127,7 @@ def masks(target: np.ndarray) -> dict[str, np.ndarray]:
 
     rim: the outermost 1/64 of the side, at least one pixel, at all four sides.  edges: the tenth of all pixels where
     the gradient (central differences) is largest, if it is at least 2 % of the brightest pixel per pixel.
-    darkest, brightest: a tenth of all pixels, and the pixels equal to the last of these.  rest: all others.
+    darkest, brightest: a tenth of all pixels each, more if pixels are equal.  rest: all others.
     """
     steep = np.hypot(*np.gradient(target))
     dark, bright = np.quantile(target, (TONE_QUANTILE, 1 - TONE_QUANTILE))
@@ -149,7 +149,7 @@ def _in_rim(side: int) -> np.ndarray:
 
 
 def _octaves(error: np.ndarray, per_unit: float) -> list[dict[str, Any]]:
-    """Return the energy of the cosine transform (orthonormal: Parseval) by octaves of frequency, coarse to fine.
+    """Return the energy of an error's cosine transform (orthonormal: Parseval) by octaves of frequency, coarse first.
 
     frequency: lower and upper limit in cycles per pixel (the finest octave extends to 0.71, along the diagonals).
     period: limits on the target, in its unit, the longer first.  error: fraction of the squared error.  The mean is in
@@ -172,7 +172,7 @@ def _octaves(error: np.ndarray, per_unit: float) -> list[dict[str, Any]]:
 
 
 # --- unlit and lifted parts -------------------------------------------------------------------------------------------
-# Target and irradiance have the same sum, (rows, columns), row 0 at y max.
+# Target and irradiance are pictures (rows, columns) of the same sum, with row 0 at y max.
 
 DARK_LEVEL = 0.01  # a pixel of the target is dark below this irradiance, as a fraction of the mean
 UNLIT_LEVEL = 0.1  # a lit pixel counts as unlit below this fraction of its target irradiance
@@ -188,7 +188,7 @@ def unlit(target: np.ndarray, irradiance: np.ndarray, screen: Screen) -> dict[st
     dark = lit & (irradiance < UNLIT_LEVEL * target)
     share = float(dark.sum() / lit.sum())
     least = MIN_UNLIT_FRACTION
-    if share < least or target[dark].sum() < least * target.sum():  # less: pixels of a rim, partly lit
+    if share < least or target[dark].sum() < least * target.sum():  # only pixels of a rim, partly lit
         return {}
     patches, count = scipy.ndimage.label(dark, np.ones((3, 3)))
     largest = 1 + np.argmax(scipy.ndimage.sum_labels(dark, patches, range(1, count + 1)))
@@ -201,9 +201,9 @@ def unlit(target: np.ndarray, irradiance: np.ndarray, screen: Screen) -> dict[st
 
 
 def lifted(target: np.ndarray, irradiance: np.ndarray) -> dict[str, float]:
-    """Return the excess light on the dark parts of the target (fraction of all), and its level (relative to the mean).
+    """Return how much light the dark parts of the target get: a smooth face cannot leave all of them dark.
 
-    A smooth face cannot divide its light without some light in between.
+    light: excess over the target, as a fraction of all light.  level: mean irradiance there / mean of the target.
     """
     dark = target < DARK_LEVEL * target.mean()
     light = float((irradiance - target)[dark].sum() / target.sum())

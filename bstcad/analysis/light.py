@@ -1,4 +1,4 @@
-"""Light through a lens: rays for figures, clear apertures needed, losses at a mount, margins of the trace, blur."""
+"""Light through a lens: rays for plots, clear apertures needed, losses at a mount, margins of the trace, blur."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def _at_interfaces(rays: Rays, lens: Lens) -> list[Rays]:
     return stops
 
 
-# --- rays for figures -------------------------------------------------------------------------------------------------
+# --- rays for plots ---------------------------------------------------------------------------------------------------
 
 FAN_RAYS = 15  # number of rays in `fan`
 GRID_LINES = 33  # number of grid lines in each direction in `ray_map`
 
 
 def fan(source: Emitter, lens: Lens, plane: Receiver) -> np.ndarray:
-    """Return polylines (rays, k, 3) in mm of the rays in y = 0 that arrive: source, each surface, the plane."""
+    """Return polylines (rays, k, 3) in mm of rays in y = 0 that reach the plane, from the source via each surface."""
     half = clear_window(source, lens).width / 2
     x = torch.linspace(-0.98 * half, 0.98 * half, FAN_RAYS, dtype=torch.float64)
     return _polylines(source.rays(x, torch.zeros_like(x), lens.entrance.z, 1.0), lens, plane)[0]
@@ -85,7 +85,7 @@ def ray_map(source: Emitter, lens: Lens, plane: Receiver) -> tuple[np.ndarray, n
 # --- clear apertures needed -------------------------------------------------------------------------------------------
 
 NEEDED_RAYS = 513  # rays per side for `needed_apertures`
-ROUND_RATIO = 1.01  # largest ratio of the radius to half width and half height of light that counts as round
+ROUND_RATIO = 1.01  # largest radius of light that counts as round, relative to its half width and half height
 EXTENT_POINTS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # points of an extended source, in half extents
 FULL_APERTURE = 0.99  # smallest extent of the light / clear aperture at which light fills the face
 
@@ -107,7 +107,7 @@ def needed_apertures(source: Emitter, lens: Lens) -> dict[str, Outline | None]:
 
 
 def _hits(source: Emitter, lens: Lens) -> Tensor:
-    """Return x and y (faces, 2, n) mm on each face of the rays that pass all faces."""
+    """Return x and y (interfaces, 2, n) mm, on each interface, of the rays that pass all faces."""
     area = clear_window(source, lens)
     line = torch.linspace(-0.5, 0.5, NEEDED_RAYS, dtype=torch.float64) * (1 - 1e-9)
     x, y = (p.reshape(-1) for p in torch.meshgrid(line * area.width, line * area.height, indexing="ij"))
@@ -184,7 +184,7 @@ def mount_losses(lens: Lens, channels: Sequence[Channel], flange: tuple[float, f
 
 
 def _misses_opening(rays: Sequence[Rays], rim: Outline, planes: Iterable[float]) -> Tensor:
-    """Return True for rays outside the rim on one of the planes, before the first face or behind the last."""
+    """Return True for rays that cross one of the planes outside the rim, before the first face or behind the last."""
     first, (coming, *_, leaving) = rays[1], rays
     outside = torch.zeros_like(leaving.alive)
     for z in planes:
@@ -203,10 +203,10 @@ MARGIN_RAYS = 512  # rays per side for `margins`
 
 @dataclass(frozen=True)
 class Margins:
-    """Worst cases over all rays that carry light to the back."""
+    """Worst cases of a trace over all rays that carry light to the back."""
 
     tir_margin_deg: float | None  # critical angle minus angle of incidence (degrees), < 0: reflected; None: no such ray
-    newton_slope_min: float | None  # smallest |F'(t)| at a tailored face, divisor of a Newton step; 0: grazing
+    newton_slope_min: float | None  # smallest |F'(t)| from the first net on, divisor of Newton's steps; 0: grazing
     non_finite: int  # number of control points, hits and landing points that are not finite
 
 
@@ -215,7 +215,7 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
     """Return the margins over n x n stratified rays per channel; the points of an extended source share n x n rays.
 
     cos θ = (d_z - d_x z_x - d_y z_y) / sqrt(1 + z_x² + z_y²) where light leaves the glass; total internal reflection at
-    sin θ = 1 / n.  F(t) = z(t) - sag(x(t), y(t)), F' = d_z - d_x z_x - d_y z_y at each face from the first net on.
+    sin θ = 1 / index.  At faces from the first net on F(t) = z - sag(x, y) at path t, F' = d_z - d_x z_x - d_y z_y.
     """
     margin, slope, n = math.inf, math.inf, math.ceil(n / math.sqrt(points_per_line(channels)))
     wrong = sum(int((~torch.isfinite(net.heights)).sum()) for net in lens.nets)
@@ -243,8 +243,8 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
 
 # --- blur by an extended source ---------------------------------------------------------------------------------------
 
-MIN_DISTANCE_RATIO = 2.5  # smallest target distance / width of lens or picture (plate thickness: width / 10)
-MAX_NEARER_RATIO = 0.9  # largest reported ratio of the finest detail on a nearer target to that on the target
+MIN_DISTANCE_RATIO = 2.5  # smallest target distance / width of lens or picture, for a plate of thickness width / 10
+MAX_NEARER_RATIO = 0.9  # largest reported ratio of the finest detail on a nearer target to the one on the target
 
 
 @dataclass(frozen=True)
@@ -301,7 +301,7 @@ class FinestDetail:
 def finest_detail(source_image: float, lens: Lens, screen: Screen, of: str, assumed: bool = False) -> FinestDetail:
     """Return the finest detail on a target where the image of the source (size: `of`) is `source_image` pixels wide."""
     distance, pixel = abs(image_from_lens(lens, screen).throw(lens.back.z)), _pixel(screen)
-    grows = distance == abs(per_radian(lens, screen))  # with the distance; an image over angles keeps its width
+    grows = distance == abs(per_radian(lens, screen))  # False for an image over angles, which keeps its width
     sizes = (*(2 * half for half in lens.outline.half_extent), *(high - low for low, high in (screen.x, screen.y)))
     nearer, image = MIN_DISTANCE_RATIO * max(sizes), source_image * pixel
     width, narrower = (detail_width(image * scale, pixel) for scale in (1.0, nearer / distance))

@@ -1,12 +1,12 @@
 """Effects that a scene neglects: an estimate of the change of the light on the target, from few rays and the picture.
 
 An effect adds channels of light: from another point, at another wavelength, or with less flux.  At a point b of the
-last face the light of all channels meets the same slope.  So the landing point and the transmission of a channel vary
-with b as smoothly as directions and lengths do, however fine the structure of the face, and few rays suffice for two
-fields over the target: the shift δ_k(t) of the light of channel k that lands at t, and its transmission w_k(t).  The
-picture E, of the target or of a finished lens, becomes
+last face the light of all channels meets the same slope.  So a channel's shift of the landing point and its
+transmission vary with b as smoothly as directions and lengths do, however fine the structure of the face, and few rays
+suffice for two fields over the target: for the light that lands at t without the effect, the shift δ_k(t) in channel k
+and the relative transmission w_k(t).  The picture E, of the target or of a finished lens, becomes
 
-    E'(t + δ_k(t)) = Σ_k c_k w_k(t) E(t) |∂(t + δ_k)/∂t|⁻¹,  c_k the weights of the channels.
+    E'(t') = Σ_k c_k w_k(t) E(t) |∂t'/∂t|⁻¹,  t' = t + δ_k(t),  c_k the weights of the channels.
 
 `Change` is the result.  Its RRMSD is between E' and E, normalised to the same sum: the RRMSD of a lens that is perfect
 without the effect.  The RRMSD of a real lens changes by no more (triangle inequality), and usually by less, since its
@@ -43,7 +43,7 @@ FIELD_CELLS = 24  # cells per side of the target, in which the fields are averag
 FIELD_SMOOTHING = (0.8, 2.0, 6.0, 24.0)  # smoothing of fields (cells), wider where light is scarce
 MIN_CELL_FLUX = 1e-4  # smoothed flux of a cell / mean, below which a field needs wider smoothing
 MIN_LIGHT_SHIFT = 1e-6  # largest shift that counts as zero (pixels)
-HALF_SHARP_WIDTH = 1.3  # width of a control cell's light (pixels) at which edges are half as sharp, measured
+HALF_SHARP_WIDTH = 1.3  # measured width of a control cell's light (pixels) at which edges are half as sharp as at best
 MAX_SHARPNESS = 0.75  # fraction of the jump at an edge that the finest cells reproduce, measured
 MAX_SAMPLED_PIXELS = 1 << 19  # largest number of pixels; of larger pictures some rows are sampled
 PADDING = 4  # dark pixels around a picture, within which the ringing of its spline ends
@@ -111,7 +111,7 @@ class Reference:
 
     @torch.no_grad()
     def change(self, channels: Sequence[Channel]) -> Change | None:
-        """Return the change if the light is that of these channels, whose weights sum to 1; None without light."""
+        """Return the change if the light consists of these channels, whose weights sum to 1; None without light."""
         if not self.lit:
             return None
         parts = [(channel.weight, *self._fields(channel)) for channel in channels]  # (c, δ, w)
@@ -125,7 +125,7 @@ class Reference:
         return Change(float(changed.sum() / before.sum() - 1), difference(changed, before), math.sqrt(8 * variance))
 
     def _fields(self, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
-        """Return shift δ (2, …) in pixels and transmission w (…) of a channel, in cells of the target."""
+        """Return shift δ (2, …) in pixels and relative transmission w (…) of a channel, in cells of the target."""
         landed, _ = _trace_through(self.lens, channel, self.screen, self.points)
         arrives = landed.alive.numpy()
         share = self._over_cells(np.where(arrives, _transmission(landed) / self.through, 0.0), self.flux)
@@ -133,7 +133,7 @@ class Reference:
         return np.stack([self._over_cells(p, np.where(arrives, self.flux, 0.0)) for p in shift]), share
 
     def _over_cells(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Average values (n, n) of the light over the cells of the target where it lands, weighted; (rows, columns)."""
+        """Average values (n, n) of the light over the cells (rows, columns) of the target where it lands, weighted."""
         sums = [self._landing(weight * v) for v in (values, 1.0)]
         field, known = np.zeros(sums[0].shape), np.zeros(sums[0].shape, bool)
         for sigma in FIELD_SMOOTHING:
@@ -198,9 +198,9 @@ class Reference:
 class Spline:
     """Picture as a function of x and y, for shifts by fractions of a pixel.
 
-    Light that is uniform in each pixel and jumps between pixels changes in proportion to a small shift; light as smooth
-    as a cubic spline changes with the square of a small blur.  If the control cells of a lens light less than a pixel,
-    it reproduces most of such a jump; if they light several pixels, none.  `sharp` is the weight of the jumps.
+    A picture that jumps from pixel to pixel changes in proportion to a small shift; a picture as smooth as a cubic
+    spline changes with the square of a small blur.  If the control cells of a lens light less than a pixel, the lens
+    reproduces most of a jump; if they light several pixels, none.  `sharp` is the weight of the jumps.
     """
 
     padded: np.ndarray  # picture with a dark margin, (rows, columns)

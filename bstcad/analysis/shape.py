@@ -1,4 +1,4 @@
-"""Shape of a lens in the figures that a machine shop needs; lengths in mm, angles in degrees.
+"""Shape of a lens, in quantities that a machine shop needs; lengths in mm, angles in degrees, slope of a ripple in rad.
 
 Radii and slopes of a face are computed on a grid four times finer than its net.  Curvature jumps at the knots, so each
 knot span is sampled up to its ends, at optics.bspline.QUARTERS inside the outline.  Slopes are computed on the rim too.
@@ -30,7 +30,7 @@ OUTLINE_ROUNDING = 1e-9  # relative rounding of the outline, so that the last po
 
 
 def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
-    """Return thickness, sag range, slope, radii and departure from the best sphere of the back; mm and degrees.
+    """Return thickness, sag range, slope, radii, departure from the best sphere, slope energy and ripple of the back.
 
     A radius is None if the back has no such curvature.  Keys front_… describe a tailored front, seen from outside as
     the back is: valleys are concave.
@@ -154,9 +154,9 @@ def ripple(face: BSplineSurface) -> Ripple:
 def slope_octaves(face: BSplineSurface) -> np.ndarray:
     """Return the slope energy of the control net by octaves of frequency, coarse to fine (mm², squared differences).
 
-    It is Σ λ |ĥ|² over the cosine transform ĥ of the net without its best cubic polynomial (a tilt has no even
-    continuation), λ the Laplacian.  Octave k has the frequencies whose larger index is in (m / 2^(k+1), m / 2^k], m the
-    number of control points along the longer side; indices along the shorter side are scaled to m.
+    It is Σ λ |ĥ|² over the cosine transform ĥ of the net minus its best cubic polynomial (the even continuation of a
+    tilt has kinks), λ the eigenvalue of the Laplacian.  Octave k has the frequencies whose larger index is in
+    (m / 2^(k+1), m / 2^k], m the number of control points along the longer side; the other indices are scaled to m.
     """
     energy, octave = _energy(face, scipy.fft.dctn(_without_cubic(face), norm="ortho")), _octave(face)
     return np.array([energy[octave == k].sum() for k in reversed(range(int(np.log2(max(face.shape)))))])

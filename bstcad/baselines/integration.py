@@ -1,17 +1,17 @@
 """Point-by-point integration of a ray mapping: the traditional construction of a surface from a transport map.
 
 Wang et al. 2023 compare their tailoring with this construction (sections 1 and 3.3, after Luo et al. 2010).  The map is
-theirs, from the plane of the front's vertex to points of the target (slope_map.py).  Rays through a grid of that plane
+theirs, from the plane of the front's vertex to points of the target (slope_map.py).  Rays through a grid on that plane
 are traced up to the back.  At a point of a ray, Snell's law and the aim of the ray give the slopes p = ∂z/∂x and q =
-∂z/∂y of the back.  From the initial point on, each point a gives the next point b, at which ray b meets
+∂z/∂y of the back.  From the initial point on, each point a gives the next point b on its own ray, where
 
     z_b - z_a = (p_a + p_b) / 2 (x_b - x_a) + (q_a + q_b) / 2 (y_b - y_a)
 
-the trapezoidal rule, by Heun's method: p_b and q_b are the slopes at the point where ray b meets the tangent plane of
-a.  (The explicit rule, with the tangent plane alone, has an error of first order in the step.)  The integration runs
-first along one line through the initial point, then across from each of its points.  A map that is not integrable, as
-off axis, gives heights that depend on the order; no averaging and no optimisation follow.  The back is the
-least-squares fit of the net to the points.
+(the trapezoidal rule).  As in Heun's method, p_b and q_b are the slopes at the point where the ray of b meets the
+tangent plane of a.  (The explicit rule, with the tangent plane alone, has an error of first order in the step.)  The
+integration runs first along one line through the initial point, then across from each point of this line.  A map that
+is not integrable, as off axis, gives heights that depend on the order; no averaging and no optimisation follow.  The
+back is the least-squares fit of the net to the points.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ from bstcad.tailoring.slope_fit import conjugate_gradients, monomials, with_poly
 from bstcad.transport.mapping import Mapping
 
 MAX_STARTS = 3  # maximum number of initial points, each moved along +z as far as the distance from the front requires
-FITTED_POINTS_PER_CELL = 4  # fitted points per side of a control cell of the coarser nets; the last net uses all
+FITTED_POINTS_PER_CELL = 4  # fitted points per side of a control cell of the coarser nets; the last net uses all points
 # Fits of the coarsest net, the nets in between and the last: weight of the second differences relative to heights,
 # conjugate-gradient iterations, and degree of a polynomial that is fitted first.  The first fit extrapolates smoothly
 # where no light falls; the last follows the points.
 COARSEST_FIT, MIDDLE_FIT, FINEST_FIT = (1e-2, 200, 3), (1e-3, 100, 0), (1e-4, 30, 0)
 
-First = Literal["x", "y"]
+First = Literal["x", "y"]  # axis of the first line of the integration
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
 
 @torch.no_grad()
 def march(coming: Rays, aim: Tensor, plane: Receiver, law: Law, z: float, first: First = "x") -> SurfacePoints:
-    """Return the points of a face that sends rays (n, n), n odd, to their aims (2, n, n) mm, from the middle ray at z.
+    """Return points of a face that sends rays (n, n), n odd, to aims (2, n, n) mm, from z (mm) on the middle ray.
 
     coming: rays on the way to the face; first: axis of the first line, across which all others run.  A ray that is
     lost, or that is parallel to the face, ends its line.  SceneError if the middle ray is lost.
@@ -165,7 +165,7 @@ class _Grid:
         return torch.stack([-p, -q, torch.ones_like(p)])
 
     def meet(self, point: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (intersections of rays with planes of these normals through points (3, rays, lines) mm, hit)."""
+        """Return intersections with planes of these normals through points (3, rays, lines) mm, and True for hits."""
         along = dot(normal, self.direction)
         ok = self.rays.sense * along > TANGENCY_TOLERANCE * torch.sqrt(dot(normal, normal))
         path = dot(normal, point - self.origin) / torch.where(ok, along, torch.ones_like(along))
@@ -173,7 +173,7 @@ class _Grid:
 
 
 def _outwards(grid: _Grid, position: Tensor, reached: Tensor, plane: Receiver, law: Law) -> SurfacePoints:
-    """Integrate lines of points outwards from their middle ray: position (3, 1, lines) mm, reached (1, lines)."""
+    """Integrate lines of points outwards from their starts on the middle ray, position (3, 1, lines) mm, reached."""
     middle = grid.alive.shape[0] // 2
     points, all_reached = torch.zeros_like(grid.origin), torch.zeros_like(grid.alive)
     points[:, [middle]], all_reached[[middle]] = position, reached
@@ -192,7 +192,7 @@ def _outwards(grid: _Grid, position: Tensor, reached: Tensor, plane: Receiver, l
 
 @torch.no_grad()
 def fit_net(surface: BSplineSurface, points: SurfacePoints, used: Tensor, levels: tuple[Sides, ...]) -> BSplineSurface:
-    """Fit nets by least squares, min Σ |h(x, y) - z|² over the points used, (n, n) bool, one level after another.
+    """Fit nets by least squares, min Σ |h(x, y) - z|² over the points `used` (n, n) bool, one level after another.
 
     Each net starts from the surface of the previous net, the first from a plane; only the last uses all points.
     """
@@ -236,7 +236,7 @@ def fit_heights(
 
 
 def bending_gradient(h: Tensor) -> Tensor:
-    """Return half the gradient of Σ (h_xx² + 2 h_xy² + h_yy²), second differences of a net (m, m): zero for a plane."""
+    """Return half the gradient of Σ (h_xx² + 2 h_xy² + h_yy²), second differences of a net (m, n): zero for a plane."""
     g = torch.zeros_like(h)
     for to, of in ((g, h), (g.T, h.T)):
         second = of[2:] - 2 * of[1:-1] + of[:-2]

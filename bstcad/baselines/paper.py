@@ -1,7 +1,7 @@
 """The procedure of the paper: stages 1 and 2 by Adam on raw control points (Wang et al. 2023, sections 2.3 and 3).
 
-Lenses of other `quality` are compared with it.  Choices for which the paper gives no number are stated here or in
-quality.py: steps per level, learning rates that fall to zero in each level, and the learning rate of stage 2.
+It is the reference for lenses of other `tailoring.quality`.  Choices for which the paper gives no number are stated
+here or in quality.py: steps per level, learning rates that fall to zero in each level, and the rate of stage 2.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FRONT_RATES = {  # learning rates of the front's parameters, per step
     "conic_constant": 0.02,  # chosen here, since the fronts of the paper are spheres
 }
 STAGE2_RATE = 2e-4  # learning rate (mm per step); chosen here, since the paper does not state it
-MAX_RAYS_PER_CONTROL_POINT = 8  # rays per control point in each direction, limited to save rays on the coarsest net
+MAX_RAYS_PER_CONTROL_POINT = 8  # largest number of rays per control point and axis; saves rays on the coarsest net
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Stage
 
 
 def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: Level | None) -> Iterator[Iterate]:
-    """Run stage 1 on the net of `lens`, or resume: min Σ |P_t - P|² over the heights and the free front."""
+    """Run or resume stage 1 on the net of `lens`: minimise Σ |P_t - P|² by heights and free parameters of the front."""
     n = min(task.knobs.rays, MAX_RAYS_PER_CONTROL_POINT * max(lens.back_net.shape))
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
@@ -95,7 +95,7 @@ def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: 
 
 
 def _improved(lens: Lens, best: Best, free: tuple[str, ...], net: Sides) -> Lens:
-    """Return the best lens of a level that starts from `lens`, refined to a net of so many control points."""
+    """Return the best lens of a level that starts from `lens`, refined to `net` control points per side."""
     if best.parameters:  # empty if no value was finite
         heights, *shape = best.parameters
         lens = with_parameters(lens, [heights, *map(float, shape)], free)
@@ -131,7 +131,7 @@ class TentMerit:
     channels: tuple[Channel, ...]  # channels of the light
     screen: Screen  # screen of the target
     target: Tensor  # (rows, columns) picture of flux 1 after tent binning
-    overshoot: float
+    overshoot: float  # weight of light outside the target (1 / pixel²)
 
     @classmethod
     def of(cls, channels: tuple[Channel, ...], screen: Screen, target: Tensor, overshoot: float) -> TentMerit:

@@ -4,9 +4,9 @@ If the front is tailored, a lens that is too thin cannot be corrected by a shift
 the light, and a shift changes where the light from the front meets the back.  So the heights of both are penalised.
 
 In a cell of a grid no coarser than either net, each face depends on at most 4 x 4 control points, and lies between
-the lowest and the highest of them.  With this bound, tiles of many cells are excluded in one pass over the nets, and
-then single cells.  In the remaining cells the thickness is computed at points a quarter of a cell apart.  (Numpy runs
-in one thread: the work is too small for several threads.)
+the lowest and the highest of them.  This bound often shows for whole tiles of cells that the thickness is nowhere near
+a limit; if not, it excludes single cells.  In the remaining cells the thickness is computed at points a quarter of a
+cell apart.  (The bound is computed by numpy in one thread: the work is too small for several threads.)
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from bstcad.optics.outlines import inside
 from bstcad.optics.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 
-PENALTY_MARGIN = 0.01  # distance from a bound at which the penalty begins, relative to the bound
-QUARTER_RIM_POINTS = 1025  # points along a quarter of the rim
+PENALTY_MARGIN = 0.01  # distance from a bound at which the penalty begins, relative to it (thickness: to `unit`)
+QUARTER_RIM_POINTS = 1025  # number of points along a quarter of the rim
 CELL_POINTS = 4  # control points per axis on which a cell may depend: it lies in at most two knot spans
 TILE_CELLS = 16  # number of cells per axis in a tile
 CELL_ROUNDING = 1e-9  # allowance in the number of cells per axis, so that rounding adds no cell to an exact number
@@ -44,10 +44,10 @@ def unit(lens: Lens, bounds: Bounds) -> float:
 def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], float]:
     """Return (penalty, its gradients (1/mm), largest excess) of the thickness t over its bounds.
 
-    The excess is e = max(thinnest - t, t - thickest) / unit everywhere, and e = (edge - t) / unit along the rim.  The
-    penalty is the mean of max(e + m, 0)² over all points of the grid, with m = PENALTY_MARGIN.  The largest excess is
-    -m if every e < -m; then the gradients are {}.  The gradients with respect to the heights have the number of the
-    face as key.  The sums are divided into fixed parts, so that no bit depends on the number of threads.
+    The excess is e = max(thinnest - t, t - thickest) / unit, along the rim with max(thinnest, edge) as thinnest.  With
+    m = PENALTY_MARGIN the penalty is the mean of max(e + m, 0)² over the grid, plus the mean along the rim if `edge` is
+    given.  If every e < -m, the largest excess is -m and the gradients are {}.  The gradients in the heights of a net
+    have the number of its face as key.  Sums have fixed parts, so that no bit depends on the number of threads.
     """
     length, square, worst = unit(lens, bounds), 0.0, -PENALTY_MARGIN
     front, back = lens.number_of("front"), lens.number_of("back")
@@ -69,9 +69,9 @@ def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], flo
 
 
 def _points_near_bounds(lens: Lens, bounds: Bounds, margin: float) -> Iterator[tuple[Tensor, Tensor, float, float]]:
-    """Yield (x, y, weight of a point, minimum thickness) for points within `margin` of a bound, and some others; in mm.
+    """Yield (x, y, weight of a point, minimum thickness) for points within `margin` of a bound, and some others (mm).
 
-    The points along the rim come last, with weights that have the sum 1 themselves.
+    The points along the rim come last; their weights sum to 1.
     """
     grid = CellGrid.over(lens)
     for x, y in grid.near(lens, bounds, margin):
@@ -82,7 +82,7 @@ def _points_near_bounds(lens: Lens, bounds: Bounds, margin: float) -> Iterator[t
 
 
 def _excess(lens: Lens, x: Tensor, y: Tensor, bounds: Bounds) -> tuple[Tensor, Tensor]:
-    """Return the excess (mm) of the thickness over the nearer bound, and 1 if this is the maximum, -1 otherwise."""
+    """Return the excess (mm) of the thickness over the nearer bound, and 1 if that is the maximum, else -1."""
     front, back = (evaluate(net.heights, *net.along_net(x, y))[0] for net in (lens.front_net, lens.back_net))
     glass = (lens.back.z - lens.front.z) + back - front
     thin = bounds.thinnest - glass
@@ -95,7 +95,7 @@ class CellGrid:
     """Grid over the bounding box of an outline, with cells no wider than a knot span of either net."""
 
     count: tuple[int, int]  # number of cells along x and along y
-    half: tuple[float, float]  # half width and height of the box (mm)
+    half: tuple[float, float]  # half width and half height of the box (mm)
 
     @classmethod
     def over(cls, lens: Lens) -> CellGrid:
@@ -117,7 +117,7 @@ class CellGrid:
         return math.prod(self.count) * len(QUARTERS) ** 2
 
     def near(self, lens: Lens, bounds: Bounds, margin: float) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield x and y (mm) of the points in cells that may be within `margin` mm of a bound, inside the outline.
+        """Yield x and y (mm) of the points inside the outline in cells that may be within `margin` mm of a bound.
 
         Points up to half of a cell's diagonal outside the outline are included, so that the rim is covered.
         """
@@ -132,7 +132,7 @@ class CellGrid:
                 yield x[within].to(lens.like), y[within].to(lens.like)
 
     def _near(self, lens: Lens, bounds: Bounds, margin: float) -> np.ndarray:
-        """Return the indices (n, 2) of the cells whose control points may be within `margin` mm of a bound."""
+        """Return the indices (n, 2) of the cells where the thickness may be within `margin` mm of a bound."""
         nets = lens.front_net, lens.back_net
         front, back = ((net.heights.detach().cpu().numpy(), self._first_points(net)) for net in nets)
         distance = lens.back.z - lens.front.z
@@ -157,7 +157,7 @@ class CellGrid:
 
 
 def _tile_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: np.ufunc) -> np.ndarray:
-    """Return the lowest (np.minimum) or highest (np.maximum) control point of each tile of cells (mm)."""
+    """Return the minimum (np.minimum) or maximum height (mm) of the control points of each tile of cells."""
     for axis, begin in enumerate(begins):
         tiles = np.split(begin, range(TILE_CELLS, len(begin), TILE_CELLS))
         windows = [slice(tile[0], tile[-1] + CELL_POINTS) for tile in tiles]
@@ -167,7 +167,7 @@ def _tile_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: n
 
 
 def _cell_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: np.ufunc) -> np.ndarray:
-    """Return the lowest (np.minimum) or highest (np.maximum) control point of each cell (mm)."""
+    """Return the minimum (np.minimum) or maximum height (mm) of the control points of each cell."""
     for axis, begin in enumerate(begins):
         heights = np.moveaxis(heights, axis, 0)
         for step in (1, 2):  # extremes of two neighbouring control points, then of four

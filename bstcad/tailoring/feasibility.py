@@ -1,15 +1,15 @@
-"""Feasibility of two freeform faces: a check on coarse grids, before the long stages, that they can meet all goals.
+"""Feasibility of two freeform faces: a check on coarse grids, before the long stages, that both can meet all goals.
 
 The goals determine the rays behind the lens (light_behind.py).  These rays determine where the light meets the back,
-and by which angle the front has to deflect it.  A design is infeasible for one of three reasons: rays would have to
-cross between lens and target, light would have to leave the back outside of the outline, or the front would have to
-deflect light by more than refraction can.
+and by which angle the front has to deflect it.  A design is refused if, for much of the light, rays would have to cross
+between lens and target, or light would have to leave the back outside of the outline.  It is reported if the front
+would have to deflect light by more than refraction can.
 
 At an index of 1.49 a front can deflect light by up to 48 degrees.  A back that cancels this deflection is nearly
 vertical, and remains so in stage 2.  If the front would have to deflect light by more than MAX_GENTLE_TURN, stage 1
-therefore raises the dark parts of the furthest picture, which cause the largest deflections; stage 2 uses the picture
-itself.  (Example: two faces 6 mm apart that have to deflect light by 38 degrees, for a square and letters.  RRMSD 0.34
-and 0.63 after 100 evaluations per round without this floor, 0.37 and 0.48 with it.)
+therefore raises the dark parts of the furthest picture, which cause the largest deflections, to a floor; stage 2 uses
+the unchanged picture.  (Example: two faces 6 mm apart that have to deflect light by 38 degrees, for a square and
+letters.  RRMSD 0.34 and 0.63 after 100 evaluations per round without this floor, 0.37 and 0.48 with it.)
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from bstcad.tailoring.stage2 import with_pixels
 from bstcad.tailoring.two_faces import front_map
 from bstcad.transport.mapping import Solver
 
-TRIAL_CELLS, TRIAL_PIXELS = 64, 128  # cells and pixels per side of the coarse grids
+TRIAL_CELLS, TRIAL_PIXELS = 64, 128  # cells per side of the coarse maps, pixels along the longer side of their pictures
 TRIAL_ITERATIONS = 100  # iterations of the coarse maps
-MAX_UNSERVED = 0.5  # largest fraction of the light that two faces may fail to serve
-REPORTED_FRACTION = 1e-3  # smallest fraction of the light that is reported as not served
+MAX_UNSERVED = 0.5  # largest fraction of the light whose rays may miss the outline or cross each other
+REPORTED_FRACTION = 1e-3  # smallest such fraction that is reported
 MAX_GENTLE_TURN = 30.0  # largest deflection at the front for which the furthest picture needs no floor (degrees)
 TRIED_FLOORS = (0.1, 0.2, 0.4, 1.0)  # floors, relative to the mean of the furthest picture, tried in this order
 SOLUTION_NAMES = {1.0: "convex", -1.0: "concave"}  # names of the solutions with the sign σ of light_behind.py
@@ -51,17 +51,17 @@ class Demand:
     outside: float  # fraction of the light that would leave the back outside of the outline
     turn: float  # largest angle by which the front deflects light (degrees); NaN: not computed
     limit: float  # largest angle by which a front can deflect light (degrees)
-    floor: float = 0.0  # irradiance, relative to the mean, to which stage 1 raises the furthest picture
+    floor: float = 0.0  # irradiance, relative to the mean, to which stage 1 raises dark parts of the furthest picture
     lifted_turn: float = math.nan  # largest deflection by the front with this floor (degrees)
 
     @property
     def rank(self) -> tuple[float, float]:
-        """Sort key, smallest for the best solution: the fraction of the light not served, then the RMS angle."""
+        """Sort key, smallest for the best solution: the fraction `crossed` + `outside`, then the RMS angle."""
         lost = self.crossed + self.outside
         return (lost if lost > REPORTED_FRACTION else 0.0), self.rms_angle
 
     def sentences(self, thickness: float) -> Iterator[str]:
-        """Yield a sentence on the angles, then one per failure with its remedy; thickness: centre thickness (mm)."""
+        """Yield sentences on angles, on a floor, and on each failure with its remedy; thickness: mm, at the centre."""
         yield (
             f"{SOLUTION_NAMES[self.solution]} solution: light leaves the lens at up to {self.angle:.3g} degrees from "
             f"the axis, and the front deflects it by up to {self.turn:.3g} degrees"
@@ -90,7 +90,7 @@ class Demand:
 
 
 def find_demand(task: Task, lens: Lens) -> Demand:
-    """Return the demand of the task's solution, or of the better one if the task states none; lens: the blank."""
+    """Return the demand of the task's solution, or of the better solution if the task states none; lens: the blank."""
     task = task.with_imaged_receivers(lens)
     both = (1.0,) if task.wave is not None else (1.0, -1.0)
     solutions = [_demand(task, sign, lens) for sign in (both if task.solution is None else (task.solution,))]
@@ -108,7 +108,7 @@ def find_demand(task: Task, lens: Lens) -> Demand:
 
 
 def _demand(task: Task, solution: float, lens: Lens) -> tuple[Demand, LightBehind]:
-    """Return the demand of a solution on coarse grids, with turn = NaN, and its rays behind the lens."""
+    """Return the demand of a solution on coarse grids (turn: NaN), and its rays behind the lens, made not to cross."""
     knobs = task.knobs.model_copy(update={"transport_grid": TRIAL_CELLS, "transport_iterations": TRIAL_ITERATIONS})
     task = replace(with_pixels(task, TRIAL_PIXELS), knobs=knobs, solution=solution, progress=no_progress)
     light = light_behind.light_for_task(task)
@@ -137,5 +137,5 @@ def _largest_turn(task: Task, lens: Lens, light: LightBehind) -> float:
 
 
 def is_infeasible(demand: Demand) -> bool:
-    """Return True if two faces would fail to serve more than the fraction MAX_UNSERVED of the light."""
+    """Return True if the rays of more than MAX_UNSERVED of the light would miss the outline or cross each other."""
     return demand.outside + demand.crossed > MAX_UNSERVED

@@ -1,8 +1,8 @@
-"""A penalty against total internal reflection, for designs that light their target up to the edge of its reach.
+"""A penalty against total internal reflection, for designs that light all that they can reach of a target.
 
-Light that a face reflects totally misses the target and contributes no gradient.  Near the critical angle a small
-ripple of the face suffices for total reflection.  So the merit of a design whose target is cut to its reachable part
-has one more term, which depends on the slopes of the face alone:
+Light that is reflected inside the lens misses the target and contributes no gradient.  Near the critical angle a small
+ripple of the face suffices for total internal reflection.  So the merit of a design whose target is cut to its
+reachable part has one more term, which depends on the slopes of the face alone:
 
     PENALTY_WEIGHT · mean over the light of max(0, u)²,    u = (η² sin² θ - sin² θ'_max) / (1 - sin² θ'_max)
 
@@ -34,7 +34,7 @@ PENALTY_WEIGHT = 100.0  # weight of the penalty relative to RRMSD²
 MAX_LIGHT_CELLS = 257  # largest number of cells per side of the grid from which the light is interpolated
 PENALTY_START = 0.6  # value of u above which `without_reflection` adds its penalty
 ACCEPTED_EXCESS = 0.5  # largest accepted (u - PENALTY_START) / (1 - PENALTY_START) after `without_reflection`
-MAX_EVALUATIONS = 60  # largest number of evaluations of the penalty alone
+MAX_EVALUATIONS = 60  # largest number of evaluations of the penalty in `without_reflection`
 
 
 @dataclass(frozen=True)
@@ -86,9 +86,9 @@ def _span_points(m: int) -> np.ndarray:
 
 
 def without_reflection(lens: Lens, edge: Edge) -> Lens:
-    """Return the lens with its last net changed just enough that the face reflects no light totally.
+    """Return the lens with its last net changed just enough that no light undergoes total internal reflection there.
 
-    The penalty alone is minimised; here it begins at u = PENALTY_START, which hardly any light reaches.
+    The penalty alone is minimised; here it begins at u = PENALTY_START, so that it concerns only a little light.
     """
     net, limit = lens.nets[-1], math.sin(edge.angle) ** 2
     penalty = replace(Grazing.of(edge, lens), angle=math.asin(math.sqrt(limit + PENALTY_START * (1 - limit))))

@@ -1,10 +1,10 @@
 """The rays behind a lens with two freeform faces, computed from its goals: one ray through each point of a target.
 
 Behind a lens the rays of a point source or of collimated light are normal to wavefronts (theorem of Malus and Dupin;
-Born and Wolf, Principles of Optics, section 3.1.2).  So their direction cosines on a plane A, from which the map
-starts, are the gradient of an eikonal.  The eikonal follows from a wavefront goal (`light_of_wave`), or from a picture
-on a second plane B (`between_targets`): light that crosses A at p shall meet B at t.  Let c be the direction cosines
-along A, and m the centroid of the light on B.  The coordinate y in
+Born and Wolf, Principles of Optics, section 3.1.2).  So their direction cosines on a plane A are the gradient of
+an eikonal.  The eikonal follows from a wavefront goal (`light_of_wave`), or from the pictures on A and on a second
+plane B (`between_targets`): light that crosses A at p shall meet B at t.  Let c be the direction cosines along A, and m
+the centroid of the light on B.  The coordinate y in
 
     c(p, t) = (t - p) / |t - p|,    y = σ (c(p, t) - c(p, m)),
 
@@ -18,7 +18,7 @@ the map is in the gaps between letters.
 
 Between lens and nearest target the rays may cross, and then no lens can send them.  In the convex solution this happens
 where the light on A is much denser than on B (an eigenvalue of ∂t/∂p above 1 + |AB| / |lens A|).
-`without_crossings` returns the nearest rays that do not cross.
+`without_crossings` then returns similar rays that do not cross.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ from bstcad.tailoring.slope_map import centroid, pixel_corners, resample_picture
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Points, Solver, grid_coordinates, solve
 
-MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds of the map; cells per side of coarse ones: n / 4 or 64
+MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds, cells per side in all but the last: max(n / 4, 64)
 MAX_WAVE_ITERATIONS = 40  # largest number of iterations for the point of a wave that sends a ray to a given point
 WAVE_TOLERANCE = 1e-9  # change of this point at which the iterations have converged (mm)
 SOURCE_FLOOR = 0.02  # smallest irradiance of the map's source picture, relative to its mean: black would leave holes
 # Standard deviations (pixels) of the blur of the source picture, solved in this order.  For a portrait with dark parts
 # beside bright ones, Newton's method ends at a mass error of 0.06 to 0.25 without this blur, and at 0.003 with it.
 SOURCE_BLURS = (4.0, 2.0, 1.0)
-FINE_FACTOR = 2  # cells per side of the last map, relative to the transport grid: letters get light from much of a face
-# Solver with floors under the target picture, relative to its mean, used one after another
+FINE_FACTOR = 2  # cells per side of the last map, relative to the transport grid: letters get the light of large areas
+# Solver with floors under the map's target picture, relative to its mean, used one after another
 TARGETS_SOLVER = Solver(floors=(0.1, 0.03, 0.01, 0.003))
 CONTRAST_RATIO = 1.5  # ratio of contrasts above which rays pass through pixel corners of the higher-contrast picture
 INTERSECTION_STEPS = 8  # Newton iterations for the intersection with a face
@@ -156,7 +156,7 @@ def light_for_task(task: Task) -> LightBehind:
 
 
 def corners(screen: Screen, parts: int) -> Points:
-    """Return x and y (mm) of the corners of a screen's pixels, each divided into parts x parts; x is axis 0."""
+    """Return x and y (mm) of the corners of a screen's pixels, each pixel divided into parts x parts; x is axis 0."""
     return pixel_corners(replace(screen, pixels=(parts * screen.columns, parts * screen.rows)))
 
 
@@ -180,7 +180,7 @@ def _dot(vector: Vector, of: np.ndarray) -> np.ndarray:
 
 
 def light_of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength: float, parts: int) -> LightBehind:
-    """Return the rays of a wave through the corners of a screen's pixels, each divided into parts x parts.
+    """Return the rays of a wave through the corners of a screen's pixels, each pixel divided into parts x parts.
 
     wavelength: nm.  SceneError if rays of the wave cross before the screen.
     """
@@ -198,8 +198,8 @@ def light_of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength
         if not bool(((direction - before).abs() * below.abs().max() > WAVE_TOLERANCE).any()):
             return LightBehind(place, direction.numpy(), picture)
     raise SceneError(
-        f"wavefront.z: rays of the wave at z = {wave.z:g} cross before the target; move the wavefront's plane nearer "
-        "to the target, or make the coefficients smaller"
+        f"wavefront.z: rays of the wave at z = {wave.z:g} mm cross before the target; move the wavefront's plane "
+        "nearer to the target, or make the coefficients smaller"
     )
 
 
@@ -210,8 +210,8 @@ def between_targets(
 
     sign: σ, 1 for the convex and -1 for the concave solution.
     The map leads from the near to the far picture, or in reverse if the near one has clearly more contrast: a map to a
-    picture with holes converges more safely than a map from it.  The spacing of the rays is about that of the cells.
-    For a picture of high contrast it is smaller, since few bright pixels have to resolve the other picture.
+    picture with black parts converges more safely than a map from it.  The rays are about as far apart as the cells;
+    for a picture of high contrast they are closer, since few bright pixels have to resolve the other picture.
     """
     contrasts = [float((p**2).mean() / p.mean() ** 2) for _, p in (near, far)]
     against = contrasts[0] > CONTRAST_RATIO * contrasts[1]  # True: rays are followed backwards, from far to near
@@ -256,9 +256,9 @@ def _normalised(way: np.ndarray) -> np.ndarray:
 
 
 def without_crossings(light: LightBehind, screen: Screen, surface: Surface, n: int) -> LightBehind:
-    """Return `light`, or if its rays cross between a surface and the screen, the nearest rays that do not.
+    """Return `light`, or if its rays cross between a surface and the screen, similar rays that do not.
 
-    The flux on the surface is the same.  The new rays follow the optimal transport map from the screen to the surface.
+    The flux on the surface stays the same.  The new rays follow the optimal map from the screen to the surface.
     """
     if light.crossed_fraction(surface) <= CROSSING_TOLERANCE:
         return light

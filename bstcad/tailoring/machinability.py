@@ -7,7 +7,7 @@ back is shifted only if changes of both faces do not suffice.
 
 Stage 2 adds to its merit the mean squared excess over the bounds, on a grid four times finer than the knot spans.  Few
 spans are near a bound; differences of control points show which, and only these are evaluated.  The remaining excess
-is removed by minimising this penalty alone, which hardly changes the picture (`enforce_bounds`).
+after stage 2 is removed by minimising this penalty alone, which hardly changes the picture (`enforce_bounds`).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from bstcad.tailoring.minimise import lbfgs, minimise
 THICKNESS_POINTS = 513  # points per side at which the thickness is computed
 RELIEF_RESERVE = 0.02  # additional thickness for the changes of stage 2, relative to the sag range (PV) of the back
 BOUNDS_STAGE = "bounds on the back"  # name in the record of the stage that enforces the bounds
-BOUND_RESERVE = 1e-3  # distance kept from a bound, relative to the bound: files round, and the grid misses extremes
+BOUND_RESERVE = 1e-3  # distance kept from a bound, relative to the bound: files are rounded, the grid misses extremes
 # Weights of the mean squared relative excess, relative to RRMSD²: by round, from the last one of a stage backwards,
 # and for a stage of one round.  (A large weight from the start keeps the search near its start: a small lens that
 # needs a radius of 20 mm but has a minimum of 50 mm ends at an RRMSD of 0.015 with 1000, and at 0.0033 with 10.)
@@ -111,12 +111,12 @@ class Excess:
 def excess(lens: Lens, bounds: Bounds) -> Excess:
     """Return the excess of curvature, slope and thickness everywhere inside the outline.
 
-    E = Σ_f mean max(q_f / b_f - 1 + m, 0)², m = PENALTY_MARGIN, over the tailored faces f and the bounds b_f > 0 on
-    their quantities q_f, plus the penalty on the thickness.  A tool reaches the back from +z, where a valley of radius
-    R has the curvature κ = 1 / R of z.  It reaches the front from -z, from where the heights are -z and the curvatures
-    have the opposite sign: a valley of the front is a ridge of z, with κ = -1 / R.  |∇z| is the same from both sides.
+    E = Σ mean max(q_f / b_f - 1 + m, 0)², m = PENALTY_MARGIN, summed over the tailored faces f and the bounds b_f > 0
+    on their quantities q_f, plus the penalty on the thickness.  A tool reaches the back from +z, where a valley of
+    radius R has the curvature κ = 1 / R of z.  It reaches the front from -z, from where the heights are -z and the
+    curvatures have the opposite sign: a valley of the front is a ridge of z, with κ = -1 / R.  |∇z| stays the same.
 
-    Sums have fixed parts: no bit depends on the number of threads.
+    Sums have fixed parts, so that no bit depends on the number of threads.
     """
     nets = {k: net.to(torch.float64) for k, net in zip(lens.freeform, lens.nets, strict=True)}
     square, worst = 0.0, -PENALTY_MARGIN

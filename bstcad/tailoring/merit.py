@@ -1,6 +1,6 @@
-"""The merit function of stages 2 and 3, and the variables that condition it (`Spectrum`: of the slope fit of stage 1).
+"""The merit function of stages 2 and 3, and the variables that condition it (`Spectrum` conditions the slope fit).
 
-The merit is the weighted mean over the goals, of RRMSD² for a picture and of the squared RMS wavefront error in waves:
+The merit is the weighted mean over the goals: of RRMSD² for a picture and of the squared RMS wavefront error in waves:
 
     M = (Σ_k w_k RRMSD_k² + w (RMS / λ)²) / (Σ_k w_k + w),    RRMSD_k² = Σ_ij |E^s_ij - E_ij|² / Σ_ij E_ij².
 
@@ -10,16 +10,16 @@ target does.  (Reports scale both pictures to the sum 1.)
 
 Two terms are added, averaged over the pictures: a penalty on light outside the target, and the fraction of the light in
 tubes that do not reach the receiver (total internal reflection).  Light outside the target changes no pixel and so has
-no gradient; the penalty is `overshoot` (1 / pixel²) times the mean square of its distance from the border in pixels (of
-the picture with its margin, for a source of finite size).  Pictures and both terms are sums over the channels of the
-light.  For a source of finite size the picture is that of its centre, blurred (source_image.py).  The wavefront error
-of a ray is its optical path S to the plane of the wave minus the phase W of the wave there (wavefront_error.py),
-without piston.
+no gradient; the penalty is `overshoot` (1 / pixel²) times the mean over all light of the squared distance outside the
+border (in pixels; for a source of finite size, the border of the picture with its margin).  Pictures and both terms are
+sums over the channels of the light.  For a source of finite size the picture is that of its centre, blurred
+(source_image.py).  The wavefront error of a ray is its optical path S to the plane of the wave minus the phase W of the
+wave there (wavefront_error.py), without piston.
 
 The Hessian: let e be the flux density on the last face, and E the irradiance of the target where its light lands.  A
-change δz of the face moves this light by L ∇δz, where L = |∂t/∂p| is the throw of a slope p (mm; for small angles the
-distance times n - 1), and so changes E by about E L Δδz.  The light of an area dA_b of the face falls on the area dA_t
-= (e / E) dA_b of the target, so that the squared error is
+change δz of the face moves this light by L ∇δz, where L = |∂t/∂p| (mm) is the throw, the change of the landing point t
+per change of the slope p (for small angles the distance times n - 1), and so changes E by about E L Δδz.  The light of
+an area dA_b of the face falls on the area dA_t = (e / E) dA_b of the target, so that the squared error is
 
     ∫ δE² dA_t  =  ∫ (E L Δδz)² (e / E) dA_b  =  L² ∫ e E (Δδz)² dA_b.
 
@@ -77,7 +77,7 @@ THROW_STRIDE = 8  # every 8th control point is checked first, since few lenses h
 
 
 def landing(rays: Landed, aim: Tensor) -> Tensor:
-    """Return the mean of |P_t - P|² over the rays that land (mm²): the sum of Wang et al. 2023, Eq. 14, as a mean."""
+    """Return the mean of |P_t - P|² (mm²) over rays that land at P with the aim P_t (Wang et al. 2023, Eq. 14: sum)."""
     lit = rays.alive & (rays.flux > 0)
     miss = (rays.position[0] - aim[0]) ** 2 + (rays.position[1] - aim[1]) ** 2
     return total(torch.where(lit, miss, torch.zeros_like(miss))) / lit.sum()
@@ -117,7 +117,7 @@ class Merit:
     def with_blur(self, source: ExtendedSource, lens: Lens, seed: int | None = None) -> Merit:
         """Return the merit for a source of finite size; the channels of this merit are the light of its centre.
 
-        seed: seed of the rays that measure the error of the blur, almost a second per goal; None: no measurement.
+        seed: seed of the rays that measure the error of the blur (almost a second per goal); None: no measurement.
         """
         exact = lens.plain()
         merit = replace(self, blurs=tuple(blurs(source, exact, goal.receiver) for goal in self.goals))
@@ -267,7 +267,7 @@ class SobolevVariable:
 
     @classmethod
     def of(cls, surface: BSplineSurface, weight: Tensor, exponent: float = LAPLACIAN_POWER) -> SobolevVariable:
-        """Make the variable for the net of a surface."""
+        """Make the variable for the net of a surface; exponent: q."""
         x, y = map(laplacian, surface.shape)
         energy = x[:, None] + y
         # numpy, since the rounding of torch's powers depends on how the work is divided among threads
@@ -292,9 +292,9 @@ class SobolevVariable:
 class CoarseVariable:
     """Heights h (m, n) in mm of a net as a function of the variable c of a coarser net: h = P h'(c) Q^T.
 
-    P (m, m') and Q (n, n') insert knots, so that h is the same spline on the finer net.  (A cosine has zero slope at
-    the rim.  With the cosines of the finer net, a slope of the surface at the rim would need many of them, which ripple
-    all over the net; the few cosines of the coarser net ripple less.)
+    P (m, m') and Q (n, n') insert knots, so that h is the same spline as the heights h' (m', n') of the coarser net.
+    (A cosine has zero slope at the rim.  With the cosines of the finer net, a slope of the surface there needs many of
+    them, which ripple all over the net; the few cosines of the coarser net ripple less.)
     """
 
     coarse: SobolevVariable  # variable of the coarser net
@@ -321,7 +321,7 @@ class CoarseVariable:
 
 
 def _apply_both(left: csr_array, t: Tensor, right: csr_array) -> Tensor:
-    """Return left t right^T with scipy, whose single thread sums in a fixed order."""
+    """Return the product left t right^T by scipy, whose single thread sums in a fixed order."""
     within = np.ascontiguousarray((left @ t.cpu().numpy()).T)
     return torch.from_numpy(np.ascontiguousarray((right @ within).T)).to(t)
 
@@ -330,7 +330,7 @@ def local_weight(source: Emitter, lens: Lens, goal: Goal, number: int | None = N
     """Return the weight w = (E / mean E)^-1/2 at each control point (m, n), smoothed and clamped.
 
     E is the irradiance of the target where light from the control point lands; before smoothing, w = 1 for light that
-    misses the screen.  On the last net, if light leaves the glass there, the weight is divided by a large throw.
+    misses the screen.  On the last net, if light leaves the glass there, the weight is divided by `_excess_throw`.
     number: index of the freeform interface in the lens; None: the back.
     """
     number, screen = lens.number_of("back") if number is None else number, goal.receiver

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bstcad.optics.kernels.reductions import dot, total
 
-Objective = Callable[[list[Tensor]], tuple[float, list[Tensor], float]]
+Objective = Callable[[list[Tensor]], tuple[float, list[Tensor], float]]  # parameters -> (merit, gradients, figure)
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,8 @@ class Iterate:
 def minimise(problem: Objective, method: Method, evaluations: int, best: Best = Best()) -> Iterator[Iterate]:
     """Answer the queries of a method until it ends or the evaluations are used up; yield the state after each.
 
-    An evaluation that is not finite is counted as skipped.  best: best evaluation before the method's state.
+    An evaluation that is not finite is counted as skipped.  evaluations: limit of their number, including those of
+    `best`, the best evaluation before the method's state.
     """
     if best.evaluations >= evaluations:
         return
@@ -157,7 +158,7 @@ def lbfgs(start: list[Tensor], evaluations: int, state: LbfgsState | None = None
 
     Returns "plateau" if PLATEAU_STEPS steps lowered the merit by less than the fraction PLATEAU_GAIN while more than
     PLATEAU_STEPS of the `evaluations` are left, or if no step lowers the merit.  A run resumed from a state has the
-    result of an uninterrupted run.  (The L-BFGS of torch.optim loads a compiler, which takes longer than a draft.)
+    result of an uninterrupted run.  (torch.optim's L-BFGS loads a compiler, which takes longer than a draft design.)
     """
     sizes, best, resumable = [p.numel() for p in start], Best(), state
 
@@ -231,8 +232,8 @@ class LinePoint:
     gradient: Tensor
 
 
-LineSearch = Generator[Query, Evaluation, LinePoint]
-Along = Callable[[float], LineSearch]
+LineSearch = Generator[Query, Evaluation, LinePoint]  # returns the point that it accepts
+Along = Callable[[float], LineSearch]  # evaluates the point at a step
 
 
 def _strong_wolfe(along: Along, start: LinePoint, step: float) -> LineSearch:
@@ -254,7 +255,7 @@ def _strong_wolfe(along: Along, start: LinePoint, step: float) -> LineSearch:
 
 
 def _zoom(along: Along, start: LinePoint, low: LinePoint, high: LinePoint) -> LineSearch:
-    """Return the point of `_strong_wolfe` between two that bracket it (algorithm 3.6); `low` has the lower merit."""
+    """Return the point of `_strong_wolfe` that low and high bracket (algorithm 3.6); `low` has the lower merit."""
     for _ in range(MAX_LINE_TRIALS):
         margin = 0.1 * abs(high.step - low.step)  # distance to keep from the ends of the interval
         nearest, farthest = sorted((low.step, high.step))

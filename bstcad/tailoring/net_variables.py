@@ -66,7 +66,7 @@ class NetVariables:
         return [front, back + _multiply(self.along, front, back)]
 
     def adjoint(self, g: Sequence[Tensor]) -> list[Tensor]:
-        """Apply the transpose of `heights`: from gradients in the control points to those in c."""
+        """Apply the transpose of `heights`: from gradients in the control points to gradients in c."""
         if self.along is not None:
             front, back = g
             g = [self.scale * (front + _multiply(self.along.T, back, front)), back]
@@ -74,7 +74,7 @@ class NetVariables:
 
 
 def _multiply(matrix: csr_array, t: Tensor, like: Tensor) -> Tensor:
-    """Return matrix t with scipy, whose single thread sums in a fixed order."""
+    """Return the product of `matrix` and t by scipy, whose single thread sums in a fixed order."""
     return torch.from_numpy(matrix @ t.cpu().double().numpy().reshape(-1)).reshape(like.shape).to(like)
 
 
@@ -138,7 +138,7 @@ def _interpolation(row: np.ndarray, column: np.ndarray, sides: tuple[int, int]) 
 
 
 def _cubic_weights(at: np.ndarray, m: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return indices and weights (k, 4) of the cubic convolution (Keys 1981, a = -1/2) at positions (k,) among m."""
+    """Return indices and weights (k, 4) of cubic convolution (Keys 1981, a = -1/2) at positions (k,) among m points."""
     first = np.minimum(at.astype(int), m - 2)
     t = at - first
     weights = t * (-1 + t * (2 - t)), 2 + t * t * (-5 + 3 * t), t * (1 + t * (4 - 3 * t)), t * t * (t - 1)

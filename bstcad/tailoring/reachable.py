@@ -37,7 +37,7 @@ from bstcad.transport.mapping import Points, Solver
 
 FACE_CELLS, FACE_STRIDE = 33, 4  # cells per side of the face; every 4th cell per axis is tried for all aims
 BOX_AIMS = 5  # aims per side of the first check, in the rectangle around the lit target
-MAX_AIMS = 64  # largest number of pixels along the longer side of the target at whose corners the reach is computed
+MAX_AIMS = 64  # largest number of pixels along the longer side of the picture for which the reach is computed
 MAP_NET, MAP_CELLS, MAP_ITERATIONS = 33, 64, 40  # control points and cells per side, and iterations, of the coarse maps
 MAX_ROUNDS = 6  # largest number of coarse maps
 SETTLED_FRACTION = 1e-3  # change of the reachable light at which the rounds end, as a fraction of all light
@@ -48,7 +48,7 @@ COARSE_FIT = Fit(bending=1e-2, steps=40, degree=3)  # fit of the face to a coars
 def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT_ANGLE) -> np.ndarray | None:
     """Return True for each pixel that a design can light, (rows, columns); None if it can light all of the picture.
 
-    lens: the blank, with its final front.  grazing: largest angle at which light may leave the face (rad).
+    lens: the blank, with its final front.  grazing: largest angle to the normal at which light may leave (rad).
     """
     screen, picture, small = goal.receiver, goal.picture, resample(goal)
     few, corners, solver = small.receiver, slope_map.pixel_corners(small.receiver), Solver(MAP_ITERATIONS)
@@ -110,7 +110,7 @@ def same_order(grid: FaceGrid, aims: Points) -> Points:
 
 
 def _inside(corners: Tensor, screen: Screen, few: Screen) -> np.ndarray:
-    """Return True (rows, columns) for the pixels of a screen where a function at the corners of `few` is positive."""
+    """Return True (rows, columns) for pixels of a screen where `corners`, values at the corners of `few`, are >= 0."""
     where = np.meshgrid(
         *(np.linspace(0, a, n + 1) for a, n in ((few.columns, screen.columns), (few.rows, screen.rows))), indexing="ij"
     )

@@ -65,7 +65,7 @@ class RatedLens:
     """Lens with its figures of merit for all pixels, all goals, and the light of the whole source."""
 
     rrmsd: float  # RRMSD by `Task.rrmsd`
-    figure: float  # square root of the merit of all goals (merit.py); without a wavefront goal equal to `rrmsd`
+    figure: float  # square root of the merit (merit.py) with `rrmsd` for each picture; `rrmsd` if there is no wavefront
     lens: Parameters
 
     def beats(self, other: RatedLens) -> bool:
@@ -80,7 +80,7 @@ WAVEFRONT_TUBES = 256  # flux tubes per side that measure the wavefront error of
 TUBES_PER_SECOND = 4.7e6  # tubes traced per second, with the gradient of the merit, on a machine of pace 1
 RRMSD_SECONDS = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
 # Rays for the RRMSD of a lens between the stages, accurate to some 5 % for STAGE_EFFORT_PIXELS pixels per side.  The
-# error of the product of two pictures of n² stratified rays falls as (p / n)³ / p, so a target of p pixels per side
+# error of the product of two pictures of n² stratified rays varies as (p / n)³ / p, so a target of p pixels per side
 # needs (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays per side.
 STAGE_EFFORT, STAGE_EFFORT_PIXELS = Effort(rays=724, accuracy=0, witness=False), 512
 FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays for scenes with tailoring.accuracy or bounds
@@ -119,11 +119,11 @@ class Task:
     bounds: Bounds | None = None  # bounds on the shape of the tailored faces; None: no bounds
     extended_sources: tuple[ExtendedSource, ...] = ()  # source at each size of stage 3, for its blur
     edge: Edge | None = None  # light at the edge of a target cut to its reachable part; None: not cut
-    # error of a picture relative to the target, (rows, columns) and of sum <= 1, in the merit; None: RRMSD²
+    # error of a picture relative to the target in the merit, both (rows, columns) and of sum <= 1; None: RRMSD²
     merit: Callable[[Tensor, Tensor], Tensor] | None = None
     wave: Wave | None = None  # required wavefront behind the lens; None: no wavefront goal
     preview: bool = False  # preview: one round per stage, no RRMSD by rays, no costly alternative
-    solution: float | None = None  # sign σ of light_behind.py, +1 or -1; None: the solution with smaller deflections
+    solution: float | None = None  # sign σ of light_behind.py, +1 or -1; None: feasibility.py chooses
     floor: float = 0.0  # irradiance, relative to the mean, to which stage 1 of two faces raises the furthest picture
     # control points per side of the front as a function of those of the back; None: the front is not freeform
     front_sides: Callable[[Sides], Sides | None] = lambda sides: None
@@ -154,7 +154,7 @@ class Task:
         return lens.with_nets(net.refined(count) for net, count in pairs)
 
     def with_imaged_receivers(self, lens: Lens) -> Task:
-        """Return the task with its receivers imaged through the surfaces behind the last net; stage 1 aims there."""
+        """Return the task with its receivers imaged through the surfaces behind the last net, for stage 1."""
         goals = (replace(goal, receiver=image_screen(lens, goal.receiver)) for goal in self.goals)
         return replace(self, goals=tuple(goals))
 
@@ -162,7 +162,7 @@ class Task:
         """Return the largest RRMSD over the goals from independent rays, on the CPU; NaN without light on a target.
 
         The flux tubes used for tailoring would underestimate the RRMSD.  effort: rays to use; None: FINE_EFFORT for a
-        scene with an accuracy or bounds, else STAGE_EFFORT.
+        scene with an accuracy or bounds, else STAGE_EFFORT, scaled to the number of pixels.
         """
         if effort is None and (self.knobs.accuracy is not None or self.bounds is not None):
             effort = FINE_EFFORT
@@ -188,7 +188,7 @@ class Task:
     def better(self, latest: Lens, before: Lens) -> tuple[Lens, RatedLens]:
         """Return the better of two lenses with its figures by FINE_EFFORT; `latest` if the difference is insignificant.
 
-        STAGE_EFFORT does not resolve RRMSDs below about 0.01: by it 0.0070 seemed better than 0.0048.
+        STAGE_EFFORT does not resolve RRMSDs below about 0.01: with it 0.0070 seemed better than 0.0048.
         """
         now, then = (self.rated(lens, self.rrmsd(lens, FINE_EFFORT)) for lens in (latest, before))
         return (before, then) if then.beats(now) else (latest, now)
@@ -202,9 +202,8 @@ class Task:
 class StageStep:
     """State of a stage after one of its steps; the driver decides whether the stage goes on."""
 
-    make: (
-        Callable[[], Lens] | None
-    )  # returns the lens of this round or, in stage 2, the best of this search; None: no lens yet
+    # returns the lens of this round or, in stage 2, the best lens of this search; None: no lens yet
+    make: Callable[[], Lens] | None
     state: Any = None  # record from which the stage can resume here; None: it cannot
     mapping: Mapping | None = None  # transport map that the lens follows (stage 1)
     # x and y (mm), each (columns + 1, rows + 1), of the points of the last tailored face that light the corners of the
@@ -254,7 +253,7 @@ class StageTime:
     """Time and RRMSD of one stage, or of one part of it."""
 
     name: str
-    seconds: float
+    seconds: float  # wall-clock time (s)
     rrmsd: float | None  # RRMSD of the lens at the end of the stage; None: not measured
     cpu_seconds: float | None = None  # CPU time, summed over processors (s); None: not measured
 
@@ -273,8 +272,8 @@ class DesignRecord:
 class Driver:
     """Driver of the stages of one design: keeps the time, the record and the best lens.
 
-    limit: seconds for the whole run, including the work after tailoring, which takes `reserve` seconds on a machine of
-    pace 1.  record: record of the earlier runs of a resumed design.
+    limit: seconds for all runs of the design, including the work after tailoring, which takes `reserve` seconds on a
+    machine of pace 1.  record: record of the earlier runs of a resumed design.
     """
 
     def __init__(

@@ -1,8 +1,9 @@
 """The slope fit of stage 1: a linear least-squares fit of a surface to the slopes that send each ray to its aim.
 
-Wang et al. 2023 minimise Σ |P_t - P|² by Adam (baselines/paper.py).  For a ray that meets the face at a known point,
-the normal that sends it to its aim follows from Snell's law in closed form.  The spline is linear in its heights, so
-the best fit of the slopes is a linear least-squares problem: a few preconditioned conjugate-gradient steps.
+Wang et al. 2023 minimise Σ |P_t - P|², from landing point P to aim P_t, by Adam (baselines/paper.py).  For a ray that
+meets the face at a known point, the normal that sends the ray to its aim follows from Snell's law in closed form.  The
+spline is linear in its heights, so the best fit of the slopes is a linear least-squares problem: a few preconditioned
+conjugate-gradient steps.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from bstcad.optics.unfolding import image_from_last_net
 from bstcad.tailoring.merit import Spectrum
 
 BLOCK_POINTS = 1 << 22  # number of points whose slopes and residuals are in memory together: 0.3 GB
-DEPENDENCE_TOLERANCE = 1e-12  # fraction of a monomial's squared slopes that is rounding if orthogonalisation leaves it
+DEPENDENCE_TOLERANCE = 1e-12  # fraction of a monomial's squared slopes below which the orthogonal rest is rounding
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,8 @@ def fit_slopes(
 ) -> BSplineSurface:
     """Return the surface after `fit.steps` steps that minimise Σ w |∇h - (z_x, z_y)|² / Σ w plus a bending energy.
 
-    The bending energy is that of the change relative to the given surface plus the polynomial of the fit.  Conjugate
-    gradients start from no change, in the variable of `Spectrum`.  x, y (mm), the slopes z_x, z_y and the weights are
-    (n,).
+    The bending energy is that of the change after the polynomial of the fit is added to the surface.  Conjugate
+    gradients start from no change, in the variable of `Spectrum`.  x, y (mm), slopes z_x, z_y and weights are (n,).
     """
     pitch_x, pitch_y = surface.pitch
     u, v = surface.along_net(x, y)
@@ -109,7 +109,7 @@ def conjugate_gradients(normal: Callable[[Tensor], Tensor], x: Tensor, residual:
     return x
 
 
-Samples = tuple[Tensor, ...]
+Samples = tuple[Tensor, ...]  # values of a linear function at points, (n,) for each component
 
 
 def with_polynomial(

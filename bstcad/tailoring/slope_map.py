@@ -1,23 +1,23 @@
 """The transport map of stage 1: optimal transport from points of a face to its slopes, a map that a surface can follow.
 
 The map of Wang et al. 2023 leads from source points to target points.  It is a gradient only in the paraxial limit;
-off axis, stage 1 loses the part that no surface can follow.  Here the transport problem is solved between points of the
-face and slopes, where the map is the gradient of the surface.  A ray that meets the last freeform face at b and shall
-reach the target point t needs the slope p(b, t), which follows from Snell's law or the law of reflection in closed
-form.  With the centroid m of the light on the target, the coordinate
+off axis, a fit to it loses the part that no surface can follow.  Here the transport problem is solved between points of
+the face and slopes, where the map is the gradient of the surface.  A ray that meets the last freeform face at b and
+shall reach the target point t needs the slope p(b, t), which follows from Snell's law or the law of reflection in
+closed form.  With the centroid m of the light on the target, the coordinate
 
     y = σ (p(b, t) - ∇g(b)),    ∇g(b) ≈ p(b, m)
 
-hardly depends on b for a fixed t; g is nearly the surface that focuses all light on m.  The optimal transport map b ->
+hardly depends on b for a fixed t; g is nearly the surface that sends all light to m.  The optimal transport map b ->
 y is ∇φ of a convex φ, so that σ y + ∇g are the slopes of a surface.  σ = 1 where light leaves the glass.  Mirrors, and
 faces where light enters the glass, deflect light against their slope: there σ = -1, so that rays of neighbouring points
 do not cross.  If there are surfaces behind the net, light is aimed at the image of the target through them
-(optics/unfolding.py).  y still depends on b a little, by the order of t - m.  Therefore each round computes y(t) at the
-b(t) of the previous round, and the rounds are a fixed-point iteration.  At the fixed point the surface solves the
+(optics/unfolding.py).  y still depends on b a little, in proportion to t - m.  Therefore each round computes y(t) at
+the b(t) of the previous round, and the rounds are a fixed-point iteration.  At the fixed point the surface solves the
 Monge-Ampère problem of the system for any g, also off axis, in the near field and behind a curved front.
 
-`map_to_target` and `aim_points` are the map of the paper, from the vertex plane of the front to the target, and the aim
-of each ray.  Stage 1 falls back on this map, and the baselines use it.
+`map_to_target` and `aim_points` give the map of the paper, from the vertex plane of the front to the target, and the
+aim of each ray.  Stage 1 falls back on this map, and the baselines use it.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ GATHERING_NET, GATHERING_SAMPLES = 33, 96  # control points per side of g, and s
 GATHERING_WIDTH = (GATHERING_NET - 1) / (GATHERING_NET - 5)  # width of g / width of the window: end spans lie outside
 GATHERING_FIT = Fit(bending=1e-3, steps=40, degree=5)  # fit of g
 PARABOLOID_FIT = Fit(steps=0, degree=2)  # fit of g by a paraboloid, if no face can focus the light
-PREVIEW_FIT, PREVIEW_SAMPLES = Fit(steps=0, degree=5), 32  # fit and samples of g in a preview, a fifth of the time
+PREVIEW_FIT, PREVIEW_SAMPLES = Fit(steps=0, degree=5), 32  # fit and samples per side of g in a preview, 5 times faster
 TARGET_FLOOR = 1e-3  # smallest irradiance of the target in the map of the paper, relative to its mean
 
 Slopes = tuple[Tensor, Tensor]  # ∂z/∂x and ∂z/∂y, of one shape
@@ -86,7 +86,7 @@ class FaceGrid:
 
 @torch.no_grad()
 def face_grid(source: Emitter, lens: Lens, window: Rectangle, cells: Sides) -> FaceGrid:
-    """Return the rays that meet the last freeform face at the centres of `cells` cells of a window.
+    """Return the rays that meet the last freeform face at the cell centres of a window; cells: number per side.
 
     The flux density is the irradiance from the source on the vertex plane of the first surface times |∂q/∂b|, where
     the ray through b crosses this plane at q, minus the losses at the faces and in the glass.
@@ -106,7 +106,7 @@ def face_grid(source: Emitter, lens: Lens, window: Rectangle, cells: Sides) -> F
 
 
 def lit_window(source: Emitter, lens: Lens, n: int = 128) -> Rectangle:
-    """Return the rectangle of the last freeform face that light meets, with a margin; SceneError if there is none."""
+    """Return the lit rectangle of the last freeform face, with a margin; SceneError if no light meets this face."""
     half_x, half_y = lens.last_freeform.outline.half_extent
     grid = face_grid(source, lens, Rectangle(2 * half_x, 2 * half_y), n)
     lit = grid.density > 0
@@ -167,7 +167,7 @@ def transport_slopes(
 ) -> SlopeMap:
     """Return the map from the light of a `square_grid` to a picture, given the slopes needed for its pixel corners.
 
-    needed: slopes p(b, t) for the corners t of the pixels.  points: b (mm) of these corners in the last round.
+    needed: slopes p(b, t) for the pixel corners t.  points: b (mm) of these corners in the last round.  sign: σ.
     """
     side, n = grid.window.width, grid.shape[0] // SUBCELLS
     rho = grid.density.cpu().double().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3))
@@ -222,7 +222,7 @@ def gathering(
 ) -> BSplineSurface:
     """Return g, the net of GATHERING_NET points per side whose slopes fit p(b, m) best over the lit part of a grid.
 
-    For a fixed sag, p(b, m) is a gradient except for a curl of the order of x y |∂p/∂z|.
+    For a fixed sag, p(b, m) is a gradient except for a curl of the order of x y |∂p/∂z|.  middle: m (mm).
     """
     count, fit = (PREVIEW_SAMPLES, PREVIEW_FIT) if preview else (GATHERING_SAMPLES, GATHERING_FIT)
     few, law = grid.thinned(count), lens.last_freeform.law
@@ -244,7 +244,7 @@ def fit_gathering(grid: FaceGrid, slopes: Slopes, fit: Fit) -> BSplineSurface:
 
 
 def interpolate(grid: FaceGrid, values: Tensor, b: Points) -> Tensor:
-    """Interpolate values (k, m, n) at cell centres to points b (…) mm, bilinear, constant outside; return (k, …)."""
+    """Interpolate values (k, m, n) at cell centres bilinearly to points b (…) mm, constant outside; return (k, …)."""
     sizes = (grid.window.width, grid.window.height)
     x, y = (torch.from_numpy(p) / (size / 2) for p, size in zip(b, sizes, strict=True))
     where = torch.stack([y, x], dim=-1)  # -1 to 1 across the window; the last axis of the values comes first

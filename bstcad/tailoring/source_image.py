@@ -7,10 +7,10 @@ even for a rough face.  So with the picture E_0 of the centre
     E(t) = ∫ K(t', t - t') E_0(t') dt',     K(t', ·) the density of δ(t', s) over the points s of the source,
 
 which needs one sheet of flux tubes instead of a sheet for each of many source points.  K is interpolated between nodes
-t_n over the screen by hat functions a_n, K(t', ·) = Σ_n a_n(t') K_n.  Then E = B E_0 = Σ_n K_n * (a_n E_0), computed
-with a few Fourier transforms.  K_n is the image of the source through the point of the back whose light lands nearest
-to t_n.  There δ and the flux are biquadratic in s through 3 x 3 points of the source, evaluated at as many points as a
-smooth image needs.
+t_n over the screen by hat functions a_n, K(t', ·) = Σ_n a_n(t') K_n.  Then E = B E_0 = Σ_n K_n * (a_n E_0), where
+the convolution * needs a few Fourier transforms.  K_n is the image of the source through the point of the back whose
+light lands nearest to t_n.  There δ and the flux are interpolated biquadratically in s from 3 x 3 points of the source,
+at 2 IMAGE_PAIRS points.
 
 The error of this model is small and varies slowly during tailoring.  It is measured with rays from points of the source
 at the start of a round, and added as a constant picture: E = B E_0 + (E_rays - B E_0 at the start).
@@ -43,9 +43,9 @@ IMAGE_GRID = 32  # points per side on the back through which the images of the s
 POINT_DISTANCE = 0.7  # distance of the 3 x 3 points of the source from its centre, in half widths
 IMAGE_PAIRS = 256  # pairs of source points that represent an image
 PIXEL_PARTS = 5  # parts of a pixel per axis in the images; odd
-ERROR_RAYS = 1448  # rays per side in each of the two sets that measure the error of the blur
+ERROR_RAYS = 1448  # square root of the number of rays in each of the two sets that measure the error of the blur
 ERROR_POINTS = 256  # source points in each of the two sets
-ERROR_SMOOTHING = 0.15  # standard deviation of the smoothing of the blur error, relative to the border - 2 pixels
+ERROR_SMOOTHING = 0.15  # standard deviation of the smoothing of the blur error, relative to (border - 2) pixels
 MAX_TRANSFORM_BYTES, VALUE_BYTES = 2 << 30, 8  # largest size of the transforms of all images, size of one value (bytes)
 MIN_BORDER = 16  # smallest border around the screen (pixels)
 ERROR_SEED_OFFSET = 500_009  # offset of the seed, so that these rays are independent of the rays of the verification
@@ -62,7 +62,7 @@ class ExtendedSource:
 
 @dataclass(frozen=True, eq=False)
 class BlurOperator:
-    """Operator B from the picture by the source's centre, on a screen with a border, to that by the whole source."""
+    """Operator B from the picture by the source's centre, on a screen with a border, to the one by the whole source."""
 
     border: int  # width of the border whose light is blurred onto the screen (pixels)
     hats: tuple[np.ndarray, np.ndarray]  # hat functions, (nodes, rows + 2 border) and (nodes, columns + 2 border)
@@ -136,7 +136,7 @@ class LocalImages:
         return cls(pixel[:, 0], pixel[:, 1:] - pixel[:, :1], flux[1:] / flux[0])
 
     def nearest(self, column: float, row: float) -> tuple[Tensor, Tensor]:
-        """Return offset (2, 9) and flux (9,) of the image nearest to a pixel; without images, a point's."""
+        """Return offset (2, 9) and flux (9,) of the image nearest to a pixel; zeros and ones if there are no images."""
         if not self.at.shape[1]:
             return torch.zeros(2, 9, dtype=torch.float64), torch.ones(9, dtype=torch.float64)
         point = int(torch.argmin((self.at[0] - column) ** 2 + (self.at[1] - row) ** 2))
@@ -170,7 +170,7 @@ def blurs(extended: ExtendedSource, lens: Lens, screen: Screen) -> tuple[BlurOpe
 
 
 def widest(screen: Screen, lines: int) -> int:
-    """Return the largest border (pixels): at most the screen's width, within MAX_TRANSFORM_BYTES for all `lines`.
+    """Return the largest border (pixels), up to the screen's longer side, within MAX_TRANSFORM_BYTES for all `lines`.
 
     Without this limit images on a tilted target that some light grazes would be arbitrarily large.
     """
@@ -181,7 +181,7 @@ def widest(screen: Screen, lines: int) -> int:
 def _operator(images: Sequence[tuple[Tensor, Tensor]], screen: Screen, border: int) -> BlurOperator:
     """Make B from the image at each node, as points: offset (2, n) in pixels, flux (n,) relative to the centre.
 
-    A hat function distributes each dot over parts of a pixel, PIXEL_PARTS per axis, a negligible blur.
+    A hat function distributes each point over parts of a pixel (PIXEL_PARTS per axis), which blurs negligibly.
     """
     down, across = (_hats(side, border) for side in screen.shape)
     side = 2 * border + 1

@@ -60,8 +60,8 @@ MAX_RIM_SINE = 0.5  # sine of the largest slope angle of the front at the rim
 MAX_ELLIPSE, MAX_HYPERBOLA = 0.8, 6.0  # largest (1 + k) c² r² and -(1 + k) c² r² at the rim in the search
 UNBOUNDED = (-math.inf, math.inf)
 
-Range = tuple[float, float]
-FrontMerit = Callable[[Lens], float]
+Range = tuple[float, float]  # lower and upper bound
+FrontMerit = Callable[[Lens], float]  # merit of a front, after a fit of the back
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> St
 
 
 def next_round(number: int, rounds: int, fine: int, settled: bool) -> int:
-    """Return the number of the round after `number`; if the map has settled, at least that of the first fine round."""
+    """Return the number of the next round; if the map has settled, at least `rounds` - `fine`, the first fine round."""
     return max(number + 1, rounds - fine) if settled else number + 1
 
 
@@ -302,7 +302,7 @@ def _curvatures(lens: Lens, rim_sags: Range, *included: float) -> Range:
 
 
 def _curvature_of_sag(h: float, r: float, k: float) -> float:
-    """Return the curvature c = 2 h / (r² + (1 + k) h²) of a conic of sag h at r, short of a vertical slope."""
+    """Return the curvature c = 2 h / (r² + (1 + k) h²) of a conic of sag h at r; h is limited near a vertical slope."""
     p = 1 + k
     if p == 0:
         return 2 * h / (r * r)

@@ -8,7 +8,7 @@ root mean square difference between the target irradiance E and the traced irrad
 
 The paper traces random rays.  Here each evaluation traces the corners of a fixed sheet of flux tubes and integrates
 their flux over the pixels exactly, so that the merit is smooth and without noise.  The variables are the heights of
-the control points of all nets, in a Sobolev variable (merit.py), so that L-BFGS needs some hundred evaluations, while
+the control points of all nets, in a Sobolev variable (merit.py), so that L-BFGS needs 100 to 300 evaluations, while
 Adam on the heights needs thousands.  A stage consists of rounds with an increasing number of tubes.
 
 For a source of finite size, stage 3 replaces stage 2 and also starts from the surface of stage 1.  It traces the light
@@ -45,28 +45,27 @@ from bstcad.tailoring.run import TUBES_PER_SECOND, Parameters, Stage, StageStep,
 from bstcad.tailoring.source_image import ExtendedSource
 
 RoundFractions = tuple[tuple[float, float], ...]  # (tubes per side, evaluations) of rounds, relative to the settings
-DENSE_ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # rounds if the last has at least DENSE_TUBES tubes
+DENSE_ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # rounds if the last has DENSE_TUBES tubes or more per cell
 # Rounds if the last one has fewer than DENSE_TUBES tubes per cell of the control net along each axis.  The first rounds
 # then distort the net between the tubes, and the last one has to correct this.  (1025 control points, two tubes per
 # cell: the portrait ends at an RRMSD of 0.018, and at 0.020 with DENSE_ROUNDS in the same time.)
 SPARSE_ROUNDS, DENSE_TUBES = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
 # Rounds for a picture and a wavefront: two nets can distort between the tubes, and so need more of them.
 WAVEFRONT_ROUNDS = ((2 / 3, 0.45), (1.0, 0.35), (4 / 3, 0.2))
-# Rounds for several pictures, and the number of control points per side above which the evaluations are proportional to
-# it: with LAPLACIAN_POWER = 0.5, the Hessian in the Sobolev variable still contains a power of the Laplacian.  (Letters
+# Rounds for several pictures, and the number of control points per side above which the evaluations grow in proportion:
+# with LAPLACIAN_POWER = 0.5, the Hessian in the Sobolev variable still contains a power of the Laplacian.  (Letters
 # before a portrait, 769 points per side: RRMSD 0.057 and 0.062 after 196 evaluations in three rounds, 0.047 and 0.057
 # after 309 in these two.)
 PICTURES_ROUNDS, PICTURES_SIDE = ((2 / 3, 1.4), (4 / 3, 0.7)), 513
 # Coarse rounds: (pixels along the longer side, tubes per side, evaluations).  They precede the fine rounds if light has
 # to move far: if the RRMSD exceeds FAR_OFF_RRMSD on LARGE_PIXELS pixels along the longer side.  Any net resolves so few
-# pixels, so such an error means that light is in the wrong place.  The second coarse round is repeated after the first
+# pixels, so such an error means that light is in the wrong place.  The last coarse round is repeated after the first
 # fine round, if other fine rounds follow.
 COARSE_ROUNDS = ((32, 256, 60), (64, 384, 60))
 LARGE_PIXELS, FAR_OFF_RRMSD = 16, 0.04
 # Factor of the evaluations of the fine rounds after coarse rounds, and this factor if there is a single fine round,
-# since the coarse round cannot be repeated before it: a stage must not end with few pixels.  (Draft of a plate with at
-# most 2 mm of glass: RRMSD 0.264 with a factor of 1.5, 0.236 with 3, but 0.408 if 60 evaluations on 64 pixels come
-# last.)
+# since no coarse round can follow it: a stage must not end with few pixels.  (Draft of a plate with at most 2 mm of
+# glass: RRMSD 0.264 with a factor of 1.5, 0.236 with 3, but 0.408 if 60 evaluations on 64 pixels come last.)
 EVALUATION_FACTOR, SINGLE_ROUND_FACTOR = 1.5, 3.0
 IMAGE_POSITIONS, SECOND_MOMENT_POINTS = 16, 8  # rays per side and source points that give the source image's width
 MIN_EVALUATIONS = 30  # evaluations below which a stage has a single round: each round has to start anew
@@ -76,7 +75,7 @@ COMPARED_EVALUATIONS = 6  # evaluations in each precision in `compare_precisions
 # Rounds of stage 3: (size of the source, evaluations), as fractions of the full size and of all evaluations.  Each
 # round measures the error of the blur anew (source_image.py).
 SOURCE_SIZES = ((1 / 3, 1 / 8), (2 / 3, 1 / 8), (1.0, 1 / 4), (1.0, 1 / 4), (1.0, 1 / 4))
-TUBES_PER_CELL, TUBES_PER_PIXEL = 2.0, 1.1  # tubes of stage 3 per control cell and pixel: the blur hides detail
+TUBES_PER_CELL, TUBES_PER_PIXEL = 2.0, 1.1  # tubes per axis in a net cell and a pixel (stage 3): the blur hides detail
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,7 @@ class TubeRound:
     def search(
         self, problem: Problem, variables: NetVariables, position: SearchPosition, total: int, state: TubeSearch | None
     ) -> Iterator[tuple[Iterate, StageStep]]:
-        """Yield the steps of one run of the minimiser, from the lens of a problem or a saved state, up to the goal.
+        """Yield (iterate, step) of one run of the minimiser from a lens or a saved state, until `goal_by_tubes`.
 
         total: evaluations of all rounds.
         """
@@ -271,7 +270,7 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
 
 
 def _overshoot_weight(task: Task, lens: Lens) -> float:
-    """Return the weight of light outside the target (1 / pixel²), smaller for a source whose image is w pixels wide.
+    """Return the weight of light outside the target (1 / pixel²), divided by 1 + w² for a source image w pixels wide.
 
     Within w of the border some light falls outside with any lens, and pulling it inside would blur the edge.
     """
@@ -319,7 +318,7 @@ class Problem:
 
 
 def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariables:
-    """Return the variables of stage 2 for the nets of a lens; pixels: variables of nets with so few cells per side."""
+    """Return the variables of stage 2 for the nets of a lens, or for coarser nets of up to `pixels` cells per side."""
     nets = lens.nets
     if pixels is not None:
         lens = lens.with_nets(net.refined(coarser(net.shape, pixels + 1)) for net in nets)
@@ -348,7 +347,7 @@ def _geometric_mean(weights: Iterable[Tensor]) -> Tensor:
 def search(
     lens: Lens, problem: Problem, variables: NetVariables, evaluations: int, state: TubeSearch | None = None
 ) -> Iterator[Iterate]:
-    """Run L-BFGS on the heights of all nets, starting from `lens`, in one block of variables c per net."""
+    """Run L-BFGS on the heights of all nets, starting from `lens`, in the variables c, one block per net."""
     start = [net.heights for net in lens.nets]
 
     def in_c(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
@@ -442,7 +441,7 @@ class PrecisionComparison:
 
 
 def compare_precisions(task: Task, lens: Lens) -> PrecisionComparison:
-    """Run a short stage 2 from `lens` in both precisions, with the same tubes and the same number of evaluations.
+    """Run a short stage 2 from `lens` in float32 and in float64, with the same tubes and number of evaluations.
 
     Rounding can change where a line search ends, so the lenses may differ by more than rounding and be equally good.
     """
@@ -465,7 +464,7 @@ def compare_precisions(task: Task, lens: Lens) -> PrecisionComparison:
 
 
 def _tailor_briefly(task: Task, lens: Lens) -> tuple[float, Tensor, Lens]:
-    """Return merit and gradient at the start, and the lens after COMPARED_EVALUATIONS, in its own precision."""
+    """Return merit and gradient at the start, and the lens after COMPARED_EVALUATIONS, in the precision of `lens`."""
     n = min(COMPARED_TUBES, task.knobs.rays)
     merit = Merit.of(task.channels, lens, n, task.goals[:1], overshoot=task.knobs.overshoot)
     merit = replace(merit, picture_error=task.merit)

@@ -46,12 +46,12 @@ POINT_SHIFT = 1e-4  # shift of a point for difference quotients of slopes, relat
 # second finest nets, until the faces fit each other.  (With two fine rounds, the errors of two photographs averaged
 # over blocks of 4 to 32 pixels are 1.5 times larger.)
 FINE_PAIR_ROUNDS = 4
-SETTLED_FRONT = 0.003  # RMS change of q(t), in half widths of the front, below which the coarse rounds end
+SETTLED_FRONT = 0.003  # RMS change of q(t), in half widths of the front's lit part, below which the coarse rounds end
 
 
 @dataclass(frozen=True)
 class FrontRound(stage1.SlopeRound):
-    """State of stage 1 with two freeform faces between two rounds.
+    """State between two rounds of stage 1 for two freeform faces.
 
     `slopes` is the map of the front; its face points are q(t) (mm), where the rays through t meet the front.
     """
@@ -140,7 +140,7 @@ def front_map(
 
     lens: lens with only its front free.  grid: `square_grid` of its lit `window`.  picture: (r, c) flux of the tube
     between each four rays, row 0 = y max.  b: (3, c + 1, r + 1) points where these rays meet the back (mm).  q: points
-    where they meet the front (mm) in the last round; None: from the inverse of r.  The result contains the new q.
+    where they meet the front (mm) in the last round; None: by the inverse of r.  The result contains the new q.
     """
     lit = slope_map.corners_of(picture)
     low, high = (np.array([f(p[lit]) for p in b[:2]]) for f in (np.min, np.max))
@@ -166,7 +166,7 @@ def _in_space(rays: Rays) -> Tensor:
 
 
 def _gathering(grid: FaceGrid, lens: Lens, back: Tensor, stretch: np.ndarray, shift: np.ndarray) -> BSplineSurface:
-    """Return the surface g of the module's docstring, fitted over the lit part of a grid."""
+    """Return g (see the module) fitted to the lit part of a grid; back: b (3, …) mm; r(q) = stretch q + shift."""
     few = grid.thinned(slope_map.GATHERING_SAMPLES)
     x, y, z = _in_space(few.at_face).cpu().double()
     height = float(total(back[2]) / back[2].numel())

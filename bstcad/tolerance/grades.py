@@ -1,4 +1,4 @@
-"""Set the limits of all errors, from three grades of manufacture and alignment and from the [[tolerance]] tables.
+"""Limits of all errors, from three grades of manufacture and alignment and from the [[tolerance]] tables.
 
 The grades are round numbers of the magnitude that manufacturers state for moulded plastic, diamond-turned and precision
 optics of some 20 mm.  They follow no standard and no particular manufacturer; replace them with your own limits.
@@ -17,7 +17,7 @@ from bstcad.scene.quality import FORM, NONE, RIPPLE, TWO_FACE_ERRORS, Tolerance,
 from bstcad.tolerance.perturbations import Kind, Perturbation, Setup, form_error, kinds, ripple
 
 DEFAULT_GRADE: Final = "diamond-turned"
-FORM_MODES = 3  # number of independent random fields with normally distributed amounts that form error sums
+FORM_MODES = 3  # number of independent random fields, with normally distributed amounts, whose sum is the form error
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class ToleranceGrade:
     words: str  # name in reports
     decentre: float  # shift of lens, front and source across and along the axis, mm
     tilt: float  # tilt, clocking and wedge, degrees
-    screen: float  # shift of the screen / width across, / distance along the axis
+    screen: float  # shift of the screen across the axis / its width; shift along the axis / its distance
     thickness: float  # thickness at the centre, mm
     index: float  # refractive index
     front_power: float  # sag of the front at its rim, mm
@@ -92,8 +92,8 @@ def base_grade(table: Sequence[Tolerance]) -> str:
 def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None = None) -> tuple[Perturbation, ...]:
     """Return all errors of the setup, with limits from a graded table.
 
-    Errors that need a finer net than that of the lens are omitted unless the table names them.  Errors of one face
-    relative to the other are included only if the table names them.  Raises SceneError for unknown errors.
+    Form errors and ripple that need a finer net are omitted; SceneError if the table names them.  Errors of one face
+    relative to the other are included only if the table names them.  Also raises SceneError for unknown errors.
     """
     errors = []
     for kind in kinds(setup, material).values():

@@ -62,7 +62,7 @@ class Setup:
         return tuple(mean.tolist())
 
     def picture(self, tubes: int) -> np.ndarray:
-        """Return the flux in each pixel of the screen (rows, columns), row 0 = y max, by tubes x tubes per channel."""
+        """Return the flux in each pixel (rows, columns), row 0 = y max; tubes: flux tubes per side and channel."""
         return tubes_picture(self.lens, self.channels, self.screen, tubes, over_the_back=True).cpu().numpy()
 
     def moved(self, part: str, motion: Motion) -> Setup:
@@ -126,7 +126,7 @@ class Perturbation:
     """One kind of error with its distribution about zero."""
 
     kind: Kind
-    limit: float  # limit (±) in the unit of the kind; for a random field its mean RMS
+    limit: float  # limit (±) in the unit of the kind; of a random field: standard deviation of its amount
     distribution: Literal["normal", "uniform", "field"] = "normal"
     cost: float = 1.0  # cost of keeping the limit, relative to the other errors
 
@@ -189,7 +189,7 @@ MOTIONS = (  # (error, words, axis, True for a rotation)
 
 
 def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
-    """Return all errors of a setup with one amount, except errors without effect or with unknown material data."""
+    """Return all errors of a setup with one amount, except errors whose effect is zero or cannot be computed."""
     every_kind = (*_motions(setup), *_shapes(setup, material), *_lights(setup), *_alignments(setup.lens))
     return {kind.name: kind for kind in every_kind}
 
@@ -199,7 +199,7 @@ def _motions(setup: Setup) -> Iterator[Kind]:
     if all(source.is_shift_invariant for source in sources):
         without_effect.add("source.axial")  # a shift of collimated light along the axis has no effect
     if not all(source.is_rotation_invariant for source in sources):
-        without_effect.add("lens.clocking")  # no effect in rotationally symmetric light; other light cannot be rotated
+        without_effect.add("lens.clocking")  # `Emitter.moved` cannot rotate light without rotational symmetry
     for part in ("lens", "source", "screen"):
         name = setup.lens.passes.optic if part == "lens" else part
         for error, words, axis, turns in MOTIONS:
@@ -342,7 +342,7 @@ def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
 FRONT_SEED_OFFSET = 100  # offset of the seeds for the form of the front, so that its fields differ from the back's
 FACE_NET = 513  # control points per side of the net that replaces a plane or a conic with a form error
 FACE_MARGIN = 6  # number of control points of this net outside a round outline, on each side
-FACE_REACH = 1.03  # radius up to which this net follows the face, in rim radii; beyond it the rim is unaffected
+FACE_REACH = 1.03  # radius / rim radius up to which this net follows the face, so that its end does not affect the rim
 CELLS_PER_PERIOD = 4.0  # minimum number of control cells in a correlation length or a period
 
 
@@ -351,7 +351,7 @@ def form_error(lens: Lens, correlation_length: float, seed: int, face: str = "ba
     net, outline = _net(lens, face)
     seed_of_face = seed + FRONT_SEED_OFFSET * (face == "front")
     field = random_field(net, correlation_length, seed_of_face, inside_outline(outline, net))
-    words = f"form of the {face}, correlated over {correlation_length:.3g} mm (draw {seed})"
+    words = f"form of the {face}, correlated over {correlation_length:.3g} mm (sample {seed})"
     return Kind(f"{face}.form_{seed}", words, "mm RMS", partial(_add_form, face, field))
 
 

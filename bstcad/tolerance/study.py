@@ -44,7 +44,7 @@ from bstcad.report.tolerances import WIDEST, Sensitivity
 from bstcad.tolerance.grades import DEFAULT_GRADE, GRADES, grade_limit
 from bstcad.tolerance.perturbations import MOTIONS, Perturbation, Setup, draws, kinds, perturb, trials
 
-Progress = Callable[[str, int, int, str], None]
+Progress = Callable[[str, int, int, str], None]  # called with stage, units done, units in total, text
 # Executor: calls work(shared, item) for each item, in this process or others, and yields the results in order.
 Spread = Callable[[Callable[[Any, Any], Any], Any, Sequence[Any]], Iterator[Any]]
 
@@ -54,7 +54,7 @@ WAVEFRONT_RAYS = 192  # rays per side of the grid for a wavefront error
 
 
 def run_locally(work: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]) -> Iterator[Any]:
-    """Call work(shared, item) in this process, for two items at a time, since parts of a trace use a single core."""
+    """Call work(shared, item) in this process, for up to two items at a time: parts of a trace use a single core."""
     if not len(items):
         return
     yield work(shared, items[0])
@@ -115,7 +115,7 @@ class Wavefronts:
     figure = "wavefront RMS"
 
     def vector(self, amounts: Sequence[float]) -> np.ndarray:
-        """Return the OPD (rays²,) without piston and tilt, times sqrt(fraction of flux) of each ray; norm: the RMS."""
+        """Return the OPD (rays²,) in waves, without piston and tilt, times sqrt(flux share); its norm is the RMS."""
         setup = perturb(self.setup, self.perturbations, amounts)
         source, lens = _main_channel(setup)
         pupil = exit_pupil(source, lens, self.wave.z, self.rays)
@@ -151,8 +151,8 @@ def _norm(vector: np.ndarray) -> float:
 # --- the model of superposed pictures ---------------------------------------------------------------------------------
 
 DERIVATIVE_STEP = 0.5  # step of the central difference for each perturbation, in standard deviations
-# (index of the first principal direction, nodes ξ in standard deviations).  A picture that moves by more than its
-# detail is not a polynomial of ξ.
+# (index of the first principal direction with these nodes, nodes ξ in standard deviations).  A picture that moves by
+# more than its detail is not a polynomial of ξ, so strong directions need many nodes.
 SPLINE_NODES = ((0, (-3.0, -2.0, -1.2, -0.5, 0.5, 1.2, 2.0, 3.0)), (4, (-2.5, -1.0, 1.0, 2.5)), (8, (-1.0, 1.0)))
 NONLINEAR_DIRECTIONS = 12  # number of strongest directions with nodes; along weaker directions pictures are linear
 MIN_STRENGTH = 1e-3  # change of the picture, relative to the strongest direction, below which it is also linear
@@ -198,7 +198,7 @@ def _cardinal(nodes: tuple[float, ...]) -> tuple[CubicSpline, CubicSpline]:
 
 
 def superpose(pictures: TracedGoal, progress: Progress = lambda *event: None, spread: Spread = run_locally) -> Model:
-    """Trace two pictures for each perturbation, and pictures at the nodes of the principal directions."""
+    """Return the model from two traced pictures per perturbation, and pictures at nodes of principal directions."""
     sigmas = np.array([p.sigma for p in pictures.perturbations])
     n = len(sigmas)
     curved = range(min(n, NONLINEAR_DIRECTIONS))
@@ -248,13 +248,13 @@ def principal_axes(symmetric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 MODEL_TRIALS = 10_000  # default number of trials by the model
 WORST_SHOWN = 5  # number of reported worst trials
-SCREEN_ADJUSTMENTS = {f"screen.{motion}" for motion, *_ in MOTIONS}
+SCREEN_ADJUSTMENTS = {f"screen.{motion}" for motion, *_ in MOTIONS}  # motions by which a user adjusts the screen
 ADJUSTMENT_RANGE = 8.0  # range of adjustments of the screen, in standard deviations
 ADJUSTMENT_FACTOR = 10.0  # limit, relative to the default grade, of an adjustment that is not an error of the study
 QUOTIENT_STEP = 1e-4  # step of the difference quotients, in standard deviations
 INDEPENDENT_SEED = 7919  # offset of the seed of independent trials
 
-Yield = tuple[float, float, float]  # fraction of the trials within a limit: low, likely, high (95 %, Wilson)
+Yield = tuple[float, float, float]  # fraction of trials within a limit: low, estimate, high (Wilson's 95 % interval)
 
 
 @dataclass(frozen=True)
@@ -322,8 +322,8 @@ def estimate_yield(good: np.ndarray) -> Yield:
 def worst_of(studies: Sequence[Study]) -> Study:
     """Combine studies of several targets with equal trials and limit: each figure is that of the worst target.
 
-    The contributions of the errors (`share`) are relative to the mean square of all pictures, each divided by the norm
-    of its target.
+    The contribution of an error (`share`) is a fraction of the mean square change of all pictures, each divided by the
+    norm of its target.
     """
     first, *others = studies
     if not others:
@@ -383,14 +383,14 @@ def _sensitivities(superposed: Model, perturbations: Sequence[Perturbation], bia
 
 
 def adjustments(setup: Setup, errors: Sequence[Perturbation]) -> tuple[Perturbation, ...]:
-    """Return shift, focus, tilt and clocking of the screen, except for motions that are among the errors."""
+    """Return perturbations by shift, focus, tilt and clocking of the screen, except for motions among the errors."""
     known, grade = {error.kind.name for error in errors}, GRADES[DEFAULT_GRADE]
     missing = [kind for name, kind in kinds(setup).items() if name in SCREEN_ADJUSTMENTS - known]
     return tuple(Perturbation(kind, ADJUSTMENT_FACTOR * grade_limit(kind, grade, setup)) for kind in missing)
 
 
 def adjusted_rrmsd(superposed: Model, perturbations: Sequence[Perturbation], amounts: np.ndarray) -> float:
-    """Minimise the RRMSD of the model by shift, focus, tilt and clocking of the screen.
+    """Return the smallest RRMSD of the model over shifts, focus, tilts and clocking of the screen.
 
     perturbations: perturbations of the model.  amounts: amounts (k,) of the first k perturbations.
     """
@@ -417,12 +417,11 @@ def adjusted_rrmsd(superposed: Model, perturbations: Sequence[Perturbation], amo
 def loosest_limits(study: Study, wanted: float, others: Sequence[Study] = ()) -> tuple[tuple[Perturbation, ...], Yield]:
     """Return the loosest tolerances with the `wanted` yield (0 … 1), and their yield by independent trials.
 
-    others: studies of the other goals with the same trials.  A lens passes if it meets all limits; the squares q_i of
-    all goals, relative to the limits, are added.
+    others: studies of the other goals with the same trials.  A lens passes if it meets all limits.
 
-    To keep error i within u_i times its limit costs c_i / u_i and adds q_i u_i² to the mean square of the picture.  For
-    a given sum Σ q_i u_i² the cost is minimal at u_i ∝ (c_i / q_i)^(1/3).  A common factor is then chosen such that the
-    model has the yield.
+    To keep error i within u_i times its limit costs c_i / u_i and adds q_i u_i² to the mean square change of the
+    pictures, summed over the goals, each relative to its limit.  For a given sum Σ q_i u_i² the cost is minimal at
+    u_i ∝ (c_i / q_i)^(1/3).  A common factor is then chosen such that the model has the yield.
     """
     perturbations, goals = study.perturbations, (study, *others)
     added = sum(

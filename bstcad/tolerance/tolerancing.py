@@ -50,8 +50,8 @@ def tolerance(folder: Path, settings: StudySettings) -> Tolerances:
         for key, _, allowed, designed in goals if settings.wanted is not None else ():
             if not designed < allowed:
                 raise SceneError(
-                    f"{key}: the design itself has {designed:.4f}, which is not below {allowed:g}, so no tolerances "
-                    "give this yield; improve the design, or raise the limit in scene.toml"
+                    f"{key}: the design itself has {designed:.4f}, which is not below the limit {allowed:g}, so no "
+                    "tolerances give the wanted yield; improve the design, or raise this limit in scene.toml"
                 )
         results = [studies.study(goal, allowed, designed, settings) for _, goal, allowed, designed in goals]
         study = studies.worst_of(results[: len(pictures)])
@@ -71,7 +71,7 @@ def tolerance(folder: Path, settings: StudySettings) -> Tolerances:
 
 
 def write_trial(folder: Path, number: int, path: Path, settings: StudySettings) -> tuple[tuple[Kind, float], ...]:
-    """Write the lens of one trial as a STEP file, in its own frame; return all amounts of the trial by kind."""
+    """Write the lens of one trial as a STEP file, in the frame of the lens; return all amounts of the trial by kind."""
     scene, nominal = read_nominal(folder)
     pictures = _pictures(scene, nominal, settings)[0]
     [amounts] = trials(pictures.perturbations, settings.seed, [number])
@@ -81,7 +81,7 @@ def write_trial(folder: Path, number: int, path: Path, settings: StudySettings) 
 
 
 def _pictures(scene: Scene, nominal: Nominal, settings: StudySettings) -> tuple[TargetPictures, ...]:
-    """Return the pictures of each target, with common errors; the screens move together."""
+    """Return the pictures of each target, all with the same errors; the screens move together."""
     channels = scene.channels(TRACED_SOURCE_POINTS) if scene.source.extent else scene.channels()
     setup = Setup(nominal.lens, channels, scene.target.screen)
     errors = perturbations(setup, graded_table(scene.tolerance, settings.grade), scene.lens.material)
@@ -105,7 +105,7 @@ def _grade(scene: Scene, grade: str | None) -> Grade:
 
 
 def _record(scene: Scene, settings: StudySettings, study: Study, goals: Sequence[Study]) -> Tolerances:
-    """Return the record; study: worst target; goals: studies of each target and of a stated wavefront."""
+    """Return the record; study: worst target; goals: studies of each target, then of the wavefront if stated."""
     count = len(scene.targets)
     each, wave = goals[:count], goals[count] if len(goals) > count else None
     change = wave.change_of if wave else lambda error: None

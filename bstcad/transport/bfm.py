@@ -9,8 +9,8 @@ and likewise for psi.  Gradient ascent alternates between phi and psi; a c-trans
 grid limits the accuracy: c-transforms map cell centres to cell centres, so the mass error levels off at a few per cent,
 which the flux tubes of monge_ampere.py then reduce.
 
-The c-transform is exact and linear in the number of cells: phi^c(x) = min_y |x - y|²/2 - phi(y) = |x|²/2 - v*(x) with
-v(y) = |y|²/2 - phi(y) is a Legendre transform, which separates: v*(x1, x2) = max_y2 [x2 y2 + max_y1 (x1 y1 -
+The c-transform is exact, in a time linear in the number of cells: phi^c(x) = min_y |x - y|²/2 - phi(y) = |x|²/2 - v*(x)
+with v(y) = |y|²/2 - phi(y) is a Legendre transform, which separates: v*(x1, x2) = max_y1 [x1 y1 + max_y2 (x2 y2 -
 v(y1, y2))].  Each line needs the lower convex hull of its n values and one monotone pass (Lucet 1997, Numerical
 Algorithms 16).  The slope of the hull edge before a vertex is the x from which this vertex is the maximiser, so the
 pass has no branch that depends on the data.
@@ -43,7 +43,7 @@ STEP_INCREASE, STEP_DECREASE, REFUSED_STEP_FACTOR = 1.25, 0.8, 0.5  # factors of
 MIN_GAIN_RATIO, MAX_GAIN_RATIO = 0.25, 0.75  # Armijo-Goldstein bounds of (gain of J) / (sigma |∇J|²)
 PLATEAU_TOLERANCE = 0.005  # relative decrease of the mass error below which the solve is on a plateau
 PLATEAU_ITERATIONS = 5  # number of iterations over which the decrease of the mass error is measured
-STEP_HALVINGS = 1  # halvings of sigma before a plateau stops the solve: the final mass error depends on sigma
+STEP_HALVINGS = 1  # number of halvings of sigma before a plateau stops the solve: the final mass error depends on sigma
 
 
 def half_square(n: int) -> np.ndarray:
@@ -109,7 +109,7 @@ class Poisson:
     def __init__(self, n: int):
         self.symbol = 4.0 * np.sin(0.5 * np.pi * np.arange(n) / n) ** 2  # s_k, (n,)
         self.pivots = _pivots(self.symbol)
-        self.keep, self.share = np.ones(n), np.zeros(n)
+        self.keep, self.share = np.ones(n), np.zeros(n)  # factors in `_eliminate`, (n,)
 
     def solve(self, r: np.ndarray) -> np.ndarray:
         """Return g with -Δg = r - mean(r), mean(g) = 0; cell units, r and g (n, n)."""
@@ -122,7 +122,7 @@ class Poisson:
 
 
 class PoissonWithoutCheckerboard(Poisson):
-    """Inverse (-Δ)^-1 (1 - D_x D_y / 16); it maps the checkerboard, for which D_x and D_y are 4, to zero.
+    """Operator (-Δ)^-1 (1 - D_x D_y / 16); it maps the checkerboard, for which D_x and D_y are 4, to zero.
 
     D_x and D_y are negative second differences.  For D_y = s_y this is ((1 + s_y²/16) / (D_x + s_y)) - s_y/16, again
     one elimination.
@@ -236,7 +236,10 @@ def ladder(source: Density, target: Density, coarsest: int) -> list[tuple[Densit
 
 
 def _ascend(source, target, phi, sigma, *, iterations, tolerance, progress):
-    """Solve on one grid, in v = |y|²/2 - phi and u = |x|²/2 - psi: the c-transform becomes `legendre`, and T = ∇u."""
+    """Return (phi, psi, sigma, mass errors, duals, reason) after the solve on one grid.
+
+    In v = |y|²/2 - phi and u = |x|²/2 - psi the c-transform becomes `legendre`, and T = ∇u.
+    """
     n, rho, nu = source.n, source.values, target.values
     half, poisson = half_square(n), Poisson(n)
     u = legendre(half - phi)
@@ -267,7 +270,7 @@ def _ascend(source, target, phi, sigma, *, iterations, tolerance, progress):
 
 
 def _half_step(a, b, rho, nu, *, poisson, sigma, dual):
-    """Ascend along the gradient in the potential of `a`, unless J decreases.  b = a*; ∇b maps rho towards nu."""
+    """Return (a, b, sigma, J, mass error) after a step in the potential of `a`; b = a*, and ∇b maps rho towards nu."""
     r = nu - pushforward(rho, b)
     error = float(np.abs(r).mean())
     g = poisson.solve(r)

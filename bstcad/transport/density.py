@@ -89,7 +89,7 @@ def _overlaps(n: int, pixels: int, extent: float) -> csr_array:
 
 
 def _normalised(values: np.ndarray, cover: np.ndarray, floor: float, name: str) -> Density:
-    """Raise values to floor x (mean in the picture) and scale to mean 1; cover: fraction of cells in the picture."""
+    """Raise values to floor x (mean in the picture), scale to mean 1; cover: fraction of each cell in the picture."""
     if values.ndim != 2 or values.shape[0] != values.shape[1] or values.shape[0] < 4:
         raise ValueError(f"{name}: has the shape {values.shape}; give an n x n grid with n >= 4")
     _check_values(values, name)
@@ -262,7 +262,7 @@ def _lay_cell(out, n, mass, x, y, i, j):
 
 
 def threads_for(n: int) -> int:
-    """Return the number of threads for n x n cells: one on a small grid, which a second thread does not speed up."""
+    """Return the number of threads for n x n cells: one on a small grid, which two do not speed up, else up to two."""
     return 1 if n <= MAX_SINGLE_THREAD_CELLS else min(2, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
 
 

@@ -44,9 +44,8 @@ class Frame:
 class Mapping:
     """The optimal map T and its inverse S = ∇v, stored as S at the pixel corners of the target.
 
-    S is bilinear inside a pixel, and T(x) solves S(y) = x by Newton's method.  T therefore sends exactly the flux of
-    each tube into its pixel, and T and S are inverse to each other to rounding.  Points outside a frame are clipped to
-    its boundary.
+    S is bilinear inside a pixel; T(x), the y with S(y) = x, is found by Newton's method.  So T sends exactly the flux
+    of each tube into its pixel, and T and S are inverse to each other to rounding.  Points outside a frame are clipped.
     """
 
     x: np.ndarray  # (n + 1, n + 1), x of S at pixel corners, cell units of the source frame
@@ -109,7 +108,7 @@ class Solver:
     """Settings of `solve`."""
 
     iterations: int = 40  # largest number of iterations of the back-and-forth method on each grid
-    tolerance: float = 2e-3  # mass error (mean |F - nu|, both of mean 1) at which the solve has converged
+    tolerance: float = 2e-3  # mass error (mean |flux - target|, both of mean 1) at which the solve has converged
     floors: tuple[float, ...] = FALLING_FLOORS  # floors solved before FLOOR, relative to the mean of the target
     progress: Listener = None  # called after each iteration; None: not called
 
@@ -124,9 +123,9 @@ def solve(
 ) -> Mapping:
     """Return the optimal map: back-and-forth on a coarse grid, then Newton's method on flux tubes up to the finest.
 
-    If the grid does not allow the tolerance, `transport.reason` is "plateau".  The target is raised to FLOOR times its
-    mean, and so stored in `mapping.target`.  If a bright rim borders on black, Newton's first step on a grid would fold
-    the map; the target is then solved with the floors of the solver, one after another, on the last grid.
+    If the grid does not allow the tolerance, `transport.reason` is "plateau".  `mapping.target` is the target raised to
+    FLOOR times its mean.  If the mass error stays above ROUGH_MASS_ERROR, as for a bright rim beside black, the target
+    is also solved with the first of the solver's floors on all grids, then with the others and FLOOR on the last grid.
     sharper: sources of increasing detail, with which Newton's method continues on the last grid as long as the mass
     error stays below ROUGH_MASS_ERROR; `mapping.source` is the last of them that succeeded.
     """
@@ -159,7 +158,7 @@ def solve(
 
 
 def mass_error(mapping: Mapping) -> float:
-    """Return mean |F - nu| over the target's pixels; F: source flux through each pixel's tube; means are 1."""
+    """Return mean |F - nu| over the target's pixels; F: source flux through each pixel's tube; both have mean 1."""
     flux = MongeAmpere(mapping.source, mapping.target).flux(mapping.transport.phi * mapping.source.n**2)
     return float(np.abs(flux - mapping.target.values).mean())
 
@@ -185,7 +184,7 @@ def _forward(sx, sy, points, out):
 
 @njit(cache=True, nogil=True)
 def _residual(sx, sy, x, y, p, q):
-    """Return the residual (x, y) - S(p, q) and the four derivatives of S at (p, q)."""
+    """Return the residual (x, y) - S(p, q), and ∂S_x/∂p, ∂S_x/∂q, ∂S_y/∂p and ∂S_y/∂q."""
     i, j = min(int(p), sx.shape[0] - 2), min(int(q), sx.shape[1] - 2)
     a, b = p - i, q - j
     ex, ey = sx[i + 1, j] - sx[i, j], sy[i + 1, j] - sy[i, j]
@@ -281,7 +280,7 @@ def grid_coordinates(grid_x: np.ndarray, grid_y: np.ndarray, x: np.ndarray, y: n
 
 @njit(cache=True, nogil=True, parallel=True)
 def _search(grid_x, grid_y, x, y, out):
-    """Solve row by row; start from the neighbour's solution or from the position in an evenly spaced grid."""
+    """Solve point by point along rows, from the neighbour's solution or the position in an evenly spaced grid."""
     rows, columns = grid_x.shape[0] - 1.0, grid_x.shape[1] - 1.0
     left, low = grid_x.min(), grid_y.min()
     wide, high = grid_x.max() - left, grid_y.max() - low

@@ -1,11 +1,11 @@
 """Newton's method on the Monge-Ampère equation of flux tubes, which removes the grid error of a coarse map.
 
-S = ∇v = y - ∇phi is the map from target to source.  The flux into target pixel p is the flux that the source sends
-through the tube of the pixel, F_p = ∫_{S(p)} rho, and the equation is F_p = nu_p.  S is stored at pixel corners (mean
-differences of phi, zero normal derivative, so that the rim of the square maps to itself) and is bilinear in pixels.
-The linearisation
+S = ∇v = y - ∇phi, v = |y|²/2 - phi, is the map from target to source.  The flux into target pixel p is the flux that
+the source sends through the tube of the pixel, F_p = ∫_{S(p)} rho, and the equation is F_p = nu_p.  S is stored at
+pixel corners (mean differences of phi, zero normal derivative, so that the rim of the square maps to itself) and is
+bilinear in pixels.  The linearisation
 
-    -div(rho cof(D²v) ∇eta) = nu - F
+    -div(rho cof(D²v) ∇eta) = nu - F,    eta the change of phi,
 
 is elliptic while v is convex; it is solved by conjugate gradients with the Poisson solve as preconditioner.
 On the target side the equation resolves the edges of the picture exactly, and the source may be zero outside a disc;
@@ -23,8 +23,8 @@ from scipy.ndimage import gaussian_filter
 from bstcad.transport.bfm import Listener, PoissonWithoutCheckerboard, TransportStep, prolong
 from bstcad.transport.density import Density, inner, threads
 
-SOFTENING = 0.2  # added to the eigenvalues of rho cof(D²v), to limit Newton's steps in dark, nearly folded regions
-BLUR = 1.0  # width of the Gaussian blur of phi that removes the noise of the coarser grid (cells)
+SOFTENING = 0.2  # addition to the eigenvalues of rho cof(D²v), to limit Newton's steps in dark, nearly folded regions
+BLUR = 1.0  # standard deviation of the Gaussian blur of phi that removes the noise of the coarser grid (cells)
 CG_ITERATIONS, CG_TOLERANCE = 15, 0.1  # conjugate gradients: maximum number of iterations, relative tolerance
 MIN_STEP = 0.05  # smallest fraction of Newton's step in the line search
 MAX_ERROR_RATIO = 0.9  # ratio of mass errors, after to before a step, above which the solve stops
@@ -85,8 +85,8 @@ def newton_on_grids(
 ) -> tuple[np.ndarray, list[float], str]:
     """Apply Newton's method on each grid; phi: start on the first grid (cell units).
 
-    blur: width (cells) of the Gaussian blur of phi before each grid.  Returns phi (cell units), the mass errors on the
-    last grid, and the reason why the solve stopped there.
+    blur: standard deviation (cells) of the blur of phi before each grid.  Returns phi (cell units), the mass errors on
+    the last grid, and the reason why the solve stopped there.
     """
     for k, (source, target) in enumerate(grids):
         if k:
@@ -121,9 +121,9 @@ def _newton_steps(tubes, phi, *, steps, tolerance, progress):
 
 
 def _line_search(tubes, phi, r, *, smoothed, eta):
-    """Return (phi, its residual, preconditioned residual) after the longest accepted of 1, 1/2, 1/4 … of a step.
+    """Return (phi, its residual, preconditioned residual) after the first accepted of the steps 1, 1/2, 1/4 … of eta.
 
-    A step is accepted if it lowers the residual in H^-1 and does not raise it in L2.  None: no step is accepted.
+    A step is accepted if it lowers the residual in H^-1 and raises its square in L2 by less than 10 %.  None: no step.
     """
     norm, square = _dual_norm(r, smoothed), inner(r, r)
     step = 1.0
@@ -218,7 +218,7 @@ def _metric(rho, x, y, metric, softening):
 
 @njit(cache=True, nogil=True)
 def _update(eta, r, d, image, step):
-    """Update the solution eta and the residual r with a step of conjugate gradients along d."""
+    """Update the solution eta and the residual r with a step of conjugate gradients along d; image: operator at d."""
     n = eta.shape[0]
     for i in range(n):
         for j in range(n):
