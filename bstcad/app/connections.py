@@ -77,7 +77,7 @@ def bound(port: int) -> Iterator[socket.socket]:
 
 
 def uvicorn_server(app: Any, ends: Callable[[], None] = lambda: None) -> uvicorn.Server:
-    """Return a server of an application, without output; `ends` is called when a signal ends the server."""
+    """Return a server of `app` that prints nothing; `ends` is called when a signal ends the server."""
     quiet = {"log_level": "critical", "access_log": False, "server_header": False, "lifespan": "off", "ws": "none"}
     config = uvicorn.Config(app, http=HeadersInTime, timeout_graceful_shutdown=SHUTDOWN_TIMEOUT, **quiet)
     return _Server(config, ends)

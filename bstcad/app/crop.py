@@ -12,7 +12,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import Target, shown_size
 
-MAX_SIDE = 480  # longest side of the photo on the page (pixels)
+MAX_SIDE = 480  # largest length of the longer side of the photo on the page (pixels)
 
 
 def target_of(scene: Scene, key: str) -> Target:

@@ -1,4 +1,4 @@
-"""A job of the workbench in its own process, which outlives page and server: a design, or work on a finished design.
+"""A job of the workbench in its own process: a design, or work on a finished design.  Closing the page does not end it.
 
 python -m bstcad.app.design_process FOLDER DESIGN [--resume] does the job of FOLDER/job.json.  The process writes into
 FOLDER what the page shows: the lines of progress, a picture of the light through the best lens so far, and the state.
@@ -25,11 +25,11 @@ from bstcad.runs.files import SentenceError, note
 
 JOB, SCENE = "job.json", "scene.toml"  # input files of a run
 CLOUD = "cloud"  # stem of the file with the measured points; the suffix states the format
-PROGRESS, LIGHT, STATE = "progress.jsonl", "light.png", "state.json"
+PROGRESS, LIGHT, STATE = "progress.jsonl", "light.png", "state.json"  # output files of a run
 MAX_JOB_SIZE = 1_000_000  # largest size of job.json (bytes)
-MAX_PICTURE_SIDE = 512  # longer side of the picture of the light (pixels)
-TUBES_PER_SIDE = 521  # flux tubes per side for that picture
-MIN_INTERVAL = 2.0  # shortest time between two pictures (s)
+MAX_PICTURE_SIDE = 512  # largest length of the longer side of the picture of the light (pixels)
+TUBES_PER_SIDE = 521  # flux tubes per side for the picture of the light
+MIN_INTERVAL = 2.0  # shortest time between two pictures, or two lines of progress with equal text (s)
 MAX_TIME_FRACTION = 0.03  # largest fraction of the run's time that the pictures may take
 SOURCE_POINTS = 16  # points that represent an extended source in the picture
 
@@ -40,7 +40,7 @@ class State:
 
     __pydantic_config__ = {"extra": "forbid", "strict": True, "allow_inf_nan": False}  # rules for reading a file
 
-    state: str  # running | finished | stopped | refused | failed
+    state: str  # running | finished | stopped | refused | failed; none: there is no run
     process: int = 0  # process id while the run is running, else 0
     began: float = 0.0  # seconds since 1970
     passed: bool | None = None  # True if all checks passed; None if none were made
@@ -154,14 +154,14 @@ def measured(job: Mapping[str, Any], run_folder: Path, output: Path, resume: boo
     return State("finished", passed=part.get("passed"), rrmsd=part.get("rrmsd_predicted"), folder=output.name)
 
 
-JOBS = {work.__name__: work for work in (design, tolerance, tradeoff, measured)}
+JOBS = {work.__name__: work for work in (design, tolerance, tradeoff, measured)}  # by kind of run
 
 
 # ---- the process -----------------------------------------------------------------------------------------------------
 
 
 def main(folder: str, output: str, *options: str) -> int:
-    """Do the job of a run's folder and write its final state there; return the exit code."""
+    """Do the job of the run in `folder` for the design in `output`, and write the run's state; return the exit code."""
     run_folder, began = Path(folder), time.time()
     State("running", os.getpid(), began).put(run_folder)
     try:

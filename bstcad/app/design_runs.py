@@ -1,4 +1,4 @@
-"""Runs in their own processes, which the server starts, follows, stops and resumes through files.
+"""Runs in their own processes: the server starts, stops and resumes them, and follows them through files.
 
 A run belongs to a design: the folder .NAME.KIND-run beside the design's folder holds the job, its progress and its
 state.  A new server finds the runs of an earlier one, whether they still run, have ended, or were killed.
@@ -29,17 +29,17 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 
 DESIGN = "design"  # kind of a run that designs a lens; the other kinds work on a finished design
-MAX_PROGRESS_SIZE = 50_000_000  # largest size of a run's file (bytes)
+MAX_PROGRESS_SIZE = 50_000_000  # largest size (bytes) of a run's file that is read
 SCENE_TEXT = "written.toml"  # file of a run: the text of the scene on the page, with its comments
-ENDING_TIMEOUT = 1.0  # time (s) that an ending server waits for runs to write checkpoints; slower runs still do
+ENDING_TIMEOUT = 1.0  # time (s) that an ending server waits for its runs; a slow run still writes its checkpoint later
 START_TIMEOUT = 30.0  # time (s) in which the process of a run has to start
 PROCESS_LOST = "its process was killed, or this machine had too little memory for it"
-NO_RUN = State("none")
+NO_RUN = State("none")  # state of a run that was never started
 
 
 @dataclass(frozen=True)
 class Run:
-    """Run of one kind for a design, which may not have been started."""
+    """Run of one kind for a design; it need not have been started."""
 
     design: Path  # folder of the design
     kind: str = DESIGN  # key of JOBS
@@ -52,9 +52,9 @@ class Run:
     # ---- start and stop ----
 
     def begin(self, job: Mapping[str, Any] | None = None, contents: Mapping[str, bytes] | None = None) -> None:
-        """Start the run in its own process, without an earlier state.  contents: files for it, by name.
+        """Start the run in its own process, and delete the files of an earlier one.  SceneError if it is running.
 
-        SceneError if it is already running.
+        job: entries of job.json besides the kind.  contents: other files for the run, by name.
         """
         if self.state.state == "running":
             raise SceneError(f"{self.design.name}: the {self.kind} is already running; wait until it ends, or stop it")
@@ -89,7 +89,7 @@ class Run:
         self._wait_for_start(process)
 
     def _wait_for_start(self, process: subprocess.Popen) -> None:
-        """Wait until the process has written that it runs; only the process writes its state."""
+        """Wait until the process has written its state, or has ended."""
         until = time.monotonic() + START_TIMEOUT
         while self._written_state().process != process.pid and time.monotonic() < until:
             if process.poll() is not None:  # it has ended already
@@ -191,7 +191,7 @@ def _read(line: str) -> list[Any] | None:
 
 
 def begin_design(scene: Scene, design: Path, text: str = "") -> Run:
-    """Start the design of a scene into a folder; `text` of the scene file is kept with the run.
+    """Start the design of a scene into a folder; text: text of its scene file, which is stored with the run.
 
     SceneError if the folder contains other files, or a run is already running.
     """
@@ -215,7 +215,7 @@ def all_runs(designs: Path) -> list[Run]:
 
 
 def end(runs: list[Run]) -> list[Run]:
-    """Stop running runs, each with its checkpoint, and return them; the server is about to end."""
+    """Signal each run that is running to end with a checkpoint; return these runs."""
     running = [run for run in runs if run.state.state == "running"]
     for run in running:
         run.signal(signal.SIGTERM)

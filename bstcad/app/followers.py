@@ -1,7 +1,7 @@
 """Keys that follow another key, so that one change on the page leaves a sensible scene.
 
 A beam that fills the lens keeps filling it.  A lens that is moved or made thicker keeps its distance from the wall.
-A beam with another profile gets a width of that profile.  With a closed lock, width and height keep their ratio.
+A beam with another profile gets the width that it needs.  With a closed lock, width and height keep their ratio.
 No key follows an invalid value.  In the text of a scene, each key can still be set alone.
 
 `impossible_choices` tries the choices of a form and returns those that the scene cannot have, with the reasons.
@@ -27,7 +27,7 @@ WIDTHS = {  # key of the beam's width, by (kind of the source, profile)
     ("point", "gaussian"): "half_angle_1e2",
     ("point", "uniform"): "half_angle",
 }
-PICTURE_KEYS = ("rotate", "fit", "seen_from", "sample")  # keys whose choices are not tried: reading a photo is slow
+PICTURE_KEYS = ("rotate", "fit", "seen_from", "sample")  # keys whose choices are not tried: each try reads a photo
 
 
 def take_change(
@@ -43,7 +43,7 @@ def take_change(
     alone = changed(text, key, value)
     now = tables(text)
     before = now if valid_text is None else tables(valid_text)
-    of_an_aperture = key == "lens.outline.shape" and table_at("source.aperture", before)  # it needs the same shape
+    of_an_aperture = key == "lens.outline.shape" and table_at("source.aperture", before)  # needs the same shape
     aperture = {"source.aperture.shape": value} if of_an_aperture else {}
     for changes in (with_followers(before, key, value, locked=locked), aperture):
         others = {other: own for other, own in changes.items() if other != key}
@@ -94,7 +94,7 @@ def _other_side(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]
 
 
 def _profile_widths(data: Mapping[str, Any], profile: Any) -> dict[str, Any]:
-    """Return the changes of a beam's widths for a profile: its width fills the lens, other widths are removed."""
+    """Return the changes for a beam with another profile: a missing width fills the lens, other widths are removed."""
     source = table_at("source", data)
     kind = source.get("kind")
     wanted = WIDTHS.get((kind, profile))
@@ -107,7 +107,7 @@ def _profile_widths(data: Mapping[str, Any], profile: Any) -> dict[str, Any]:
 
 
 def _width(data: Mapping[str, Any], source: Mapping[str, Any], name: str) -> float | None:
-    """Return the width of a beam that fills the lens: a radius (mm), or the half angle to its corners (degrees)."""
+    """Return the width of a beam that fills the lens: a radius (mm), or the half angle to the corners (degrees)."""
     sizes = extent(table_at("lens.outline", data))
     if sizes is None:
         return None

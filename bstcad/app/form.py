@@ -1,4 +1,4 @@
-"""The form of a scene, as records and as HTML: a field for each key that the scene's tables may have by the schema.
+"""The form of a scene, as records and as HTML: a field for each key that the schema allows in its tables.
 
 A table that the scene lacks, such as a wavefront or a second target, is an addition: a button that adds the table.
 """
@@ -21,7 +21,7 @@ from bstcad.scene.schema import TAGS, Node, records, rows, schema, tags
 if TYPE_CHECKING:
     import jinja2
 
-# Labels, by key, of the fields that most people change.  Of several keys in a row, the form shows the key that is set.
+# Labels, by key, of the fields that most people change.  An entry is one field: for the key that is set, or the first.
 MAIN_FIELDS: tuple[Mapping[str, str], ...] = (
     {
         "target.image": "Picture: image file", "target.text": "Picture: letters", "target.sample": "Picture: sample",
@@ -46,7 +46,7 @@ MAIN_FIELDS: tuple[Mapping[str, str], ...] = (
     {"target.gamma": "Gamma of the picture"},
     {"tailoring.quality": "Quality"},
 )  # fmt: skip
-# Labels of two positions z for a front face at z = 0, from which they are measured.
+# Labels of two keys z for a front face at z = 0: they are then distances from it.
 FROM_FRONT = {"lens.back.z": "Thickness at the centre", "target.z": "Distance of the wall from the front face"}
 HELP = {  # help of main fields, instead of the description of the key
     "target.z": "The front is the face that the light enters; the drawing shows the distance from the other face.",
@@ -54,13 +54,13 @@ HELP = {  # help of main fields, instead of the description of the key
     "target.y": "-20, 20 is a picture 40 mm high, centred on the axis of the lens.",
     "lens.outline.width": "Size from left to right.",
     "lens.outline.height": "Size from bottom to top.",
-    "lens.back.z": "Before the relief is computed; the face moves if the smallest thickness requires it.",
+    "lens.back.z": "Value before the relief is computed; the face is moved if the smallest thickness requires it.",
     "lens.material": "PMMA is acrylic, PC is polycarbonate; glasses have their catalogue names, such as N-BK7.",
     "source.kind": "collimated: parallel light, such as the sun or a laser beam. point: a lamp or an LED.",
-    "source.wavelength": "Colour of the light; for sunlight or white light leave it. Several: [[nm, weight], …].",
+    "source.wavelength": "Colour; for sunlight or white light, leave it unchanged. Several: [[nm, weight], …].",
     "target.seen_from": "lens: beside the lens, in front of the wall. behind: behind a translucent wall.",
     "target.fit": "crop: cut off its edges. pad: add dark borders. stretch: change its proportions.",
-    "target.gamma": "For a photo leave it empty; 1 if the numbers of the file are irradiance.",
+    "target.gamma": "Leave it empty for a photo; 1 if the numbers of the file are irradiance.",
     "tailoring.quality": "draft is fast, fine is accurate; paper is the procedure of Wang et al. 2023.",
 }
 SECTIONS = {  # labels, by key, of sections whose key would be unclear as a title
@@ -74,10 +74,10 @@ ADDITIONS = {  # labels of buttons that add a table, by key
     "effects": "Add an effect (losses, ghosts)", "tolerance": "Add a tolerance",
 }  # fmt: skip
 LOCKED_SIDES = {"x": "y", "y": "x", "width": "height", "height": "width"}  # side: the other side, which a lock changes
-OPTIONAL_TABLES = ("mount",)  # tables that have a meaning even if they are empty
+OPTIONAL_TABLES = ("mount",)  # tables that a button adds though no key is required
 MAX_TABLES = 1000  # largest number of tables in a list for which the schema states none
 MIN_STEPS = 100  # smallest number of steps of a slider
-STEP_DIGITS = (5, 2, 1)  # possible first digits of a slider's step; all others are 0
+STEP_DIGITS = (5, 2, 1)  # possible first digits of a slider's step; its other digits are 0
 
 Control = Literal["number", "pair", "numbers", "choice", "check", "text", "lines"]
 Table = Mapping[str, Any]
@@ -99,7 +99,7 @@ class Field:
     default: str  # default value; "" without a default
     example: str
     control: Control
-    choices: tuple[str, ...]  # values of a choice, or of the items of a text
+    choices: tuple[str, ...]  # possible values of a choice, or of each item of a text
     value: str  # value in the scene; "" if the key is not set
     is_set: bool
     required: bool
@@ -199,7 +199,7 @@ def _without(group: Group, taken: set[str]) -> Group:
 
 
 def _group(key: str, node: Node, table: Table, data: Table, removable: bool = False) -> Group:
-    """Return the group of the table at a key; if its kind is unknown, only the field of the kind."""
+    """Return the group of the table at a key; if the table states no known kind, only the field of the kind."""
     union = records_at(key, data)
     kinds = matching_records(union, table)
     tag, nodes = tags(union[0]), kinds[0]["properties"]
@@ -225,7 +225,7 @@ def _group(key: str, node: Node, table: Table, data: Table, removable: bool = Fa
 
 
 def _list(key: str, node: Node, value: Any, data: Table, maximum: int) -> Group:
-    """Return the group of a list of tables; of a single table that needs no list, such as a target, only its group."""
+    """Return the group of a list of tables, or of the only table if it need not be in a list, such as a target."""
     tables = [part if isinstance(part, dict) else {} for part in (value if isinstance(value, list) else [value])]
     tables = tables if value else []
     behind = f"{key}[{len(tables)}]"
@@ -297,7 +297,7 @@ def _label(key: str) -> str:
 
 
 def _docs_page(key: str) -> str:
-    """Return the address of a key in the documentation, relative to its first page: the section of its table."""
+    """Return the address of the section on a key's table, relative to the first page of the documentation."""
     alone = [name for name, node in schema()["properties"].items() if not records(node)]
     table = without_numbers(key).partition(".")[0]
     return f"reference/scene-keys.html#keys-{alone[0] if table in alone else table}"
@@ -318,7 +318,7 @@ class Slider:
 
 
 def slider(field: Field) -> Slider | None:
-    """Return a slider from half to twice a field's number, or the width of its pair; None if it has no number."""
+    """Return a slider from half to twice a field's number or the width of its pair; None without number or limits."""
     words, middle = field.value or field.default or field.example, ""
     value = number(words) if field.control == "number" else None
     if field.control == "pair":
@@ -342,7 +342,7 @@ def html(form: SceneForm, errors: Mapping[str, str], has_docs: bool = False) -> 
 
     A control has its key as data-key and name, a slider as data-key only.  A button has data-key, and in data-value the
     JSON of the value that `scene_text.changed` sets; null removes the table.
-    errors: sentences by key, each shown beside the key's control, or at the top if there is no such control.
+    errors: sentences by key, each shown at the key's control, or else at its table, or else at the top.
     has_docs: True if the documentation is available, to which the sections link.
     """
     known = [*(field.key for field in form.first), *(key for section in form.sections for key in _keys(section))]
@@ -356,7 +356,7 @@ def html(form: SceneForm, errors: Mapping[str, str], has_docs: bool = False) -> 
 
 @functools.cache
 def environment() -> jinja2.Environment:
-    """Return the templates of this folder; all text is escaped, since names and scenes come from users."""
+    """Return the Jinja environment of this folder; all text is escaped, since names and scenes come from users."""
     import jinja2
 
     loader, undefined = jinja2.FileSystemLoader(Path(__file__).parent), jinja2.StrictUndefined
@@ -377,7 +377,7 @@ def html_id(key: str) -> str:
 
 
 def _owner(key: str, known: Iterable[str]) -> str:
-    """Return the key of the field, or else of the innermost group, beside which a sentence on a key is shown, or ""."""
+    """Return the key of the field or innermost group at which a sentence on `key` is shown; "": at the top."""
     alike = {other.replace("[0]", ""): other for other in known} | {other: other for other in known}
     while key:
         if found := alike.get(key) or alike.get(key.replace("[0]", "")):

@@ -1,8 +1,8 @@
 """The guard before every request, since any web page and any local program can talk to a server on loopback.
 
 A request is accepted on three conditions: its Host is this server (a foreign name may point here); its Origin, if any,
-is this server (another page may send a request); and it has the token of this start, from the address that the
-terminal prints or from the cookie that this address sets.  The size of a body is checked while the body arrives.
+is this server (another page may send a request); and it has the token of this start, in the address that the
+terminal prints or in the cookie that this address sets.  The size of a body is checked while the body arrives.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 
 MAX_BODY_SIZE = 4_000_000  # largest size of a body (bytes), enough for a scene file as JSON
-POLICY = (
+POLICY = (  # Content-Security-Policy of the answers
     "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; form-action 'self'; "
     "frame-ancestors 'none'"
 )
-SANDBOX = (
+SANDBOX = (  # Content-Security-Policy of the HTML files of a design
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 )
-HEADERS = {
+HEADERS = {  # headers of every answer that does not set them itself
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
@@ -38,10 +38,10 @@ HEADERS = {
     "Content-Security-Policy": POLICY,
 }
 OWN_SITES = ("same-origin", "none")  # accepted Sec-Fetch-Site: pages of this server, or an address that a person typed
-REFUSALS = {
-    "host": "This address is not the workbench's; open the one that the terminal shows.",
+REFUSALS = {  # sentences for the user, by the condition that the request does not meet
+    "host": "This address is not the workbench's; open the address that the terminal shows.",
     "origin": "Another web page sent this request; the workbench answers only its own pages.",
-    "token": "The workbench was restarted, or this address is incomplete; open the one that the terminal shows. "
+    "token": "The workbench was restarted, or this address is incomplete; open the address that the terminal shows. "
     "Nothing is lost: scenes and designs are in their folders.",
     "size": "The request is too large; send a smaller file.",
 }
@@ -52,7 +52,7 @@ class TooLarge(Exception):
 
 
 class Guard:
-    """ASGI middleware that protects the application of one start."""
+    """ASGI middleware that protects the application during one start of the server."""
 
     def __init__(self, app: Any, port: int, token: str, larger: tuple[str, int] = ("", 0)) -> None:
         """Guard `app`.  larger: regular expression of the paths that allow larger bodies, and the limit in bytes."""
@@ -115,10 +115,10 @@ def _refusal(why: str, code: int) -> Response:
 def _redirect(path: str, from_own: bool) -> Response:
     """Return an answer that leads to the same page without the token in its address.
 
-    Browsers count a redirect as a request of the page that began it.  From a terminal in a web page, it would arrive as
-    a foreign request without the strict cookie; then, a page of this server leads to the address instead.
+    Browsers count a redirect as a request of the page with the link.  If this page is foreign, such as a terminal in a
+    browser, they omit the strict cookie; then, a page of this server leads to the address instead.
     """
-    address = quote("/" + path.lstrip("/"))  # //name would be another server; no quotation mark is left
+    address = quote("/" + path.lstrip("/"))  # //name would be another server; `quote` leaves no quotation mark
     if from_own:
         return RedirectResponse(address, status_code=303)
     return HTMLResponse(f'<!doctype html><title>bstcad</title><meta http-equiv="refresh" content="0;url={address}">')
@@ -140,7 +140,7 @@ class _Body:
         return message
 
     async def send(self, message: MutableMapping[str, Any]) -> None:
-        """Send the answer, unless the body is too large: starlette answers every error before it raises it."""
+        """Send the answer, unless the body is too large: starlette answers an error before raising it."""
         if self._left >= 0:
             self.answered = True
             await self._send(message)

@@ -11,20 +11,21 @@ from typing import Any
 from bstcad.scene.schema import Node, records, schema, tags
 
 KEY_PART = re.compile(r"([^.\[\]]+)(?:\[(\d+)\])?")  # part of a dotted key: name, number of a table in its list
-TABLE_NUMBER = re.compile(r"\[\d*\]")
+TABLE_NUMBER = re.compile(r"\[\d*\]")  # number of a table in its list, as in target[1]
 SOURCE_DISTANCE = 100.0  # distance of a new source from the lens (mm)
-DISTANCE_RATIO = 1.5  # distance of an added target from the back, relative to the last target
+DISTANCE_RATIO = 1.5  # distance of an added target from the back / distance of the last target from it
 SIZE_MODELS = {  # new outline: (table whose size it gets, factor on this size)
     "source.aperture": ("lens.outline", 1.0), "mount.rim": ("lens.outline", 1.0), "wavefront": ("lens.outline", 1.0),
     "mount.flange.outline": ("lens.outline", 2.0), "lens.front.outline": ("lens.outline", 0.5),
     "target.outline": ("target", 1.0), "target.profile": ("target", 1.0),
 }  # fmt: skip
-FIRST_OPTIONS = {  # key with which a new table begins that needs one of several keys, by (table, kind)
+FIRST_OPTIONS = {  # first key, by (table, kind), of a new table that needs one of several keys
     ("target", ""): {"uniform": True},
     ("tolerance", ""): {"grade": "precise"},
     ("lens.front", "bspline"): {"optimise": True},
 }
 
+# Python types of a value, by its type in the schema.
 TYPES = {"number": (int, float), "integer": (int,), "boolean": (bool,), "string": (str,), "array": ()}
 
 Table = Mapping[str, Any]
@@ -96,7 +97,7 @@ def choices(node: Node) -> list[Any]:
 
 
 def cast(node: Node, value: Any) -> Any:
-    """Return a value, or a table of values, with the types of a node: integers become floats where it has floats.
+    """Return a value, or a table of values, with the types of a node: integers become floats where the node has floats.
 
     Ranges are not checked.  ValueError if the node does not allow the value.
     """
@@ -141,7 +142,7 @@ def _hashable(table: Table) -> dict[str, str]:
 
 
 def convert_table(key: str, tag: Mapping[str, str], data: Table) -> dict[str, Any]:
-    """Return the table at a key converted to another kind: common keys keep their values, missing keys get new ones."""
+    """Return the table at a key converted to the kind `tag`: common keys keep their values, others get new ones."""
     union, old = records_at(key, data), table_at(key, data)
     chosen = next((record for record in union if tag.items() <= tags(record).items()), None)
     if chosen is None:  # no such kind
@@ -169,8 +170,8 @@ def _is_common(before: Node | None, after: Node | None, value: Any) -> bool:
 def new_table(key: str, data: Table) -> dict[str, Any]:
     """Return a new table for a key: its required keys, with values that fit the scene, or the schema's examples.
 
-    The key of a list names the table after the last one, target[1]; a second target is a copy of the first at
-    DISTANCE_RATIO times the distance.
+    In a list, the key names the table after the last one, such as target[1].  A further target is a copy of the last
+    at DISTANCE_RATIO times its distance from the back.
     """
     name, others = without_numbers(key), data.get(without_numbers(key))
     others = [part for part in (others if isinstance(others, list) else [others]) if isinstance(part, dict)]
@@ -243,7 +244,7 @@ def extent(table: Table) -> tuple[float, float] | None:
 
 
 def are_numbers(*values: Any) -> bool:
-    """Return True if all values are numbers below 1e300, and not bool."""
+    """Return True if all values are numbers (not bool) of a magnitude below 1e300."""
     return all(type(value) in (int, float) and abs(value) < 1e300 for value in values)
 
 
@@ -264,7 +265,7 @@ def _screw_circle(data: Table) -> float | None:
 
 
 def _source_z(data: Table) -> float | None:
-    """Return z (mm) of a new source: before the lens, or on the light's side of a mirror; None if z = 0 is possible."""
+    """Return z (mm) of a new source before the lens, or on the light's side of a mirror; None: keep the default."""
     source, front, back = table_at("source", data), _scaled_z(data, "lens.front"), _scaled_z(data, "lens.back")
     if front is None or back is None:
         return None

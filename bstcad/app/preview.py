@@ -1,7 +1,7 @@
 """A preview of a scene: the light of its lens after about a second, from a reduced design.
 
 The preview is a quick design (`Task.preview`) of the same scene with fewer pixels, control points, flux tubes and
-evaluations.  A pixel has as many control cells and tubes as in a draft.  Details finer than a pixel are not shown.
+evaluations.  Each pixel has as many control cells and tubes as in a draft.  Details finer than a pixel are not shown.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from bstcad.tailoring.source_image import ExtendedSource
 
 COARSE_NET = 33  # control points per side in the first rounds of stage 1
 TRANSPORT_CELLS = 48  # cells per side of the transport map
-GOALS_SIZE_FACTOR = 0.5  # factor on pixels, net and tubes for a scene of several goals
-GOALS_EVALUATIONS_FACTOR = 3  # factor on the evaluations for a scene of several goals
+GOALS_SIZE_FACTOR = 0.5  # factor on pixels, control points and tubes per side for several targets or a wavefront
+GOALS_EVALUATIONS_FACTOR = 3  # factor on the evaluations for several targets or a wavefront
 MIN_POINT_ROUNDS = 3  # smallest number of rounds of stage 1 for a point source
 TUBES_PER_PIXEL = 2.5  # flux tubes per pixel along each axis for the picture; tailoring uses other tubes
-LEDGER_RAYS = 160  # rays per side for the ledger of the light
-SHAPE_POINTS = 129  # points per side for the thickness
-IMAGE_POINTS = 16  # points per side of the back for the images of the source
+LEDGER_RAYS = 160  # rays per side for the ledger of the light (flux by fate)
+SHAPE_POINTS = 129  # points per side of the lens for the figures of its shape
+IMAGE_POINTS = 16  # points per side of the back, for the images of the source and the lit fraction
 SEED = 77  # seed of the ledger's rays
 
 
@@ -54,8 +54,8 @@ class PreviewSize:
     blurred: int  # evaluations of stage 2 for an extended source, each of which takes twice the time
 
 
-QUICK = PreviewSize(pixels=72, net=180, tubes=240, rounds=2, evaluations=12, blurred=8)
-REFINED = PreviewSize(pixels=128, net=320, tubes=384, rounds=4, evaluations=50, blurred=30)
+QUICK = PreviewSize(pixels=72, net=180, tubes=240, rounds=2, evaluations=12, blurred=8)  # first preview
+REFINED = PreviewSize(pixels=128, net=320, tubes=384, rounds=4, evaluations=50, blurred=30)  # preview when idle
 
 
 class Outdated(Exception):
@@ -107,7 +107,7 @@ def _progress(outdated: Callable[[], bool], remarks: list[str]) -> Progress:
 
 
 def reduced_scene(scene: Scene, size: PreviewSize) -> Scene:
-    """Return the scene with the pixels, control points and settings of a preview, and bstcad's own method."""
+    """Return the scene with the pixels, control points and tailoring settings of a preview, by the default method."""
     several = len(scene.targets) > 1 or scene.wavefront is not None
     size_factor, evaluations_factor = (GOALS_SIZE_FACTOR, GOALS_EVALUATIONS_FACTOR) if several else (1.0, 1)
     max_net = round(size_factor * size.net)
@@ -132,7 +132,7 @@ def reduced_scene(scene: Scene, size: PreviewSize) -> Scene:
 
 
 def _evaluate(scene: Scene, made: Made) -> Preview:
-    """Return the preview of a lens: its light, traced by independent tubes or by images of the source, and figures."""
+    """Return the preview of a lens: figures, and its light by flux tubes that its design did not use."""
     pictures, channels, lens = [], scene.channels(), made.lens
     for goal in made.goals:
         light = _picture(scene, lens, goal)
@@ -158,7 +158,7 @@ def _lit_fraction(scene: Scene, lens: Lens) -> float:
 @torch.no_grad()
 def _picture(scene: Scene, lens: Lens, goal: Goal) -> np.ndarray:
     n = round(TUBES_PER_PIXEL * max(goal.receiver.shape))
-    if scene.draw is None:  # a point source
+    if scene.draw is None:  # a point source; otherwise the picture is blurred with images of the source
         return tubes_picture(lens, scene.channels(), goal.receiver, n).numpy()
     source = ExtendedSource(scene.source, scene.with_source_scaled(0.0).channels(), scene.draw)
     merit = Merit.of(source.centre, lens, n, [goal], overshoot=0.0).with_blur(source, lens)

@@ -24,7 +24,7 @@ from bstcad.scene.scene_file import tables
 from bstcad.sweep.net_choice import with_net
 from bstcad.sweep.plan import plan
 
-STAGES = ("preview", "settled", "effects", "predicted")
+STAGES = ("preview", "settled", "effects", "predicted")  # names of the answers to a request, in their order
 MAX_PAGES = 32  # largest number of pages with a stored request
 IDLE_DELAY = 0.7  # pause (s) between a preview and the next of STAGES, in case another change comes
 JOIN_TIMEOUT = 0.5  # time (s) in which the thread has to end
@@ -41,7 +41,7 @@ class PreviewRequest:
     text: str = ""  # text of the scene file, to whose lines a plan refers
     answers: list[tuple[str, Any]] = field(default_factory=list)  # (stage, answer or the Exception that prevented it)
     replaced: bool = False  # True once a later request of the page has come
-    preview_time: float = math.inf  # time of the first preview (time.monotonic)
+    preview_time: float = math.inf  # time at which the first preview was ready (time.monotonic)
     poll_time: float = field(default_factory=time.monotonic)  # time of the page's last poll (time.monotonic)
     plan: Iterator[dict[str, Any]] | None = None  # parts of the plan that are still to be made
 
@@ -80,7 +80,7 @@ class PreviewDesk:
         """Wait up to `patience` seconds for the answer of a stage (index in STAGES); None if late or replaced."""
         with self._news:
             request.poll_time = time.monotonic()
-            self._news.notify_all()  # the request may have been given up
+            self._news.notify_all()  # the thread serves this page again if it had stopped polling
             self._news.wait_for(lambda: len(request.answers) > stage or request.replaced or self._ended, patience)
             return request.answers[stage] if len(request.answers) > stage else None
 
@@ -141,7 +141,7 @@ class PreviewDesk:
             return
         except Exception as fault:  # a failing preview must not end the thread
             found = fault
-        processes.return_freed()  # sizes of arrays change between previews: unused holes would add up
+        processes.return_freed()  # arrays change in size between previews: freed memory would fragment
         with self._news:
             failed = stage == "preview" and isinstance(found, Exception)
             request.preview_time = min(request.preview_time, time.monotonic())

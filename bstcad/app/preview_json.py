@@ -47,7 +47,7 @@ def figures(found: Preview) -> Rows:
 
 
 def of_plan(plan: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the effects that are left out, one row for each, with the chosen net and the verdict."""
+    """Return the simulated effects, a row for each effect left out, the chosen net, and the verdict."""
     rows = [
         [" ".join(filter(None, (LEFT_OUT[entry.kind], entry.detail and f"({entry.detail})"))), *changes(entry), of]
         for goal in plan["goals"]

@@ -1,6 +1,6 @@
-"""The server of the workbench: its pages and the requests of their scripts, on loopback and behind guard.py.
+"""The server of the workbench on loopback, which sends the pages and answers the requests of their scripts.
 
-The server keeps no state that could be lost: texts are in the workspace, runs in their folders.
+guard.py checks each request first.  Nothing is lost when the server ends: scenes, runs and designs are in files.
 """
 
 from __future__ import annotations
@@ -46,9 +46,10 @@ from bstcad.scene.schema import rows
 
 Body = Mapping[str, Any]  # JSON object that a page sends
 ANSWER_TIMEOUT = 20.0  # time (s) until a waiting request returns without an answer and the page polls again
-UPLOAD = "/api/picture"
-LARGE_BODY_PATHS = rf"{UPLOAD}|/api/design/[^/]+/measured"  # paths that allow larger bodies
-STATIC = Path(__file__).parent / "static"
+UPLOAD = "/api/picture"  # address to which a page sends a picture
+LARGE_BODY_PATHS = rf"{UPLOAD}|/api/design/[^/]+/measured"  # paths whose bodies may have LARGEST_UPLOAD bytes
+STATIC = Path(__file__).parent / "static"  # folder of scripts and styles
+# Content types, by file ending, of the files of a design that a page shows; all other files are downloads.
 CONTENT_TYPES = {".html": "text/html", ".json": "application/json", ".png": "image/png", ".pdf": "application/pdf"}
 RRMSD = (
     "RRMSD is the error of the light: the root mean square of its difference from the picture, divided by the root "
@@ -62,12 +63,12 @@ CLOUD_ENDINGS = ((b"ply", ".ply"), (b"solid", ".stl"))  # (first bytes of a file
 
 
 class Workbench:
-    """The server's application: pages, requests, previews and runs from one start of the server to its end."""
+    """Web application of the server, with the previews and runs that the server has started."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace, self.desk = workspace, PreviewDesk()
         self.started: list[Run] = []  # runs that this server has started
-        self._valid_texts: dict[str, str] = {}  # latest valid text, by scene; followers are computed from it
+        self._valid_texts: dict[str, str] = {}  # latest valid text, by scene; see `take_change`
         scene, design = "/api/scene/{name}", "/api/design/{name}"
         get_routes = {
             "/": self.start_page,
@@ -130,8 +131,8 @@ class Workbench:
         return self._sentence_answer(request, f"{name}{error.strerror or type(error).__name__}; {remedy}", 400)
 
     def _note_disconnect(self, request: Request, error: Exception) -> Response:
-        """Report in the terminal a request whose client has disconnected, so that no one reads the answer."""
-        print(f"bstcad: {request.url.path}: the browser cancelled this request, which has no effect", file=sys.stderr)
+        """Report in the terminal that the client disconnected before its request was complete."""
+        print(f"bstcad: {request.url.path}: the browser cancelled this request; nothing was done", file=sys.stderr)
         return Response(status_code=400)
 
     def _report_fault(self, request: Request, error: Exception) -> Response:
@@ -141,7 +142,7 @@ class Workbench:
         return self._sentence_answer(request, f"{words}; see the terminal of the workbench for the traceback", 500)
 
     def _sentence_answer(self, request: Request, sentence: str, status: int) -> Response:
-        """Answer with a sentence, as a page or as JSON, without the folders of this machine."""
+        """Answer with a sentence, as JSON under /api/ or else as a page; folders of this machine are left out of it."""
         sentence = self.workspace.without_paths(sentence)
         if not request.url.path.startswith("/api/"):
             return self._page("lost.html.j2", status=status, title="Error", sentence=sentence)
@@ -217,7 +218,7 @@ class Workbench:
         return self._page("design.html.j2", title=name, name=name, run=self._news(run), jobs=jobs, **result)
 
     def compare_page(self, request: Request) -> Response:
-        """Answer with the page that compares designs: their pictures, curves, and the keys that differ."""
+        """Answer with the page that compares up to four designs: pictures, RRMSD over time, and keys that differ."""
         names = [name for name in request.query_params.getlist("design")][:4]
         known = [(name, self._report(name)) for name in names]
         found = [{"name": name, "report": report, "rrmsd": record.rrmsds(report)} for name, report in known if report]
@@ -230,7 +231,7 @@ class Workbench:
     # ---- scenes ----
 
     def add_scene(self, _: str, body: Body) -> dict[str, Any]:
-        """Write a new scene file: {light, size as in `bstcad new`, picture or sample or text} or {template}."""
+        """Write a scene file; body: {light, size} as in `bstcad new`, or {template}; and picture, sample or text."""
         known = {key: str(body[key]) for key in ("sample", "text", "template") if body.get(key)}
         image = str(body["picture"]) if body.get("picture") else None
         light = str(body.get("light") or next(iter(new_scene.LIGHTS)))
@@ -243,7 +244,7 @@ class Workbench:
         return JSONResponse({"picture": await run_in_threadpool(self.workspace.keep, data)})
 
     def scene_state(self, request: Request) -> Response:
-        """Answer with a scene's text, form and fault; only with the revision if the page has this revision."""
+        """Answer with a scene's text, form and fault, or only with its revision if the page has it (?revision)."""
         known, name = request.query_params.get("revision"), request.path_params["name"]
         if known is not None and known == self.workspace.opened(name).revision:
             return JSONResponse({"revision": known})
@@ -278,9 +279,9 @@ class Workbench:
         return None
 
     def change_scene(self, name: str, body: Body) -> dict[str, Any]:
-        """Change a scene: {text}, or {key, words} with words that a person typed, or {key, value}.
+        """Change a scene; body: {text}, or {key, words} with words that a person typed, or {key, value}.
 
-        {locked: true}: the other side of a target or a lens keeps its ratio to the changed side.  In the answer,
+        {locked: true}: the other side of a target or an outline keeps its ratio to the changed side.  In the answer,
         `followed` lists the other keys that changed.
         """
         followed: list[str] = []
@@ -311,7 +312,7 @@ class Workbench:
         return Response(crop.small_photo(crop.target_of(scene, key)), media_type="image/png")
 
     def take_proportions(self, name: str, body: Body) -> dict[str, Any]:
-        """Give the plate and the picture the proportions of a target's photo: {key}, the target's key."""
+        """Give plate and picture the proportions of a target's photo; body: {key}, the key of the target."""
         key = str(body.get("key") or "target")
 
         def with_proportions(text: str) -> str:
@@ -330,7 +331,7 @@ class Workbench:
         return JSONResponse(impossible_choices(text, lambda each: (self._fault(name, each) or {}).get("sentence")))
 
     def save_scene(self, name: str, body: Body) -> dict[str, Any]:
-        """Save the text in the scene file; {anyway: true} replaces a file that another program changed."""
+        """Save the text in the scene file; body: {anyway: true} replaces a file that another program changed."""
         self.workspace.save(name, anyway=bool(body.get("anyway")))
         return self._state(name)
 
@@ -342,7 +343,7 @@ class Workbench:
     # ---- previews ----
 
     def preview(self, name: str, body: Body) -> dict[str, Any]:
-        """Answer with the preview of the current scene: {page, number}; {replaced: true} after a newer request."""
+        """Request previews of a scene and answer as `answer` does for the first stage; body: {page, number}."""
         text = self.workspace.opened(name).text
         page, number = str(_required(body, "page"))[:40], _integer(_required(body, "number"))
         asking = PreviewRequest(page, number, self.workspace.scene(name, text), text)
@@ -350,7 +351,7 @@ class Workbench:
         return self._answered(asking, 0)
 
     def answer(self, request: Request) -> Response:
-        """Answer with a later stage of a page's request (?page, number, stage); {} if the stage is not finished."""
+        """Answer with a stage of a request (?page, number, stage); {}: not finished; {replaced: true}: outdated."""
         query = request.query_params
         number, stage = _integer(_required(query, "number")), _integer(_required(query, "stage"))
         body = self.desk.last(_required(query, "page"))
@@ -378,7 +379,7 @@ class Workbench:
     def make(self, name: str, body: Body) -> dict[str, Any]:
         """Save the scene and start its design in its own process; answer with the design's name.
 
-        {page}: id of the page, whose request for previews is dropped.
+        body: {page}, the id of the page; its request for previews is dropped.
         """
         self.desk.drop(str(body.get("page")))
         text = self.workspace.opened(name).text
@@ -396,7 +397,7 @@ class Workbench:
         return Run(self.workspace.design(request.path_params["name"]), kind)
 
     def follow(self, request: Request) -> Response:
-        """Answer with the state of a run and its progress from line `since` on."""
+        """Answer with the state of a run (?kind) and the lines of its progress from number ?since on."""
         return JSONResponse(self._news(self._run(request), _integer(request.query_params.get("since", 0))))
 
     def _news(self, run: Run, since: int = 10**9) -> dict[str, Any]:
@@ -413,7 +414,7 @@ class Workbench:
         return Response(data, media_type="image/png") if data else Response(status_code=404)
 
     def dark_figure(self, request: Request) -> Response:
-        """Answer with the figure of the irradiance for dark mode; the normal figure if that fails."""
+        """Answer with irradiance.png drawn for dark mode, or with the file itself if the design cannot be read."""
         name = request.path_params["name"]
         usual = self.workspace.file(name, "figures/irradiance.png")
         try:
@@ -425,7 +426,7 @@ class Workbench:
             return FileResponse(usual, media_type="image/png")
 
     def stop(self, request: Request) -> Response:
-        """Stop a run: a design with the best lens so far, or at once with a checkpoint (?at_once)."""
+        """Stop a run; a design ends with the best lens so far, or at once with a checkpoint (?at_once)."""
         run = self._run(request)
         gently = run.kind == design_runs.DESIGN and "at_once" not in request.query_params
         run.signal(signal.SIGINT if gently else signal.SIGTERM)
@@ -450,7 +451,7 @@ class Workbench:
         wanted = body.get("yield")
         fraction = None if wanted in (None, "") else _number(wanted, "yield") / 100
         if fraction is not None and not 0 < fraction < 1:
-            raise SceneError(f"yield: {100 * fraction:g} % is not between 0 and 100 %; give a percentage such as 90")
+            raise SceneError(f"yield: {100 * fraction:g} % is not strictly between 0 and 100 %; give 90, for example")
         return self._begin(name, "tolerance", {"grade": body.get("grade") or None, "yield": fraction})
 
     def tradeoff(self, name: str, body: Body) -> dict[str, Any]:
@@ -488,7 +489,7 @@ class Workbench:
         kind = CONTENT_TYPES.get(path.suffix)
         if kind is None or "download" in request.query_params:
             return FileResponse(path, media_type="application/octet-stream", filename=path.name)
-        policy = SANDBOX if kind == "text/html" else POLICY  # the page of a foreign folder is isolated
+        policy = SANDBOX if kind == "text/html" else POLICY  # a page may come from elsewhere: isolate it
         return FileResponse(path, media_type=kind, headers={"Content-Security-Policy": policy})
 
     def all_files(self, request: Request) -> Response:
@@ -584,7 +585,7 @@ def _flat_values(table: Mapping[str, Any], at: str = "") -> dict[str, str]:
 
 
 def serve(given: Path | None, port: int, say: Callable[[str], None], show: Callable[[str], Any]) -> None:
-    """Serve the workbench until Ctrl-C.  say: prints a sentence in the terminal; show: opens an address."""
+    """Serve the workbench until Ctrl-C.  given: see `Workspace.of`.  say: prints a sentence; show: opens an address."""
     workspace, page = Workspace.of(given)
     with bound(port) as own:
         number, token = own.getsockname()[1], secrets.token_urlsafe(24)

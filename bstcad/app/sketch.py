@@ -1,7 +1,7 @@
-"""A side view of a scene with its dimensions: light, lens and wall, by the keys of its text.
+"""A side view of a scene with its dimensions: light, lens and wall, drawn from the keys of its text.
 
-The text need not be valid, and the drawing is not to scale.  An element with data-of belongs to all keys with that
-prefix and is highlighted while one of them is edited.
+The text need not be valid, and the drawing is not to scale.  An element with data-of belongs to all keys that
+begin with its value, and is highlighted while one of them is edited.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ class Workbench:
         self.refresh()
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the scene to a file with its comments; a scene given as an object also writes its pictures there."""
+        """Write the scene to a file with its comments; the pictures of a scene object are written beside the file."""
         path = Path(path).expanduser()
         beside = folders.scene_files(self.scene) if self._path is None else {}
         for name, data in (beside | {folders.SCENE: self.text.encode()}).items():

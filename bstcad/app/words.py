@@ -28,8 +28,8 @@ from bstcad.scene.schema import Node, records
 BARE = re.compile(r"[A-Za-z0-9_-]+")  # name that TOML allows without quotes
 MAX_DIGITS = 300  # largest length of a number (characters)
 SPACES = re.compile(r"(?<=\d)[ \u00a0\u2009\u202f'’_](?=\d{3}(?!\d))")  # spaces before three digits of a number
-THOUSANDS = {mark: re.compile(rf"[+-]?\d{{1,3}}(\{mark}\d{{3}})+") for mark in ",."}
-DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+THOUSANDS = {mark: re.compile(rf"[+-]?\d{{1,3}}(\{mark}\d{{3}})+") for mark in ",."}  # whole number, by mark
+DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")  # number with a decimal point
 BOOLEAN_WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 
 
@@ -39,9 +39,9 @@ BOOLEAN_WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": Fa
 def typed(key: str, words: str, data: Mapping[str, Any]) -> Any:
     """Return the value of the words that a person typed for a key; None, which removes the key, for empty words.
 
-    A number has a decimal point or a decimal comma: 0.5 and 0,5.  A single mark is decimal: 1,000 is 1.  If points and
-    commas occur, the last is decimal and the others separate thousands, as spaces do: 1.000,5, 1,000.5 and 1 000,5.  A
-    mark that occurs twice separates thousands, as every mark in an integer: 1.000 pixels are 1000.  A unit may follow.
+    A number has a decimal point or a decimal comma: 0.5 and 0,5.  A single one is decimal: 1,000 is 1.  If points and
+    commas occur, the last is decimal and the others separate thousands, as spaces do: 1.000,5, 1,000.5 and 1 000,5.
+    Repeated points or commas, and any in an integer, separate thousands: 1.000 pixels are 1000.  A unit may follow.
 
     Items of a list are separated by ";", else by commas with a space, else by spaces: "1,5; 2,5" and "1.5, 2.5" and
     "1,5 2,5"; if none of these occurs, by commas: "1.5,2.5".  Anything in brackets is TOML:
@@ -146,7 +146,7 @@ def _fault(key: str, node: Node, words: str, data: Mapping[str, Any]) -> str:
         wrong = [part for part in given if number(part) is None]
         if wrong:
             return f"{wrong[0][:40]!r} is not a number; write {wanted} numbers, such as {sample}"
-        return f"{len(given)} values are given, but {wanted} are needed; write {wanted}, such as {sample}"
+        return f"{wanted} values are needed instead of {len(given)}; write {wanted}, such as {sample}"
     if kinds == ["array"]:
         return f"{quoted} is not a list of the right form; write a list such as {sample}"
     what, remedy = ("whole number", "without a decimal point") if "integer" in kinds else ("number", "with digits")

@@ -29,7 +29,7 @@ from bstcad.scene.schema import contents
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")  # name of a scene or a design: no path, no hidden file
 PICTURES = "pictures"  # folder of uploads, beside the scenes
 UNSAVED = "unsaved"  # kind of the hidden file with unsaved changes
-LARGEST_UPLOAD = 100_000_000  # largest size of a picture (bytes)
+LARGEST_UPLOAD = 100_000_000  # largest size of a picture or of measured points (bytes)
 DESIGN_FILES = ("report.json", "design.npz")  # files by which a design's folder is recognised
 
 
@@ -135,12 +135,12 @@ class Workspace:
             return self.opened(name)
 
     def edit(self, name: str, by: Callable[[str], str]) -> OpenScene:
-        """Replace the text of a scene by a function of it; no other change comes in between."""
+        """Replace the text of a scene with by(text); no other change comes in between."""
         with self._changing:
             return self.change(name, by(self.opened(name).text))
 
     def save(self, name: str, anyway: bool = False) -> OpenScene:
-        """Write the text to the scene file.  SceneError if another program has changed it since editing began."""
+        """Write the text to the scene file.  SceneError if another program changed it meanwhile, unless `anyway`."""
         path = self.path(name)
         with self._changing:
             unsaved = files.beside(path, UNSAVED)
@@ -196,7 +196,7 @@ class Workspace:
         return name
 
     def _show(self, name: str, key: str, value: str, plate: new_scene.Plate | None) -> None:
-        """Replace the picture of a new scene file, which an error removes.  plate: plate of the scene, if any."""
+        """Replace the picture of a new scene file; an error removes the file.  plate: None for a template."""
         path = self.path(name)
         try:
             text = self._text(path)
@@ -204,7 +204,7 @@ class Workspace:
             key = f"target[0].{key}" if isinstance(targets, list) and len(targets) > 1 else f"target.{key}"
             text = changed(text, key, value)
             if plate is not None and (blurred := plate.blur_rrmsd(self.scene(name, text))) is not None:
-                text = changed(plate.text(name, blurred=blurred), key, value)  # the limit depends on the picture
+                text = changed(plate.text(name, blurred=blurred), key, value)  # the RRMSD limit depends on the picture
             files.put(path, _encoded(name, text))
         except BaseException:
             path.unlink()
@@ -213,8 +213,8 @@ class Workspace:
     def adopt(self, design: str, folder: Path, written: Path | None = None) -> str:
         """Write a new scene file for the scene in a folder, with the files that it names; return the scene's name.
 
-        written: file with the original text of the scene.  Its comments are preserved, or those of the scene file with
-        the design's name, provided that the file still describes the same scene.
+        written: file with the original text of the scene.  The comments of this file are preserved, or else those of
+        the scene file with the design's name, if they describe the same scene.
         """
         text = self._text(folder / "scene.toml")
         loaded = self._loaded(folder / "scene.toml", text)
@@ -362,7 +362,7 @@ def _encoded(name: str, text: str) -> bytes:
     try:
         return text.encode()
     except UnicodeEncodeError:
-        raise SceneError(f"{name}: contains half a character; write the text again in UTF-8") from None
+        raise SceneError(f"{name}: contains half a character (a lone surrogate); delete it") from None
 
 
 def _with_unix_ends(text: str) -> str:

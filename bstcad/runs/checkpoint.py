@@ -25,7 +25,7 @@ import torch
 from bstcad.runs import files
 from bstcad.runs.files import SceneError
 
-MAGIC = b"bstcad checkpoint 9\n"  # version; increase it if fields of a state's records or of the purpose change
+MAGIC = b"bstcad checkpoint 9\n"  # first line; increase the number if fields of states or purposes change
 DIGEST_SIZE = 65  # length of the line with the SHA-256 (bytes)
 MAX_SIZE = 8 << 30  # largest size of a checkpoint (bytes); 2049 x 2049 control points need 1 GB
 MAX_WRITING_FRACTION = 0.02  # largest fraction of the run's time that checkpoints may take
@@ -38,7 +38,7 @@ Purpose = dict[str, Any]  # description of the checkpoint's design: numbers, tex
 
 
 def write(path: Path, purpose: Purpose, state: Any) -> None:
-    """Write a checkpoint of a design (`purpose`) to `path`, completely or not at all.  OSError if not."""
+    """Write a checkpoint of a design (`purpose`) to `path`, completely or not at all (OSError)."""
     arrays: dict[str, np.ndarray] = {}
     tree = json.dumps([purpose, state], default=partial(_packed, arrays))
     with files.atomic_file(path) as file:  # without a copy of the state in memory
@@ -51,7 +51,7 @@ def write(path: Path, purpose: Purpose, state: Any) -> None:
 
 
 def read(path: Path, kind: type, device: str = "cpu") -> tuple[Purpose, Any]:
-    """Return (purpose, state) of a checkpoint; the state is a `kind`, its tensors are on a device.
+    """Return (purpose, state) of a checkpoint; the state is a `kind`, its tensors are on `device`.
 
     Mappings are returned as dicts, lists as tuples.  SceneError if the file is not a checkpoint of this version.
     """
@@ -80,7 +80,7 @@ def read(path: Path, kind: type, device: str = "cpu") -> tuple[Purpose, Any]:
 
 
 def _packed(arrays: dict[str, np.ndarray], value: Any) -> dict[str, Any]:
-    """Encode a value that JSON lacks: {"@array": name in `arrays`}, {"@module.Class": fields}, or a mapping."""
+    """Encode a value that JSON lacks: {"@array" or "@tensor": name in `arrays`}, {"@module.Class": fields}, mapping."""
     if isinstance(value, torch.Tensor):
         return {"@tensor": _packed(arrays, value.detach().cpu().numpy())["@array"]}
     if isinstance(value, np.ndarray):
@@ -177,7 +177,7 @@ class Keeper:
             write(path, self.purpose, self.latest)
         except (OSError, MemoryError):
             path.parent.rmdir()
-            return "the design so far is lost, for lack of space beside the folder and for temporary files; free some"
+            return "the design so far is lost: no space is left beside the folder or for temporary files; free some"
         return f"the design so far is kept in {path}; move it to {self.path} and use --resume to continue it"
 
     def load(self) -> Any:

@@ -1,7 +1,7 @@
 """Jobs for other processes and other machines, distributed by a scheduler of dask.distributed.
 
-Each worker has the same version of bstcad and does one job at a time.  The scheduler gives the jobs of a lost worker to
-another worker.
+Each worker must have the same version of bstcad as this process, and does one job at a time.  The scheduler gives the
+jobs of a lost worker to another worker.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from bstcad.runs.files import MachineError, SceneError, first_line
 CONNECTION_TIMEOUT = 30.0  # timeout (s) for the scheduler's answer, and for the first worker
 JOB_INTERVAL = 0.5  # time (s) between two checks for finished jobs
 RETRIES = 2  # number of retries of a job after an error of a worker
-MAX_WORKERS = 1000
-THIS_MACHINE = "here"  # `Answer.where` of a job on this machine; otherwise it is the address of the worker
+MAX_WORKERS = 1000  # largest value of --workers
+THIS_MACHINE = "here"  # value of `Answer.where` for a job on this machine; for others, the address of the worker
 
 _one_at_a_time = threading.Lock()  # limits a worker process to one job, whatever its number of threads
 
@@ -47,7 +47,7 @@ class Machines(Protocol):
         """Start the job work(*arguments)."""
 
     def next(self, tick: Callable[[], None]) -> Answer:
-        """Wait for the next job that ends, return its answer, and call `tick` meanwhile."""
+        """Wait until a job ends, calling `tick` regularly, and return its answer."""
 
 
 @contextlib.contextmanager
@@ -122,11 +122,11 @@ class Cluster:
         self._keys[future] = key
 
     def next(self, tick: Callable[[], None] = lambda: None) -> Answer:
-        """Wait for the next answer and call `tick` meanwhile.  MachineError if the scheduler is lost."""
+        """Wait until a job ends, calling `tick`, and return its answer.  MachineError if the scheduler is lost."""
         return self._ended(self._keys, tick)
 
     def _ended(self, futures: Collection[Any], tick: Callable[[], None] = lambda: None) -> Answer:
-        """Wait until one of these futures is done, return its answer, and call `tick` meanwhile."""
+        """Wait until one of these futures is done, calling `tick`, and return its answer."""
         while True:
             for future in [future for future in futures if future.done()]:
                 return self._answer(self._keys.pop(future), future)

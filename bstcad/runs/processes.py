@@ -190,7 +190,7 @@ def _environment_variable(name: str, value: str) -> Iterator[None]:
 
 
 def _serve(parent: int) -> None:
-    """Ignore the parent's signals, and end when the parent ends: a killed parent cannot shut this process down."""
+    """Ignore the signals that the parent handles, and end when it ends: a killed parent cannot end this process."""
     global _is_second
     _is_second = True
     for number in (*TERMINAL_SIGNALS, signal.SIGTERM):
@@ -202,7 +202,7 @@ def _serve(parent: int) -> None:
 
 
 def peak_memory() -> float | None:
-    """Return the peak memory of this process (GB), which psutil lacks on Linux; None if the system lacks it."""
+    """Return the peak memory of this process (GB); None if the system does not state it.  psutil lacks it on Linux."""
     with contextlib.suppress(OSError, StopIteration):  # on Linux getrusage includes the parent process
         lines = Path("/proc/self/status").read_text().splitlines()
         return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) * 1024 / 1e9
@@ -218,8 +218,8 @@ def keep_freed() -> None:
     """Let up to 2 GB of freed memory stay with this process, in arrays of up to 128 MiB; needs glibc.
 
     By default, glibc returns freed arrays of more than 32 MiB to the system, which clears each new array page by page.
-    This takes an eighth of the time of an evaluation of a few million tubes.  Keeping freed arrays of more than 128 MiB
-    would fragment a third of all memory.
+    Clearing takes an eighth of the time of an evaluation of a few million tubes.  Keeping freed arrays of more than
+    128 MiB would fragment a third of all memory.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:

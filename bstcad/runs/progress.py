@@ -1,6 +1,7 @@
 """Progress of long work: bars on a terminal or in a notebook, plain lines elsewhere.
 
-Each display is a context manager that yields a function progress(stage, done, total, text); text: the merit so far.
+Each display is a context manager that yields a function progress(stage, done, total, text): name of the stage, number
+of steps done, their total (0: unknown), and a text such as the RRMSD so far.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def _notebook() -> Callable[..., Any] | None:
 
 @contextmanager
 def bars(console: Console) -> Iterator[ProgressFunction]:
-    """Display one bar per stage, with the merit and the time left; bars of past stages stay."""
+    """Display one bar per stage, with its text and the time left; bars of past stages stay."""
     name, merit = TextColumn("{task.description:<12}"), TextColumn("{task.fields[merit]}", style="cyan")
     times = TaskProgressColumn(), TimeElapsedColumn(), TimeRemainingColumn()
     with Progress(name, BarColumn(bar_width=30), *times, merit, console=console) as progress:

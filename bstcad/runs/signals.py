@@ -17,7 +17,7 @@ TERMINATION_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHU
 TERMINAL_SIGNALS = (signal.SIGINT, *TERMINATION_SIGNALS[1:])  # signals that a terminal sends to its whole process group
 _received: list[int] = []  # termination signals since `raise_terminated` began
 _starting: list[object] = []  # one item for each process that is being started
-_delayed: list[int] = []  # signals that arrived in a block of `exit_on_signal` while a process was being started
+_delayed: list[int] = []  # signals that `exit_on_signal` handles once the process has been started
 
 
 class Terminated(BaseException):

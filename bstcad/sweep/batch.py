@@ -39,8 +39,8 @@ from bstcad.verify.verdict import NO_LIMIT, VERDICTS, Check
 if TYPE_CHECKING:
     from rich.console import Group
 
-REFUSED, BROKEN, STOPPED = "refused", "broken", "not done"
-STATUS_STYLES = {"passed": "green", "passed with remarks": "yellow", NO_LIMIT: "cyan"}  # colours; all others are red
+REFUSED, BROKEN, STOPPED = "refused", "broken", "not done"  # statuses of a design without a lens
+STATUS_STYLES = {"passed": "green", "passed with remarks": "yellow", NO_LIMIT: "cyan"}  # colours; others: red
 KILLED_CODE = -9  # exit code of a process killed by a user, or by the system when memory ran out
 CORES_PER_DESIGN = 2  # number of cores that one design uses
 
@@ -51,12 +51,12 @@ class BatchEntry(StoredRecord):
     scene: str  # path of the scene file, as given by the user
     name: str = ""  # name of the scene and of the design's folder
     status: str = STOPPED  # verdict (verify.verdict.VERDICTS), REFUSED, BROKEN or STOPPED
-    rrmsd: float | None = None  # RRMSD of the report; with several targets, the worst target here and in the next three
+    rrmsd: float | None = None  # RRMSD of the report; this and the next three: of the target with the largest RRMSD
     rrmsd_noise: float | None = None  # standard error of rrmsd
     leak: float | None = None  # fraction of the light on the target that falls where the target is dark
     light_on_target: float | None = None  # fraction of the source's light that falls on the target
     checks_failed: tuple[str, ...] = ()  # names of the failed checks
-    seconds: float = 0.0  # time until the lens was verified
+    seconds: float = 0.0  # time until the lens was verified (s)
     report: str = ""  # path of report.html, relative to the batch's folder
     where: str = ""  # "here", or the address of a worker; "": not run
     reason: str = ""  # sentence that states why there is no lens; "": there is a lens
@@ -291,7 +291,7 @@ def exit_code(rows: Sequence[BatchEntry]) -> int:
 
 
 def summary(rows: Sequence[BatchEntry], folder: Path, verbose: bool = False) -> Group:
-    """Return a line per design, with figures or the reason of a failure, then its failed checks (verbose: all)."""
+    """Return a line per design, with figures or the reason of a failure, then the failed checks (verbose: all)."""
     from rich.console import Group
     from rich.text import Text
 

@@ -143,10 +143,10 @@ class LocalPool:
 
 KERNEL_TUBES, KERNEL_PIXELS = 1024, 512  # flux tubes and pixels per side
 KERNEL_NET, KERNEL_INDEX = 257, 1.49  # control points per side; refractive index
-KERNEL_WIDTH, KERNEL_THICKNESS = 20.0, 5.0  # mm
+KERNEL_WIDTH, KERNEL_THICKNESS = 20.0, 5.0  # width and thickness of the lens, mm
 KERNEL_SCREEN_Z = 200.0  # distance of the screen from the front, mm
 WAVE_HEIGHT, WAVE_PERIODS = 0.003, 3  # amplitude of the waves of the back (mm), number of periods across the width
-KERNEL_REPEATS = 3  # number of evaluations; the time of the fastest is used
+KERNEL_REPEATS = 3  # number of evaluations of the kernel; the time of the fastest is used
 
 
 def measure_seconds(work: Callable[[], object]) -> float:
@@ -158,7 +158,7 @@ def measure_seconds(work: Callable[[], object]) -> float:
 
 @cache
 def calibration_kernel(tubes: int = KERNEL_TUBES) -> Callable[[], Any]:
-    """Return a function that evaluates merit and gradient by flux tubes through a fixed small lens; made once."""
+    """Return a function that evaluates merit and gradient with flux tubes through a fixed small lens; made once."""
     u = torch.linspace(-math.pi * WAVE_PERIODS, math.pi * WAVE_PERIODS, KERNEL_NET, dtype=torch.float64)
     outline, span = Rectangle(KERNEL_WIDTH, KERNEL_WIDTH), (-KERNEL_WIDTH / 2, KERNEL_WIDTH / 2)
     back = BSplineSurface(KERNEL_THICKNESS, WAVE_HEIGHT * u.cos()[:, None] * u.cos(), span, span)
@@ -176,7 +176,7 @@ def calibration_kernel(tubes: int = KERNEL_TUBES) -> Callable[[], Any]:
 Value = int | float | str | tuple[int, int]
 Settings = tuple[tuple[str, Value], ...]  # (dotted key of the scene, value), sorted by key; (): the base scene
 
-DONE, FAILED, NOT_RUN = "done", "failed", "not run: budget"
+DONE, FAILED, NOT_RUN = "done", "failed", "not run: budget"  # statuses of a run
 REFERENCE_EFFORT = Effort(witness=False)  # effort of the reference: rays only, which no design uses for tailoring
 WARM_UP_CHANGES = {  # settings of the first run, which compiles kernels and loads libraries and is not timed
     "lens.back.control_points": 33, "tailoring.quality": "draft", "tailoring.rays": 96,
@@ -205,7 +205,7 @@ StoredSettings = Annotated[Settings, BeforeValidator(_from_json), PlainSerialize
 
 
 class HistoryPoint(TypedDict):
-    """RRMSD of a design at one time, by the tubes used for tailoring."""
+    """RRMSD of a design at one time, measured with the flux tubes used for tailoring."""
 
     seconds: float  # time since the start of the design
     rrmsd: float | None  # RRMSD; null: not finite
@@ -263,7 +263,7 @@ class ColdRun(StoredRecord):
 def run_and_judge(
     contents: SceneFiles, point: Settings, limit: float, effort: Effort, tick: Tick = lambda: None
 ) -> ColdRun:
-    """Run the command for a base scene with these settings, for at most `limit` seconds, and measure its RRMSD."""
+    """Design a base scene with the settings `point` in at most `limit` seconds, and measure its time and RRMSD."""
     start = time.perf_counter()
     unit = min(measure_seconds(calibration_kernel()) for _ in range(KERNEL_REPEATS))
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:

@@ -41,7 +41,7 @@ TRANSPORT_ROUNDS, COARSE_STEPS = 2, 40  # rounds of transport and slope fit, and
 
 @torch.no_grad()
 def coarse_lens(scene: Scene) -> Lens:
-    """Return a lens with nearly the angles and paths of the finished lens, but with a coarse picture."""
+    """Return a lens in which light has nearly the angles and paths of the finished lens, but with a coarse picture."""
     channel = _central_channel(scene)
     lens = channel.through(scene.flat_lens(COARSE_POINTS))
     picture = _downsample(scene.target.irradiance(), COARSE_PIXELS)
@@ -75,7 +75,7 @@ def _downsample(picture: np.ndarray, limit: int) -> np.ndarray:
 
 
 def _central_channel(scene: Scene, *more: Effect) -> Channel:
-    """Return the channel from the centre of the source at its main wavelength, with further effects."""
+    """Return the channel from the source's centre at its main wavelength, with the losses of the scene and `more`."""
     source = scene.source.central
     loss_factors = losses((*scene.effects, *more), scene.lens, source.main_wavelength)
     return Channel(source, scene.index, losses=loss_factors, around=scene.around(source.main_wavelength))
@@ -90,13 +90,13 @@ DEFAULT_DIAMETER = 0.1  # assumed diameter of a point source, mm
 DEFAULT_DIVERGENCE = 0.1  # assumed divergence of parallel light, degrees
 # Assumed sizes for each Emitter.size_key: (size, shape, unit).
 DEFAULT_SIZES = {"diameter": (DEFAULT_DIAMETER, "disc", "mm"), "divergence": (DEFAULT_DIVERGENCE, "cone", "degrees")}
-LINE_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # (half widths, weight) of a uniform line
+LINE_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # (offset / half width, weight), uniform line
 DISC_POINTS = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # (x, y in radii, weight) of a disc
-FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"
+FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"  # scene keys
 
 
 def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ...]:
-    """Return the neglected effects with the change of the picture by each effect, the largest change first.
+    """Return the neglected effects with the changes that each causes, the largest change of the RRMSD first.
 
     picture: flux in each pixel (rows, columns), from the target or the traced lens.
     """
@@ -210,7 +210,7 @@ def diagnosis(scene: Scene, making: DesignCourse, proof: Proof, target: np.ndarr
     curve = ending(
         [(point.seconds, point.rrmsd) for point in making.history],
         [(stage.seconds, stage.rrmsd) for stage in making.stages],
-        since=math.fsum(stage.seconds for stage in making.stages[: max(sizes[2:], default=0)]),  # full source
+        since=math.fsum(stage.seconds for stage in making.stages[: max(sizes[2:], default=0)]),  # source at full size
     )
     reached = {key: at for key, at in (proof.at_bounds or {}).items() if key in scene.lens.bounded_by}
     bounds: dict[str, Any] = {

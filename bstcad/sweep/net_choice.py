@@ -33,7 +33,7 @@ from bstcad.scene.scene import Scene
 from bstcad.sweep.estimates import coarse_lens
 from bstcad.sweep.prediction import REMAINING_BLUR, blur_rrmsd, memory_gb, typical_seconds
 
-NET_KEY = "lens.back.control_points"
+NET_KEY = "lens.back.control_points"  # key of the scene that states the net
 SQUARE_NETS = (65, 129, 257, 513, 1025)  # control points per side of candidates, or as many in square cells
 MAX_SQUARE_ASPECT = 1.25  # largest aspect ratio of an outline with a square net
 # (reduction of the RRMSD, increase of the time), as factors: a larger net with less reduction in more time is rejected.
@@ -46,7 +46,7 @@ QUALITY_TERMS = {"draft": (1.5, 0.012), "standard": (1.0, 0.002), "fine": (0.7, 
 MIN_SEAM_SHIFT = 7.0  # seam shift (pixels) below which cells are finer than the tool can use
 # Cells per pixel above which finer nets reduce the RRMSD further by at most a factor, and this factor.
 SUFFICIENT_CELLS, MAX_FURTHER_GAIN = 5.0, 1.4
-MIN_RRMSD_RATIO = 0.43  # smallest known ratio of RRMSDs by a finer net: portrait with 1025 instead of 513 points
+MIN_RRMSD_RATIO = 0.43  # smallest observed RRMSD with a finer net / RRMSD: portrait with 1025 and 513 points
 MIN_RELATIVE_FLUX = 1e-3  # flux of a tile / mean flux below which the mean density is used
 
 
@@ -102,7 +102,7 @@ class Choice:
 
 
 def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
-    """Return the scene and None, or with a chosen net and the choice; SceneError if no light meets the back."""
+    """Return (scene with a chosen net, choice); (scene, None) if it states a net.  SceneError: no light on the back."""
     if scene.lens.back.control_points is not None:
         return scene, None
     levels = scene.tailoring.levels
@@ -226,8 +226,8 @@ def area_cells(scene: Scene, lens: Lens) -> ControlCells:
 def net_rrmsd(light: ControlCells, scene: Scene, image: float = 0.0) -> float:
     """Estimate the RRMSD of a scene with its net, from detail finer than its cells or near this limit, and an offset.
 
-    image: RRMSD of the target blurred by the image of the source.  The estimate is fitted to designs in standard
-    quality: half of them are within a factor of 1.3, and nine of ten within 2.  Other qualities are less accurate.
+    light: see `area_cells`.  image: RRMSD of the target blurred by the image of the source.  The estimate is fitted to
+    designs in standard quality: half are within a factor of 1.3, nine of ten within 2.  Others are less accurate.
     """
     factor, rest = QUALITY_TERMS.get(scene.tailoring.quality, QUALITY_TERMS["standard"])
     width, height = scene.lens.cells

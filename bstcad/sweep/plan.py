@@ -36,7 +36,7 @@ def plan(scene: Scene, text: str = "", keys: Sequence[str] = (), tick: Tick = la
     """Yield the entries of `plan --json`: first the effects, then the predictions.
 
     simulated: effects that are simulated.  goals: for each target its key, left_out (neglected effects, ordered by
-    change of the RRMSD), blur and unreachable.  The plan repeats the entries of the target with the largest blur.
+    change of the RRMSD), blur and unreachable.  The entries of the most blurred target are repeated outside goals.
 
     unreachable: part of the target that light cannot reach (optics.reach.unreached); None: light reaches all of it.
 
@@ -69,7 +69,7 @@ def plan(scene: Scene, text: str = "", keys: Sequence[str] = (), tick: Tick = la
 def verdict(scene: Scene, entries: Mapping[str, Any]) -> dict[str, str] | None:
     """Return the verdict of a plan, {kind, sentence}; None if the present entries do not determine it.
 
-    kind: "blurred" (the image of the source exceeds the allowed RRMSD with any lens), "within", "open" or "beyond" (the
+    kind: "blurred" (with any lens, the blur by the source exceeds the allowed RRMSD), "within", "open" or "beyond" (the
     interval of nine of ten designs is below, around or above the requested RRMSD), "no limit" (no RRMSD is requested),
     or "not predicted".
     """
@@ -120,7 +120,7 @@ def reach_drawn(scene: Scene) -> tuple[bytes, ...]:
     if scene.lens.front.is_tailored:
         raise SceneError(
             "--png: draws the part of the target that light can reach through a tailored back, but in this scene the "
-            "front is tailored; omit --png: `bstcad generate` states first which targets such a lens cannot light"
+            "front is tailored; omit --png; `bstcad generate` begins by stating which targets such a lens cannot light"
         )
     images = []
     for alone in scene.single_target_scenes():
@@ -132,7 +132,7 @@ def reach_drawn(scene: Scene) -> tuple[bytes, ...]:
 
 
 def _request_of(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[str, Any]:
-    """Return where an effect is requested: line of the scene file (None: on the command line, or by default), words."""
+    """Return the place that requests an effect: line of the scene file (None: command line or default), and words."""
     for other in keys:
         if other == key or key.startswith(f"{other}.") or other.startswith(f"{key}."):
             return {"line": None, "asked_by": f"--set {other}"}

@@ -1,10 +1,9 @@
 """Predict time, RRMSD and memory of a design from a pilot: a small version of the same design, run on this machine.
 
 Net, pixels, flux tubes and transport cells of a pilot are those of the scene divided by one factor.  A pixel therefore
-has as many control cells and tubes as in the scene, and the search as many evaluations.  The pilot includes all faces,
-goals, losses, wavelengths and bounds of the scene.  How the time of each stage scales with its sizes
-is known from the method.  A pilot contains no detail finer than its pixels; the error of this detail is estimated from
-the picture.
+has as many control cells and tubes as in the scene, and the search makes as many evaluations.  The pilot includes all
+faces, goals, losses, wavelengths and bounds of the scene.  How the time of each stage scales with its sizes is known
+from the method.  A pilot has no detail finer than its pixels; the error of this detail is estimated from the picture.
 
 tests/benchmarks/test_prediction.py compares predictions with designs of the templates and of the gallery.
 """
@@ -35,19 +34,19 @@ from bstcad.tailoring.slope_map import SUBCELLS
 from bstcad.tailoring.stage2 import round_shares, sheet_sizes, stage3_sheet_sizes
 
 Interval = tuple[float, float, float]  # (low, likely, high); nine of ten designs lie between low and high
-QUALITIES = ("draft", "standard", "fine")
+QUALITIES = ("draft", "standard", "fine")  # qualities with a prediction
 PILOT_QUALITIES = ("draft", "standard")  # qualities with a pilot; "fine" uses the pilot of "standard"
 INTERVAL_FACTORS = {"seconds": 1.5, "rrmsd": 1.5, "memory_gb": 1.25}  # factors within which nine of ten designs lie
 
 # --- the pilot --------------------------------------------------------------------------------------------------------
 
-PILOT_LIMITS = 128, 193, 512  # maximum pixels, control points and tubes per side of a pilot
+PILOT_LIMITS = 128, 193, 512  # maximum pixels (more for MIN_PILOT_POINTS), control points, tubes per side of a pilot
 MIN_PILOT_POINTS = 65  # minimum control points per side of a pilot, unless its scene has fewer
 MIN_PILOT_TUBES = 16  # minimum tubes per side of a pilot
 PILOT_CELLS = (16, 256)  # minimum and maximum cells per side of the transport of a pilot
 PILOT_EFFORT = Effort(rays=2048, accuracy=0.02, witness=False)  # effort of the measurement of a pilot's RRMSD
 SEARCH_STAGES = ("stage 2", "stage 3")  # beginnings of the names of stages that use the minimiser
-COARSE_ROUND_TEXT = " pixels, "  # text in the names of rounds with few pixels, whose sizes do not scale
+COARSE_ROUND_TEXT = " pixels, "  # text in the names of rounds with few pixels, whose sizes do not depend on the scene
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
 
 
 def with_quality(scene: Scene, quality: str) -> Scene:
-    """Return the scene in a quality, with the settings that it states, but without limits that end a design early."""
+    """Return the scene in another quality, without limits that end a design early; all other settings remain."""
     return scene.changed({"tailoring.quality": quality, "tailoring.accuracy": None, "tailoring.max_time": None})
 
 
@@ -148,7 +147,7 @@ def blur_rrmsd(scene: Scene, lens: Lens) -> float:
 # --- predictions ------------------------------------------------------------------------------------------------------
 
 PILOT_EXPONENT = -0.6  # exponent by which the RRMSD scales with the factor of the pilot
-DETAIL_FACTORS = {"draft": 0.2, "standard": 0.02, "fine": 0.02}  # RRMSD / detail that a pilot lacks, by quality
+DETAIL_FACTORS = {"draft": 0.2, "standard": 0.02, "fine": 0.02}  # RRMSD due to detail that a pilot lacks / detail
 FINE_RATIO = 0.7  # ratio of the RRMSD in fine to that in standard quality
 REMAINING_BLUR = 0.5  # fraction of the blur by an extended source that remains after stage 3
 
@@ -187,23 +186,23 @@ def predicted_seconds(scene: Scene, pilot: Pilot) -> float:
 
 # Sizes (per side, or iterations) for which the following times (s) and memory (GB) are stated, on two cores of pace 1.
 UNIT_TUBES, UNIT_POINTS, UNIT_PIXELS, UNIT_GRID, UNIT_ITERATIONS = 1024, 513, 512, 256, 40
-KERNEL_SECONDS = 0.115  # evaluation of cold_run.calibration_kernel
-ROUND_SECONDS, TRANSPORT_SECONDS, FIT_SECONDS = 0.06, 0.2, 0.6  # stage 1: a round, a transport, a slope fit
-TWO_FACE_TRANSPORT_SECONDS = 2.4  # transport behind two freeform faces, where the light between them is traced
-TWO_FACE_SECONDS = 3.0  # part of stage 1 of two freeform faces that is independent of sizes
-AIMING_SECONDS = 1.0  # search for the rays from a point source through UNIT_TUBES² given points
-FRONT_SECONDS = 1.7  # search for a curved front
-EVALUATION_SECONDS, VARIABLE_SECONDS, BLUR_SECONDS = 0.11, 0.046, 0.30  # evaluation: tubes, control points, pixels
-CALL_SECONDS = 0.01  # part of an evaluation that is independent of sizes
-IMAGE_SECONDS = 0.7  # images of an extended source, in each round
-ADAM_SECONDS = 0.1  # step of the paper's procedure
-START_SECONDS = 2.8  # imports, and end of the process
-WRITE_SECONDS, NET_SECONDS, PICTURE_SECONDS = 1.5, 2.4, 1.1  # output: constant, control points, pixels
-MOUNT_SECONDS = 2.5  # cutting and verification of the mounted part
-RAY_SECONDS, DRAFT_RAY_SECONDS = 1.6, 1.0  # rays of a verification, per target and wavelength
-WITNESS_SECONDS, DRAFT_WITNESS_SECONDS = 6.0, 2.5  # finer flux tubes for a second net, per target
-LIBRARIES_GB = 1.5  # libraries in both processes
-TUBES_GB, NET_GB, PIXELS_GB = 0.12, 0.27, 0.02  # tubes, control points, pixels
+KERNEL_SECONDS = 0.115  # time of an evaluation of cold_run.calibration_kernel
+ROUND_SECONDS, TRANSPORT_SECONDS, FIT_SECONDS = 0.06, 0.2, 0.6  # times in stage 1 of a round, transport, slope fit
+TWO_FACE_TRANSPORT_SECONDS = 2.4  # time of a transport behind two freeform faces, between which light is traced
+TWO_FACE_SECONDS = 3.0  # time in stage 1 for two freeform faces of any size
+AIMING_SECONDS = 1.0  # time to find the rays from a point source through UNIT_TUBES² points
+FRONT_SECONDS = 1.7  # time of the search for a curved front
+EVALUATION_SECONDS, VARIABLE_SECONDS, BLUR_SECONDS = 0.11, 0.046, 0.30  # times in an evaluation: tubes, net, blur
+CALL_SECONDS = 0.01  # time in an evaluation that is independent of sizes
+IMAGE_SECONDS = 0.7  # time in a round for the images of an extended source
+ADAM_SECONDS = 0.1  # time of a step of the paper's procedure
+START_SECONDS = 2.8  # time of the imports and of the end of the process
+WRITE_SECONDS, NET_SECONDS, PICTURE_SECONDS = 1.5, 2.4, 1.1  # times of writing: constant part, net, pixels
+MOUNT_SECONDS = 2.5  # time of cutting and verifying the mounted part
+RAY_SECONDS, DRAFT_RAY_SECONDS = 1.6, 1.0  # time to verify with rays, per target and wavelength
+WITNESS_SECONDS, DRAFT_WITNESS_SECONDS = 6.0, 2.5  # time to verify two nets with flux tubes, per target
+LIBRARIES_GB = 1.5  # memory of the libraries in both processes
+TUBES_GB, NET_GB, PIXELS_GB = 0.12, 0.27, 0.02  # memory of tubes, net and pixels
 GOAL_MEMORY_FACTOR = 3.0  # memory of tubes per goal with several goals / memory with one target
 
 

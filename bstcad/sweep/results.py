@@ -88,7 +88,7 @@ class Calibration(StoredRecord):
 class Preset(StoredRecord):
     """Quality preset that was run."""
 
-    name: str  # draft, standard or fine
+    name: str  # draft, standard, fine or paper
     seconds: float | None  # time of the run (s)
     rrmsd: float  # RRMSD by the reference
 
@@ -108,7 +108,7 @@ class TradeoffTable(StoredRecord):
     versions: dict[str, str]  # versions of the libraries, by name
     reference: dict[str, Any]  # reference for the RRMSD: rays (numbers of rays, ascending), what (in words)
     calibration: Calibration  # duration of the calibration kernel
-    runs: tuple[ColdRun, ...]  # runs, the most important first, without PRIVATE_FIELDS
+    runs: tuple[ColdRun, ...]  # runs that ended, then the others, each by importance, without PRIVATE_FIELDS
     knobs: tuple[TableKnob, ...]  # knobs that were varied
     front: tuple[StoredSettings, ...]  # settings of the runs on the Pareto front, the fastest first
     front_halving: float | None  # factor of the time that halves the error along the front
@@ -185,7 +185,7 @@ def write(table: TradeoffTable, folder: Path) -> None:
 
 # --- the figure -------------------------------------------------------------------------------------------------------
 
-# Colours by Okabe and Ito, each with its own marker for readers who cannot distinguish colours.
+# Colour, marker and line of each knob; the markers are for readers who cannot distinguish colours.
 KNOB_STYLES = {
     "evaluations": (BLUE, "o", "-"),
     "tubes": (VERMILION, "s", "-"),
@@ -201,17 +201,11 @@ KNOB_STYLES = {
 }
 FIGURE_WIDTH, FIGURE_HEIGHT = 10.0, 7.4  # inches
 AXIS_MARGIN = 1.25  # factor between the outermost points and the ends of the axes
-MAX_FLOOR_DISTANCE = 6.0  # smallest RRMSD / lower end of the axis, at most, to show the standard error
+MAX_FLOOR_DISTANCE = 6.0  # largest ratio of the smallest RRMSD to the lower end of the axis
 DARK_RRMSD = 1.0  # RRMSD of a dark picture; axes do not extend to larger RRMSDs
-THIN_LINE: dict[str, Any] = {"lw": 0.9, "zorder": 1}  # style of the convergence and of the standard error
+THIN_LINE: dict[str, Any] = {"lw": 0.9, "zorder": 1}  # style of the lines of the convergence and the standard error
 FRONT_STYLE: dict[str, Any] = {"color": "#f0c80073", "lw": 5.5, "solid_joinstyle": "round", "solid_capstyle": "round"}
-RING_STYLE: dict[str, Any] = {
-    "marker": "o",
-    "ms": 18,
-    "mfc": "none",
-    "mec": "#a87c00",
-    "mew": 1.6,
-}  # style of the runs of the front
+RING_STYLE: dict[str, Any] = {"marker": "o", "ms": 18, "mfc": "none", "mec": "#a87c00", "mew": 1.6}  # runs of the front
 
 
 @styled
@@ -249,7 +243,7 @@ def draw_runs(axes: Axes, table: TradeoffTable) -> None:
         label = "convergence of the base run (warm)"
         axes.plot(*zip(*points, strict=True), color="#b5b5b5", label=label, **THIN_LINE)
     for knob in table.knobs:
-        if knob.key in KNOB_STYLES and len(knob.places) > (knob.key != "adam"):  # the others have the base as a point
+        if knob.key in KNOB_STYLES and len(knob.places) > (knob.key != "adam"):  # others include the base
             _draw_knob(axes, knob)
     if table.front_runs:
         times, errors = zip(*(run.time_and_error for run in table.front_runs), strict=True)
@@ -293,7 +287,7 @@ def draw_legend(axes: Axes) -> None:
 
 # --- the page and the terminal ----------------------------------------------------------------------------------------
 
-VERDICT_STYLES = {"pass": "bold green", "remarks": "bold yellow", "fail": "bold red"}  # page: terminal
+VERDICT_STYLES = {"pass": "bold green", "remarks": "bold yellow", "fail": "bold red"}  # page class: terminal style
 PAGE_TEMPLATE = Path(__file__).with_name("tradeoff.html.j2")
 
 
@@ -351,5 +345,5 @@ def summary(table: TradeoffTable) -> Group:
             rows.add_row(Text(f"{run.label}{' (Pareto front)' * run.on_front}"), f"{run.rrmsd:.4f}", *seconds)
     lines = [Text(f"Failed: {run.label}: {run.reason}") for run in table.failed]
     if count := len(table.not_run):
-        lines.append(Text(f"{count} runs did not fit into the budget; a larger --budget continues from here"))
+        lines.append(Text(f"Runs beyond the budget: {count}; a larger --budget continues from here"))
     return Group(rows, *lines, Text(f"{headline} ", VERDICT_STYLES[style]).append(explanation, "default"))

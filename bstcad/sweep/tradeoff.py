@@ -37,13 +37,13 @@ from bstcad.tailoring.run import Progress, no_progress
 
 # --- knobs ------------------------------------------------------------------------------------------------------------
 
-HALF, SQRT_HALF = 0.5, 0.5**0.5
+HALF, SQRT_HALF = 0.5, 0.5**0.5  # factors on the value of a setting
 POINT_LIMITS = (9, 1025)  # minimum and maximum control points per side
 GRID_LIMITS = (32, 2048)  # minimum and maximum transport cells per side
 PIXEL_LIMITS = (8, 4096)  # minimum and maximum pixels per side
 COUNT_LIMITS = (1, 16_384)  # minimum and maximum of all other varied numbers
 ROUND_COUNTS = (1, 2, 3, 5, 8)  # numbers of rounds of transport and slope fit in stage 1
-ADAM_FRACTIONS = (1 / 8, 1 / 4, 1 / 2, 1.0)  # steps of the procedure of Wang et al. / steps of the preset
+ADAM_FRACTIONS = (1 / 8, 1 / 4, 1 / 2, 1.0)  # numbers of steps of the procedure of Wang et al., relative to the preset
 
 Points = Mapping[str, Settings]  # points of a knob by label ("768"), in the order of increasing work
 
@@ -64,7 +64,7 @@ def other_seed(scene: Scene, point: Settings) -> Settings:
 
 
 def describe(point: Settings) -> str:
-    """Describe settings as on the command line."""
+    """Describe settings in words, such as "rays = 512, rounds = 2"."""
     changes = (f"{key.removeprefix('tailoring.')} = {format_value(value)}" for key, value in point)
     return ", ".join(changes) or "the scene's own"
 
@@ -146,7 +146,7 @@ def _pixels(scene: Scene) -> Points:
 
 
 def _adam_points(own: bool) -> Points:
-    """Return points of the procedure of Wang et al. with fewer steps; the last point is the preset."""
+    """Return points of the procedure of Wang et al. with fewer steps, then its preset; own: the scene uses it."""
     points = {}
     for factor in ADAM_FRACTIONS:
         steps = {name: round(factor * PRESETS["paper"][name]) for name in ("stage1_iterations", "stage2_iterations")}
@@ -176,12 +176,13 @@ def _joint_points(*varied: tuple[str, Any, Sequence[float]]) -> Points:
 def run_order(scene: Scene, knobs: Sequence[Knob]) -> list[Settings]:
     """Return all runs, the most important first, so that any budget gives the most useful runs.
 
-    Presets come first, then neighbours of the base, other seeds, further points, and the paper's procedure.
+    First come the presets draft and standard and the base, then neighbours of the base with other seeds and the preset
+    fine, then further points, and last the procedure of the paper.
     """
     presets = knobs[0].points
     single = [knob for knob in knobs[1:] if not knob.combines]
     joint = [knob for knob in knobs if knob.combines]
-    paper = presets.get("paper", ())  # minutes
+    paper = presets.get("paper", ())  # takes minutes
 
     def neighbours(varied: Iterable[Knob], *distances: int) -> list[Settings]:
         return [point for steps in distances for knob in varied for point in _neighbour(knob, steps) if point != paper]
@@ -228,7 +229,7 @@ REFERENCE_TEXT = (
     "stratified rays that were not used in tailoring, in independent sets, until the standard error is below {:.2%} of "
     "the RRMSD; {} pixels; the lens as read back from its folder"
 )
-NO_TIMES = dict.fromkeys(("seconds", "cpu_seconds", "kernel_seconds", "cost_seconds"))  # null entries of a run not done
+NO_TIMES = dict.fromkeys(("seconds", "cpu_seconds", "kernel_seconds", "cost_seconds"))  # null for a run not done
 
 
 class RunFile(StoredRecord):
@@ -326,7 +327,7 @@ class _Sweep:
         failed: dict[str, Any] = {"status": cold_run.FAILED, "reason": answer.reason, "version": environment.version()}
         run = answer.value or ColdRun(settings=answer.key, **failed)
         self.runs[answer.key] = run.model_copy(update={"predicted_seconds": predicted, "where": answer.where})
-        real = (run for run in self.runs.values() if run.cost_seconds)  # runs that were not started may start now
+        real = (run for run in self.runs.values() if run.cost_seconds)  # runs that were never started are not stored
         cold_run.write_record(self._file, RunFile(runs=tuple(real)))
         self.table()
 
@@ -374,7 +375,7 @@ class _Sweep:
 
 # --- predicted seconds of runs ----------------------------------------------------------------------------------------
 
-JUDGING_SECONDS = 2.0  # time of the reference for a lens (s)
+JUDGING_SECONDS = 2.0  # time to measure a lens's RRMSD with the reference (s)
 
 
 def predicted_work(scene: Scene, point: Settings) -> tuple[bool, float]:

@@ -340,7 +340,7 @@ def test_words_are_values(key):
     ("target.z", "far", "target.z: 'far' is not a number; write one, such as 1000"),
     ("target.z", "1.00,000.5", "target.z: '1.00,000.5' is not a number; write one, such as 1000"),
     ("target.z", "1e999", "target.z: '1e999' is not a number; write one, such as 1000"),
-    ("target.x", "5", "target.x: 1 values are given, but 2 are needed; write 2, such as -200, 200"),
+    ("target.x", "5", "target.x: 2 values are needed instead of 1; write 2, such as -200, 200"),
     ("target.x", "1; a", "target.x: 'a' is not a number; write 2 numbers, such as -200, 200"),
     ("target.pixels", "12.5", "target.pixels: '12.5' is not a whole number; write one, such as 512"),
     ("target.seen_from", "behnd", "target.seen_from: 'behnd' is not possible; did you mean 'behind'?"),

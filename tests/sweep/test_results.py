@@ -98,8 +98,8 @@ def test_the_page_fetches_nothing_and_shows_every_run(swept):
     text = (folder / "tradeoff.html").read_text()
     assert not re.search(r'(?:src|href)="(?!data:)', text) and "<script" not in text
     assert results.verdict(found)[1] in text and "HALVING" in text
-    assert "The seed has no effect on L-BFGS by flux tubes" in text
-    assert "The seed has an effect on Adam by random rays" in text
+    assert "The seed has no effect on L-BFGS with flux tubes" in text
+    assert "The seed has an effect on Adam with random rays" in text
     assert text.count('<th scope="row" class="label">') == len(found.front) + len(found.runs_with_lens) + len(
         found.failed
     )

@@ -1,4 +1,4 @@
-// Requests to the server, common to all pages: each answer is JSON, a refusal is one sentence.
+// Functions common to all pages: requests to the server, whose answers are JSON (a refusal is one sentence), and drawing.
 
 export const element = (id) => document.getElementById(id);
 
@@ -30,9 +30,9 @@ export async function ask(address, body, options = {}) {
   try {
     reply = text ? JSON.parse(text) : {};
   } catch {
-    throw new Refused(text.slice(0, 300) || `The workbench failed (${answer.status}).`);
+    throw new Refused(text.slice(0, 300) || `The workbench failed (HTTP status ${answer.status}).`);
   }
-  if (!answer.ok) throw new Refused(reply.sentence || `The workbench failed (${answer.status}).`);
+  if (!answer.ok) throw new Refused(reply.sentence || `The workbench failed (HTTP status ${answer.status}).`);
   return reply;
 }
 

@@ -3,7 +3,7 @@ import { element } from "./common.js";
 
 const MIN_WIDTH = 0.05, STEP = 0.02; // smallest width of the frame, and the step of a key, as fractions of the photo
 const [figure, photo, frame] = ["crop", "photo", "frame"].map(element);
-let part = [0, 0, 1, 1], ratio = 1, drag = null, take = () => {}; // left, top, right, bottom; width / height, in fractions
+let part = [0, 0, 1, 1], ratio = 1, drag = null, take = () => {}; // part: left, top, right, bottom, as fractions of the photo; ratio: width / height of the frame in these fractions
 
 const clamp = (value, low, high) => Math.min(Math.max(value, low), Math.max(high, low));
 const rounded = (value) => Math.round(value * 1e4) / 1e4;
@@ -13,7 +13,7 @@ function draw() {
   Object.assign(frame.style, { left: `${100 * left}%`, top: `${100 * top}%`, width: `${100 * (right - left)}%`, height: `${100 * (bottom - top)}%` });
 }
 
-// Set a frame of a given width, with its middle as near to a point as the photo allows.
+// Set the frame to a given width, with its middle as near to (x, y) as the photo allows.
 function put(x, y, width) {
   const wide = clamp(width, MIN_WIDTH, Math.min(1, ratio)), high = wide / ratio;
   const left = clamp(x - wide / 2, 0, 1 - wide), top = clamp(y - high / 2, 0, 1 - high);
@@ -23,7 +23,7 @@ function put(x, y, width) {
 
 const middle = () => [(part[0] + part[2]) / 2, (part[1] + part[3]) / 2];
 
-// sides: width and height of the target, as the photo lies; given: its crop, or null; changed(value): called after a drag.
+// sides: width and height of the target, in the orientation of the photo; given: crop of the target, or null; changed(value): called after a drag.
 export function show(address, { sides, given, fills }, changed) {
   take = changed;
   const begin = () => {

@@ -111,7 +111,7 @@ function markForm() {
   for (const [key, choices] of Object.entries(impossible)) for (const control of controlsOf(key)) grey(control, choices);
 }
 
-// The frame over the photo of the first target.
+// Show the frame over the photo of the first target.
 const numbersOf = (key) => (controlsOf(key)[0]?.value ?? "").split(/[;,]/).map(Number);
 const firstTarget = () => (controlsOf("target[0].z").length ? "target[0]" : "target");
 
@@ -140,7 +140,7 @@ function grey(control, choices) {
   for (const option of control.options) {
     const why = choices[option.value];
     if (!why) continue;
-    option.value = option.value; // its text changes below
+    option.value = option.value; // keep the value, since the text changes below
     option.disabled = true;
     option.textContent = `${option.value} (not possible)`;
     reasons.append(`${option.value} is not possible in this scene: ${why}. `);
@@ -285,9 +285,9 @@ function show(reply) {
   else showPlan(reply);
 }
 
-// Clear all figures, which are of an earlier scene, and show the reason instead.
+// Clear all figures, which belong to an earlier scene, and show the reason instead.
 function noEstimates(sentence) {
-  number++; // answers that arrive now are of the earlier scene
+  number++; // answers that arrive from now on belong to the earlier scene
   const status = element("status");
   element("targets").classList.remove("waiting");
   element("targets").replaceChildren();
@@ -362,7 +362,7 @@ function showPlan(reply) {
     element("comes-to").textContent = reply.verdict?.sentence ?? "";
     element("comes-to").className = reply.verdict?.kind === "blurred" ? "error" : "";
   }
-  qualities = reply.qualities ?? {};  // empty until the pilots have ended
+  qualities = reply.qualities ?? {};  // empty until predictions exist
   if (reply.refused) noPlan(`No estimate: ${reply.refused}.`);
   else if (reply.stage === "effects") {
     element("net").textContent = reply.net ?? "";
