@@ -205,7 +205,7 @@ MARGIN_RAYS = 512  # rays per side for `margins`
 class Margins:
     """Worst cases of a trace over all rays that carry light to the back."""
 
-    tir_margin_deg: float | None  # critical angle minus angle of incidence (degrees), < 0: reflected; None: no such ray
+    tir_margin_deg: float | None  # critical angle minus angle of incidence (degrees), < 0: reflected; None: no ray
     newton_slope_min: float | None  # smallest |F'(t)| from the first net on, divisor of Newton's steps; 0: grazing
     non_finite: int  # number of control points, hits and landing points that are not finite
 

@@ -38,9 +38,9 @@ from bstcad.optics.tubes import rays_to
 from bstcad.optics.unfolding import per_radian
 
 FACE_POINTS = 64  # points per side of the last face from which light is traced
-GHOST_RAYS_PER_SIDE, GHOST_SMOOTHING = 128, 0.7  # rays per side for a ghost; smoothing of its picture (cells)
+GHOST_RAYS_PER_SIDE, GHOST_SMOOTHING = 128, 0.7  # rays per side for a ghost; standard deviation of its blur (cells)
 FIELD_CELLS = 24  # cells per side of the target, in which the fields are averaged
-FIELD_SMOOTHING = (0.8, 2.0, 6.0, 24.0)  # smoothing of fields (cells), wider where light is scarce
+FIELD_SMOOTHING = (0.8, 2.0, 6.0, 24.0)  # standard deviations of the smoothing (cells), wider where light is scarce
 MIN_CELL_FLUX = 1e-4  # smoothed flux of a cell / mean, below which a field needs wider smoothing
 MIN_LIGHT_SHIFT = 1e-6  # largest shift that counts as zero (pixels)
 HALF_SHARP_WIDTH = 1.3  # measured width of a control cell's light (pixels) at which edges are half as sharp as at best
@@ -56,7 +56,7 @@ class Change:
 
     flux: float  # relative change of the light on the target
     rrmsd: float  # √(Σ |E' - E|² / Σ E²), E' the picture with the effect, scaled to the sum of E
-    blur: float  # diameter of a uniform disc with the variance of the point images (pixels)
+    blur: float  # diameter of a uniform disc with the variance of the point images (pixels); diffraction: λ L / D
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,7 +44,7 @@ class Grazing:
     net: BSplineSurface  # net whose knots are used; its heights are ignored
     at_face: Rays  # (3, m, n) rays at these points before refraction, traced through the lens given to `of`
     weight: Tensor  # (m, n) fraction of the light at each point, sum 1
-    eta: float  # ratio of the index before the face to that behind it
+    eta: float  # index before the face / index behind it
     angle: float  # θ'_max (rad)
 
     @classmethod

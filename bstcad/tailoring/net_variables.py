@@ -42,7 +42,7 @@ SCALE_FRACTION = 0.2  # ratio, by measurement, of f to the scale at which both b
 # Standard deviation of the smoothing of q(b), in control points of the back.  In a gap between two parts of the light,
 # where few rays fall and some cross, q(b) jumps: without smoothing R causes ripples of 0.07 mm between the tubes.
 POSITION_SMOOTHING = 3.0
-INTERPOLATION_POINTS = 4  # control points of the front per axis from which R interpolates at one of the back
+INTERPOLATION_POINTS = 4  # front control points per axis from which R interpolates at a control point of the back
 
 
 @dataclass(frozen=True)

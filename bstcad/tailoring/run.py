@@ -124,7 +124,7 @@ class Task:
     wave: Wave | None = None  # required wavefront behind the lens; None: no wavefront goal
     preview: bool = False  # preview: one round per stage, no RRMSD by rays, no costly alternative
     solution: float | None = None  # sign σ of light_behind.py, +1 or -1; None: feasibility.py chooses
-    floor: float = 0.0  # irradiance, relative to the mean, to which stage 1 of two faces raises the furthest picture
+    floor: float = 0.0  # smallest irradiance, relative to the mean, of the furthest picture in stage 1 of two faces
     # control points per side of the front as a function of those of the back; None: the front is not freeform
     front_sides: Callable[[Sides], Sides | None] = lambda sides: None
 

@@ -52,7 +52,7 @@ from bstcad.transport.mapping import Solver as Solver  # exported to rooms that 
 
 SUBCELLS = 2  # samples of the light per axis in a transport cell, since a rim may cross the cell
 SUBPIXELS = 8  # parts of pixels per axis in a transport cell; a pixel has at least one part
-SLOPE_FLOOR = 1e-3  # smallest slope density, relative to its mean: the solver needs some density in black parts
+SLOPE_FLOOR = 1e-3  # smallest density of light over slopes, relative to its mean: the solver needs some in black parts
 GATHERING_NET, GATHERING_SAMPLES = 33, 96  # control points per side of g, and samples per side for its fit
 GATHERING_WIDTH = (GATHERING_NET - 1) / (GATHERING_NET - 5)  # width of g / width of the window: end spans lie outside
 GATHERING_FIT = Fit(bending=1e-3, steps=40, degree=5)  # fit of g

@@ -155,7 +155,7 @@ DERIVATIVE_STEP = 0.5  # step of the central difference for each perturbation, i
 # more than its detail is not a polynomial of ξ, so strong directions need many nodes.
 SPLINE_NODES = ((0, (-3.0, -2.0, -1.2, -0.5, 0.5, 1.2, 2.0, 3.0)), (4, (-2.5, -1.0, 1.0, 2.5)), (8, (-1.0, 1.0)))
 NONLINEAR_DIRECTIONS = 12  # number of strongest directions with nodes; along weaker directions pictures are linear
-MIN_STRENGTH = 1e-3  # change of the picture, relative to the strongest direction, below which it is also linear
+MIN_STRENGTH = 1e-3  # change of the picture, relative to the strongest direction, below which pictures are linear too
 
 
 @dataclass(frozen=True, eq=False)

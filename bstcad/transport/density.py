@@ -163,7 +163,7 @@ def _resample(flux, x, y, along_x, along_y, out):
                 for j in range(along_y):
                     b = (j + 0.5) / along_y
                     px, py = (1 - b) * x0 + b * x1 - 0.5, (1 - b) * y0 + b * y1 - 0.5
-                    if not abs(px) + abs(py) < np.inf:  # flux at a position that is not finite: no density
+                    if not abs(px) + abs(py) < np.inf:  # flux at a position that is not finite: a NaN as result
                         out[0, 0] = np.nan
                         continue
                     px, py = min(max(px, 0.0), n - 1.0), min(max(py, 0.0), n - 1.0)
