@@ -2,7 +2,7 @@
 
 A freeform face is batoid's `Bicubic` on grid lines through all knots.  Heights, slopes and mixed derivatives there make
 it equal to the spline, except in the outermost one and a half pitches, where x is not linear in the parameter.
-bstcad's source gives the start and the flux of each ray; batoid traces the ray, without losses.
+bstcad's source gives the start, direction and flux of each ray; batoid traces the ray, without losses.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from bstcad.optics.rays import Rays, axes
 from bstcad.optics.tilted import TiltedSurface
 from bstcad.optics.trace import launch_strips
 
-GRID_MARGIN = 0.125  # margin of a grid outside the rim, relative to the face's width; ray searches may begin there
+GRID_MARGIN = 0.125  # margin of a grid outside the net, relative to the net's width; ray searches may begin there
 POLYGON_CORNERS = 4096  # number of corners of the polygon that represents an outline with round corners
-COMPARISON_POINTS = 100_000  # number of points at which batoid's faces are compared with the lens's
+COMPARISON_POINTS = 100_000  # largest number of points at which batoid's faces are compared with the lens's
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def vector(rays: Rays) -> Any:
 
 
 def land(rays: Any, screen: Screen, sense: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Move rays of batoid to a screen; return x and y there (mm) and True for rays that hit.  sense: -1 along -z."""
+    """Move rays of batoid to a screen; return x, y (mm), and True for a hit.  sense: 1 for light along +z, or -1."""
     x, y, _ = screen.middle
     batoid.intersect(batoid.Plane(), rays, _frame(screen.middle, np.column_stack(axes(screen.tilt or (0.0, 0.0)))))
     arrived = ~rays.failed & ~rays.vignetted & np.isfinite(rays.x) & np.isfinite(rays.y) & (sense * rays.vz > 0)
@@ -132,7 +132,7 @@ def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, se
                 landed += bin_flux(x[arrived], y[arrived], flux[arrived], screen)
                 launched += flux.sum()
                 count += len(x)
-            picture += channel.weight / max(launched, 1.0) * landed  # cells on a beam's rim are inside or outside
+            picture += channel.weight / max(launched, 1.0) * landed  # `launched` may exceed 1 by cells on a beam's rim
     faces_of = zip(known[lens.solid], lens.interfaces[lens.solid], strict=True)
     return Traced(halves, count, FaceError.worst(face.error(interface.outline) for face, interface in faces_of))
 

@@ -32,9 +32,9 @@ from bstcad.scene.target import overlap
 from bstcad.verify.verdict import Check
 
 JUDGES = {"batoid": "bstcad.judges.batoid", "mitsuba": "bstcad.judges.mitsuba"}
-JUDGE_RAYS = 1 << 24  # total number of a judge's rays
+JUDGE_RAYS = 1 << 24  # total number of rays of a judge on one target
 MAX_COMPARED_PIXELS = 128  # largest number of pixels along the longer side of the compared pictures
-OWN_EFFORT = Effort(accuracy=0.0, witness=False)  # effort of bstcad: all rays, no second picture by flux tubes
+OWN_EFFORT = Effort(accuracy=0.0, witness=False)  # effort of bstcad's picture: all rays, no second one by flux tubes
 OWN_SEED_OFFSET = 500_009  # difference between the seeds of bstcad's and the judge's rays
 AGREEMENT_FACTOR = 1.5  # largest ratio of the difference of pictures to its noise, for many pixels
 MIN_NOISE = 1e-9  # lower bound of the noise, relative to the target
@@ -43,7 +43,7 @@ FLUX_TOLERANCE = 0.005  # largest difference of the light on the target, as a fr
 
 @dataclass(frozen=True)
 class Judge:
-    """Comparison of a judge's picture with bstcad's, as in report.json; differences are relative to the target."""
+    """Comparison of a judge's picture with bstcad's, as in report.json; differences relative to the target's RMS."""
 
     name: str  # name of the program
     version: str  # version of the program
@@ -107,9 +107,9 @@ def choose_judges(names: Sequence[str | OwnJudge]) -> tuple[str | OwnJudge, ...]
         if not isinstance(name, str):
             continue
         if name not in JUDGES:
-            raise SceneError(f"--against {name}: is not a known program; {nearest(name, list(JUDGES), 'choose')}")
+            raise SceneError(f"--against: {name!r} is not a known program; {nearest(name, list(JUDGES), 'choose')}")
         if importlib.util.find_spec(name) is None:
-            raise MachineError(f"--against {name}: {name} is not installed; pip install 'bstcad[judges]'")
+            raise MachineError(f"--against {name}: {name} is not installed; run pip install 'bstcad[judges]'")
     return tuple(dict.fromkeys(names))
 
 
@@ -210,7 +210,7 @@ def _scale_to(picture: np.ndarray, total: float) -> np.ndarray:
 
 
 def coarse_screen(screen: Screen) -> Screen:
-    """Return the screen with nearly square pixels, along the longer side at most MAX_COMPARED_PIXELS or the old number.
+    """Return the screen with nearly square pixels, along the longer side at most as many as now or MAX_COMPARED_PIXELS.
 
     Of the numbers above half this limit, the one with the most nearly square pixels is chosen, the largest of equals.
     """

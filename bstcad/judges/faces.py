@@ -1,4 +1,4 @@
-"""Faces of a lens for judges: heights, slopes and triangles; and the record of a judge's picture.
+"""Faces of a lens for judges (heights, slopes and triangles), and the record of a judge's picture.
 
 The faces are independent of bstcad's tracing: scipy evaluates splines on the control net and its knots, and numpy the
 sag of a surface of revolution.
@@ -24,7 +24,7 @@ from bstcad.optics.unfolding import per_radian
 
 PARAMETER_STEPS = 6  # steps of Newton's method for a parameter; the first guess has an error of at most half a span
 GRID_CELLS = 512  # number of cells per side of the grid over a face without knots
-PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # radii relative to the rim; slim triangles leak light
+PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # ring radius / rim radius; slim triangles would leak light
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class Revolved:
     half: tuple[float, float]  # half extents along x and y (mm)
 
     def lines(self, parts: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return x and y (mm) of the lines of a uniform grid over the face; parts: refinement, not for a plane."""
+        """Return x and y (mm) of the lines of a uniform grid over the face; parts: refinement, none for a plane."""
         cells = GRID_CELLS * parts if self.curvature else 64
         x, y = (np.linspace(-half, half, cells + 1) for half in self.half)
         return x, y
@@ -136,7 +136,7 @@ Face = Freeform | Revolved
 
 
 def face(surface: Surface, outline: Outline) -> Face:
-    """Return the face of a surface of a lens with an outline."""
+    """Return a surface of a lens as a Freeform or Revolved face; outline: bounds of a Revolved face."""
     plain = surface.plain()
     if is_net(plain):
         return Freeform(plain.control_points())
@@ -171,7 +171,7 @@ class FaceError:
 class Traced:
     """A judge's picture of the light on a screen."""
 
-    halves: np.ndarray = field(repr=False)  # flux per pixel, (2, rows, columns), row 0 = y max, each with the full flux
+    halves: np.ndarray = field(repr=False)  # flux per pixel, (2, rows, columns), row 0 = y max; each half: full flux
     rays: int  # total number of rays
     error: FaceError  # largest error of the judge's faces
     by: str = ""  # variant of the program, if it has several
@@ -197,7 +197,7 @@ def rim(outline: Outline, points: int = 512) -> np.ndarray:
 
 
 def clip_to_rim(outline: Outline, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a mask of points inside an outline, and x, y (mm); points outside are moved to the nearest on it."""
+    """Return a mask of points inside an outline, and x, y (mm) with points outside moved to the nearest on it."""
     a, b, r2 = outline.limits
     r, core_x, core_y = math.sqrt(r2), np.clip(x, -a, a), np.clip(y, -b, b)
     distance = np.hypot(x - core_x, y - core_y)
@@ -225,10 +225,10 @@ def _mesh(corners: np.ndarray, normals: np.ndarray, triangles: np.ndarray, uv: n
 
 
 def face_mesh(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Trimesh, FaceError]:
-    """Return a mesh of a face inside the outline, with exact normals towards +z or -z at its corners, and its error.
+    """Return a mesh of a face inside the outline, and its error; exact normals at corners, towards +z (up) or -z.
 
-    The grid is uniform and has lines through all knots.  Between corners, normals are interpolated linearly, nearly as
-    on a quadratic spline.  Outer corners of cells on the rim are moved onto the rim; cells outside are omitted.
+    The grid (Face.lines(parts)) has lines through all knots.  Between corners, normals are interpolated linearly,
+    nearly as on a quadratic spline.  Cells outside the rim are omitted; outer corners of cells on it are moved onto it.
     """
     x, y = face.lines(parts)
     shape = face.on_grid(x, y)
@@ -250,7 +250,7 @@ def face_mesh(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Trime
 
 
 def _mesh_error(face: Face, shape: Shape, x: np.ndarray, y: np.ndarray, *, whole: np.ndarray) -> FaceError:
-    """Return the error at the centres of cells inside the rim (whole), which lie on the diagonals of these cells."""
+    """Return the error of the mesh at the centres of the cells that are inside the rim (whole), on their diagonals."""
     middle = face.on_grid((x[:-1] + x[1:]) / 2, (y[:-1] + y[1:]) / 2)
     between = shape.normals[:-1, :-1] + shape.normals[1:, 1:]
     between /= np.linalg.norm(between, axis=-1, keepdims=True)
@@ -273,7 +273,7 @@ def plate(front: Face, outline: Outline) -> Trimesh:
 
 
 def disc(outline: Outline, centre: tuple[float, float, float], along: tuple[float, float, float]) -> Trimesh:
-    """Return the mesh of an outline's inside at constant z, with normals `along`, and texture u, v from 0 to 1."""
+    """Return the mesh of the area inside an outline around `centre` (mm), normals `along`, texture u, v from 0 to 1."""
     around = rim(outline, 4) if outline.shape == "rectangle" else rim(outline)
     points = np.concatenate([np.zeros((1, 2)), around])
     k = np.arange(len(around))

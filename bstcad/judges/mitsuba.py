@@ -60,7 +60,7 @@ def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
     if (first := channels[0].source).kind not in LAMPS:
         return f"Mitsuba has no lamp for the light of {type(first).__name__}"
     if first.parallel and points_per_line(channels) > 1:
-        return "parallel light of many directions starts from a plate for each, and these plates would block each other"
+        return "parallel light starts from one plate for each direction, and these plates would block each other"
     if lens.passes.sense < 0 and first.parallel:
         return "a parallel beam that comes down to a mirror starts from a plate, which would block the reflected light"
     return ""
@@ -76,7 +76,7 @@ def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
 def trace(
     lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int, reflections: int = 0
 ) -> Traced:
-    """Return the picture on a screen of square pixels; reflections: largest number inside the lens, 2 for a ghost."""
+    """Return the picture on a screen of square pixels; reflections: largest number inside the lens (ghost: 2)."""
     _mitsuba().set_variant(variant := _variant())
     _mitsuba().logger().clear_appenders()  # no progress bar per render
     halves, photons = np.zeros((2, *screen.shape)), 0
@@ -123,7 +123,7 @@ def _render(scene: Any, screen: Screen, photons: float, seed: tuple[int, ...]) -
 
 
 def _scene_without_lamps(lens: Lens, screen: Screen, folder: Path) -> tuple[dict[str, Entry], FaceError]:
-    """Return the scene without lamps, with meshes in `folder` as fine as the screen requires, and the meshes' error."""
+    """Return the scene without lamps, with meshes (files in `folder`) fine enough for the screen, and their error."""
     back, (below, above) = faces.face(lens.back, lens.outline), lens.apertures
     upper, error = _fine_mesh(back, above, lens, screen, up=True)
     meshes = {"back": upper}
@@ -247,7 +247,7 @@ def _plate(source: Collimated, weight: float, lens: Lens, path: Path) -> Entry:
 
 
 def _spot(source: Point, weight: float, lens: Lens) -> Entry:
-    """Return a spot of the radiant intensity I = 1 / (2π (1 - cos θ_max)) up to θ_max."""
+    """Return a spot with the radiant intensity weight / (2π (1 - cos θ_max)) up to θ_max."""
     edge = source.half_angle
     assert edge is not None  # a cone has a half angle
     intensity = weight / (2 * math.pi * (1 - math.cos(math.radians(edge))))
@@ -257,7 +257,7 @@ def _spot(source: Point, weight: float, lens: Lens) -> Entry:
 
 
 def _projector(source: Point, weight: float, lens: Lens, half: float) -> Entry:
-    """Return a projector along the axis of the lens, over a square of slopes up to `half`."""
+    """Return a projector along the axis of the lens; its square field has slopes up to `half` along x and y."""
     to_world, fov = _look_along(source.position, (0.0, 0.0, _sense(source, lens))), math.degrees(2 * math.atan(half))
     projector = {"type": "projector", "to_world": to_world, "fov": fov, "scale": weight / PROJECTOR_FLUX}
     return projector | {"irradiance": {"type": "ref", "id": "slide"}}
@@ -287,7 +287,7 @@ def _texture(values: np.ndarray) -> Entry:
 
 
 def _sense(source: Point, lens: Lens) -> float:
-    """Return 1 if the light leaves along the source's third axis, -1 if against it."""
+    """Return the direction of the light along z: 1 if the source is below the entrance of the lens, else -1."""
     return 1.0 if source.position[2] <= lens.entrance.z else -1.0
 
 

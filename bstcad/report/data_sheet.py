@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 297.0, 210.0  # size of the page, A4 (mm)
 FRAME = (20.0, 10.0, 287.0, 200.0)  # left, lower, right and upper edge of the frame (mm, ISO 5457)
-TABLE_TOP, TITLE_LEFT, LIGHT_LEFT = 60.5, 205.0, 226.0  # upper or left edge of each block (mm)
+TABLE_TOP, TITLE_LEFT, LIGHT_LEFT = 60.5, 205.0, 226.0  # upper edge of tables, left edges of title block and light (mm)
 ROW_HEIGHT, TABLE_FONT, HEADING_FONT = 3.57, 2.3, 2.6  # height of a table row, font sizes of rows and headings (mm)
 PICTURE_PIXELS = 256  # pixels along the longer side of a picture of the light
 APERTURE_ROUNDING = 1e-4  # relative amount by which a printed clear aperture may be too small
@@ -44,8 +44,8 @@ class DataSheet:
     """Content of a data sheet."""
 
     scene: Scene
-    designed: Lens
-    shape: Mapping[str, float | None]  # facts of the lens inside its mount's rim; volume of lens.step
+    designed: Lens  # lens as designed, not cut to the rim of its mount
+    shape: Mapping[str, float | None]  # analysis.shape.describe of the lens inside its mount's rim; volume of lens.step
     order: Order  # order for the shop; order.file is the STEP file that the sheet describes
     target: np.ndarray  # picture of the first target (rows, columns), row 0 at y max, column 0 at x min
     irradiance: np.ndarray  # irradiance on the first target, in the form and with the sum of `target`
@@ -70,7 +70,7 @@ class DataSheet:
 
     @cached_property
     def apertures(self) -> dict[str, Outline | None]:
-        """Clear apertures that the light uses, by face; None: the whole face."""
+        """Clear aperture that the light needs on each face; None: the whole face."""
         return needed_apertures(self.scene.source, self.lens)
 
     @property
@@ -88,7 +88,7 @@ class DataSheet:
 
 
 def _aperture(patch: Outline | None, outline: Outline) -> str:
-    """Return the size of a clear aperture in words, rounded up to three digits."""
+    """Return the size of a clear aperture in words, rounded up to three digits; patch None: the whole face."""
 
     def up(value: float) -> float:
         return float(rounded_up(value * (1 - APERTURE_ROUNDING)))
@@ -146,7 +146,7 @@ def page(sheet: DataSheet) -> Figure:
 
 
 def _form(sheet: DataSheet) -> str:
-    """Return the form of the front in a few words; convex (CX) if the centre of curvature is on the +z side."""
+    """Return the form of the front in a few words: CX, convex, if a centre of curvature is on the +z side, else CC."""
     front = sheet.record["front"]
     radii = {name.removeprefix("radius"): radius for name, radius in front.items() if name[:6] == "radius" and radius}
     words = [f"R{way} {abs(radius):.5g} {'CX' if radius > 0 else 'CC'}" for way, radius in radii.items()]
@@ -202,7 +202,7 @@ def _title_block(paper: Paper, sheet: DataSheet, scale: str) -> None:
 
 
 def _light(paper: Paper, sheet: DataSheet, y: float) -> float:
-    """Draw target and irradiance below y; return the y of the row below them (mm)."""
+    """Draw the target and the irradiance with their upper edges at y; return y of the first row below them (mm)."""
     start, end, view = LIGHT_LEFT + 2.4, FRAME[2] - 2.4, View.of(sheet.scene)
     width = (end - start - 2.4) / 2
     height = min(width * (view.y[1] - view.y[0]) / (view.x[1] - view.x[0]), 44.0)
@@ -232,7 +232,7 @@ def _write_rows(paper: Paper, rows: Rows, y: float, pitch: float) -> float:
     for name, value in rows:
         lines = wrapped(value, NOTES, end - start - 17.0, 3)
         if y - pitch * len(lines) < TABLE_TOP:
-            paper.text(start, y, "More: see the STEP file", NOTES, color=GREY)
+            paper.text(start, y, "More rows do not fit on this page", NOTES, color=GREY)
             break
         paper.text(start, y, name, NOTES, room=16.4, color=GREY)
         for line in lines:

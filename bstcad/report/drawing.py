@@ -71,13 +71,13 @@ def new_figure(width: float, height: float, layout: str = "constrained") -> Figu
 
 
 def footnote(figure: Figure, text: str) -> None:
-    """Write a grey line under a figure."""
+    """Write grey text under a figure."""
     figure.supxlabel(text, x=0.01, ha="left", fontsize=8, color=GREY)
 
 
 @styled
 def png(figure: Figure, ground: str = "#ffffff") -> bytes:
-    """Return the figure as PNG bytes without margins; with fewer pixels if it would exceed MAX_PNG_BYTES."""
+    """Return the figure as PNG bytes, cropped to MARGIN; with fewer pixels if it would exceed MAX_PNG_BYTES."""
     picture = _encode(figure, DPI, ground)
     if len(picture) > MAX_PNG_BYTES:
         picture = _encode(figure, DPI * 0.95 * (MAX_PNG_BYTES / len(picture)) ** 0.5, ground)
@@ -125,7 +125,7 @@ def steps(name: str, count: int) -> Any:
 
 
 def round_up(value: float) -> float:
-    """Return `value` rounded up to 1, 2 or 5 times a power of ten, a plain end of a scale; 1 if it is not positive."""
+    """Return `value` rounded up to 1, 2 or 5 times a power of ten, as the end of a scale; 1 if it is not positive."""
     if value <= 0.0:
         return 1.0
     decade = 10.0 ** np.floor(np.log10(value))

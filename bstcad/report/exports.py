@@ -3,7 +3,7 @@
 Tables are text: the first line names the columns, lengths in mm.  Drawings show the outline of a bare lens, or the part
 with its [mount], seen from the back: x to the right, y up, mm.  Each kind of edge is a set of closed curves on its own
 layer (DXF) or in its own group (SVG).  Centre marks and text are on other layers, so that a saw or a laser can omit
-them.  Draft narrows the flange upwards; the drawing shows its lower, wider edge.
+them.  Draft narrows the flange towards +z; the drawing shows its wider edge, which is the one at the smaller z.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ from bstcad.runs import files
 from bstcad.scene.mount import Mount
 
 SIDECAR = ".txt"  # suffix of a text file that states how far interpolation of a table moves the light
-SHEET = "datasheet"  # kind of export that the caller draws, from the report beside the lens
+SHEET = "datasheet"  # kind of export that `export` omits: the caller draws it from the report in the design's folder
 
 OUTLINE, RIM, FLANGE, SCREWS, HOLES = "OUTLINE", "RIM", "FLANGE", "SCREW_HOLES", "HOLES"
 CENTRES, TEXT = "CENTRES", "TEXT"
 MARK_OVERSHOOT = 1.5  # length by which a centre mark extends beyond the edge of a hole or rim (mm)
 SVG_MARGIN = 3.0  # margin around the drawing in the SVG (mm)
-EDGE_WIDTH, CENTRE_WIDTH = 0.25, 0.13  # widths of lines (mm, ISO 128)
+EDGE_WIDTH, CENTRE_WIDTH = 0.25, 0.13  # line widths of edges and of centre marks (mm, ISO 128)
 CHAIN_LENGTHS = (4.0, 0.8, 0.4, 0.8)  # lengths of dash, gap, dot and gap of a centre line (mm)
-CAPITAL_HEIGHT = 1.8  # height of a capital (mm, ISO 3098)
-FONT_SIZE = CAPITAL_HEIGHT / 0.72  # font size whose capitals have this height (mm)
-MAX_LINE_LENGTH = 60  # characters per line of text
+CAPITAL_HEIGHT = 1.8  # height of a capital letter (mm, ISO 3098)
+FONT_SIZE = CAPITAL_HEIGHT / 0.72  # font size at which capital letters have this height (mm)
+MAX_LINE_LENGTH = 60  # largest number of characters per line of text
 LETTER_WIDTH = 0.56 * FONT_SIZE  # upper bound of the mean width of a letter (mm)
 QUARTER_TURN_BULGE = math.tan(math.pi / 8)  # DXF bulge of an arc of 90 degrees: tan of a quarter of the angle
-EDGES = {"fill": "none", "stroke": "black", "stroke-width": f"{EDGE_WIDTH:g}"}
-STYLES = {  # attributes of the groups in the SVG, except those of edges
+EDGES = {"fill": "none", "stroke": "black", "stroke-width": f"{EDGE_WIDTH:g}"}  # attributes of a group of edges (SVG)
+STYLES = {  # attributes of the other groups (SVG), by layer
     CENTRES: {
         "fill": "none",
         "stroke": "#c00000",
@@ -55,8 +55,8 @@ STYLES = {  # attributes of the groups in the SVG, except those of edges
 }
 DXF_SIGNS = str.maketrans({"Ø": "%%c", "°": "%%d", "×": "x"})  # codes that CAD systems show in any font
 
-# (layer, kind, numbers): numbers (mm) are x, y, radius of a circle; half width, half height and corner radius of a box
-# around the axis; both ends of a line; or x, y and the string of a text.
+# (layer, kind, content); content (mm), by kind: "circle": x, y, radius; "box", centred on the axis: half width, half
+# height, corner radius; "line": x and y of one end, then of the other; "text": x, y and the string.
 Piece = tuple[str, str, tuple[Any, ...]]
 
 
@@ -74,10 +74,10 @@ def export(
 ) -> Exported:  # fmt: skip
     """Write the files of `kinds` (files.EXPORTS; nothing for SHEET) to the folder, each completely or not at all.
 
-    points: points along the wider side of grids; by default the number of control points of the back, and for
-    OpticStudio the knots of the net.  label: name of meshes and of a part.  mount: mount of the part in drawings; None:
-    drawings show the outline of the lens.  light: traced to measure the error of grids and tables; None: it is not
-    measured.  ValueError: a kind is unknown, or points is out of range.
+    points: number of points along the wider side of a grid; None: that of the back's control points (OpticStudio: at
+    the knots).  label: name of a mesh or part.  mount: mount in drawings; None: drawings show the outline of the lens.
+    light: light that is traced to compute the error of grids and tables; None: the error is not computed.
+    ValueError: a kind is unknown, or points is out of range.
     """
     for kind in kinds:
         if kind not in files.EXPORTS:
@@ -142,19 +142,19 @@ def points_table(lens: Lens, face: Surface, points: int) -> str:
 
 
 def turning_cloud(lens: Lens, points: int, face: Surface | None = None) -> str:
-    """Return a CSV table for slow-tool diamond turning: radius, angle from +x towards +y, height above the vertex.
+    """Return a CSV table for slow-tool diamond turning: radius (mm), angle (degrees), height above the vertex (mm).
 
-    face: None is the back.  Heights are along +z, which for the front is into the glass.
+    face: None is the back.  Angles are from +x towards +y; heights are along +z, which for the front is into the glass.
 
-    There are `points` rings of equal spacing from the axis to the farthest point of the outline.  Each ring has the
-    number of angles that the outermost ring needs for the same spacing.  Points outside the outline are omitted.  The
-    tool radius is not compensated.
+    There are `points` rings of equal spacing from the axis to the farthest point of the outline.  All rings have the
+    same angles; neighbours on the outermost ring are one ring spacing apart.  Points outside the outline are omitted.
+    The tool radius is not compensated.
     """
     ring = np.linspace(0.0, float(np.hypot(*lens.outline.farthest)), points)
     count = round(2 * np.pi * (points - 1))
     radius, angle = (p.ravel() for p in np.meshgrid(ring, np.arange(count) * 360.0 / count, indexing="ij"))
     x, y = radius * np.cos(np.radians(angle)), radius * np.sin(np.radians(angle))
-    inside = lens.outline.contains(*(torch.from_numpy(p * (1 - 1e-12)) for p in (x, y))).numpy()  # on the rim: inside
+    inside = lens.outline.contains(*(torch.from_numpy(p * (1 - 1e-12)) for p in (x, y))).numpy()  # with the rim
     face = face or lens.back
     height = sag(face, x[inside], y[inside]) - sag(face, 0.0, 0.0)
     return _csv(radius_mm=radius[inside], angle_deg=angle[inside], sag_mm=height)
@@ -279,7 +279,7 @@ def across(outline: Outline) -> str:
 
 
 def pitch_radius(mount: Mount) -> float | None:
-    """Return the radius (mm) of the pitch circle of the screws; None: no screws, or a circle outside the flange."""
+    """Return the radius (mm) of the screws' pitch circle; None: no screws, or the circle leaves the flange."""
     screws = mount.flange and mount.flange.screws
     if not screws or 2 * min(mount.flange.outline.outline.half_extent) <= screws.circle:
         return None
@@ -287,7 +287,7 @@ def pitch_radius(mount: Mount) -> float | None:
 
 
 def _corners(a: float, b: float, r: float) -> list[tuple[float, float, float]]:
-    """Return x, y (mm) and bulge of a box's corners or of the ends of its arcs, counterclockwise from (-x, -y)."""
+    """Return (x, y, bulge) of a box's corners or ends of arcs, counterclockwise; a, b: half sizes, r: radius (mm)."""
     p, q, turn = a - r, b - r, QUARTER_TURN_BULGE
     if not r:
         return [(-a, -b, 0.0), (a, -b, 0.0), (a, b, 0.0), (-a, b, 0.0)]

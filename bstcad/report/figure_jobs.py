@@ -1,6 +1,6 @@
 """Jobs that draw the pictures of a report in a second process, and the figures of the lens, its rays and its design.
 
-Each figure is a function from plain values to a matplotlib Figure.  Maps have row 0 at y min; axes are in mm.
+Each figure has a function that returns it as a matplotlib Figure.  Maps have row 0 at y min; axes are in mm.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-CELLS, LIGHT_PATH_CELLS = 320, 200  # mesh cells per axis in the 3-D picture, and in the view with rays
+CELLS, LIGHT_PATH_CELLS = 320, 200  # mesh cells per axis in the 3-D picture, and in the 3-D view with rays
 RAYS = 28  # rays per axis in the view with rays
 MILLIONTHS = 1e6  # factor from a fraction to millionths
 MAP_POINTS = 401  # samples of a surface map along each axis
@@ -178,9 +178,9 @@ def draw_convergence(report: Contents, view: View) -> Pngs:
 
 @styled
 def surface_maps(lens: Lens, found: Survey, face: str = "back") -> Figure:
-    """Draw sag, slope angle and mean curvature (optics.curvature.principal) of a freeform face inside the outline.
+    """Draw maps of sag, slope angle and mean curvature of a freeform face inside the outline.
 
-    found: extremes of the face, which the samples may miss.  face: "back" or "front".
+    found: extreme values of the face, which the samples of the maps may miss.  face: "back" or "front".
 
     The best-fit plane is subtracted from the sag if the PV of the plane exceeds the PV of the residual.
     """
@@ -292,7 +292,7 @@ def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
 
 @styled
 def convergence(history: Sequence[CurvePoint], stages: Sequence[StageRecord], noise: float) -> Figure:
-    """Draw the RRMSD against the seconds since the start: a curve per stage, the values after stages, and `noise`."""
+    """Draw the RRMSD against time (s): a curve per stage, rings for the values after stages, and a line at `noise`."""
     seconds, values = np.array([(point.seconds, point.rrmsd) for point in history], dtype=float).T
     ends = np.cumsum([0.0, *(stage.seconds for stage in stages)])
     after = np.isin(values, [stage.rrmsd for stage in stages if stage.rrmsd is not None])

@@ -16,16 +16,16 @@ from bstcad.scene.scene import Scene
 from bstcad.scene.target import drawing
 from bstcad.verify.checks import Proof
 
-Fraction = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]  # fraction of 1, with the rounding error of a sum
+Fraction = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]  # number from 0 to 1, with the rounding error of a sum
 Size = Annotated[float, Field(ge=0, le=1e12)]
 Rrmsd = Annotated[float, Field(gt=0, le=1e3)]
 
 
 @dataclass(frozen=True)
 class GoalFigures:
-    """Light on a target."""
+    """Figures of the light on a target."""
 
-    key: str  # target; with several targets target[0], target[1] …
+    key: str  # key of the target in the scene: target; if there are several, target[0], target[1] …
     where: str  # position of the receiver, in words
     weight: Size  # weight of the squared error on this target in the merit function
     rrmsd: Rrmsd  # RRMSD computed from the flux in each pixel
@@ -44,7 +44,7 @@ class GoalFigures:
 
     @property
     def suffix(self) -> str:
-        """Suffix of a name, such as ", target[1]"; empty if there is one target."""
+        """Suffix that tells apart the names of figures, such as ", target[1]"; empty if there is one target."""
         return suffix_of(self.key)
 
     @property

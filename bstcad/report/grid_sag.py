@@ -1,9 +1,9 @@
 """Grid sag of a net for Zemax OpticStudio: its points, its file, and the shift of the light by its interpolation.
 
-OpticStudio interpolates between the points of a grid by bicubic Hermite patches.  A net is one biquadratic polynomial
-in each knot span (optics/bspline.py), and the patch over the four corners of a span equals this polynomial.  A grid
-whose points are the knots, and perhaps points between them, is therefore exact.  In the end spans x(t) is quadratic,
-and the net is not a polynomial in x; there the grid is refined until the light moves by less than MAX_SHIFT.
+OpticStudio interpolates between the points of a grid by bicubic Hermite patches.  Except in the end spans, a net is one
+biquadratic polynomial in each knot span (optics/bspline.py), and the patch over the four corners of the span equals
+this polynomial.  A grid that includes all knots is exact there.  In the end spans x(t) is quadratic, and the net is not
+a polynomial in x; if they lie inside the rim, the grid is refined until the light moves by at most MAX_SHIFT.
 
 `Patches` is the surface that OpticStudio interpolates.  Rays through it and through the exact face give the shift.
 """
@@ -31,11 +31,11 @@ from bstcad.report.units import number
 
 MIN_POINTS, MAX_POINTS = 3, 4097  # points per side of a table
 MIN_ZEMAX_POINTS = 5  # points per side: "the nx and ny values must be no smaller than 5" (OpticStudio, Grid Sag)
-MAX_SHIFT = 0.1  # largest shift of the light by a grid of default density (target pixels)
+MAX_SHIFT = 0.1  # shift of the light (target pixels) up to which a grid or table is fine enough
 CELLS_PER_SPAN = (1, 2, 4, 8, 16)  # grid cells per knot span, tried in this order
-MAX_FLUSH_POINTS = 1_050_000  # largest grid that ends at the rim; larger grids end at the knots outside the rim
+MAX_FLUSH_POINTS = 1_050_000  # number of points up to which a grid that ends at the rim is preferred to a coarser one
 SHIFT_RAYS = 192  # rays per side of the bundle that measures the shift
-RIM_ROUNDING = 1e-9  # distance between a knot and the rim that counts as zero (in pitches of the net)
+RIM_ROUNDING = 1e-9  # distance from the rim that counts as zero (in pitches of the net, or steps of the grid)
 NEWTON_STEPS = 12  # steps of Newton's method to the intersection with the patches; smooth faces need 5
 MIN_DERIVATIVE = 1e-6  # lower bound of the derivative in a step of Newton's method
 HIT_TOLERANCE = 1e-9  # residual of the last step below which a ray hits the face (mm)
@@ -68,11 +68,11 @@ class Shift:
 
 @dataclass(frozen=True)
 class Grid:
-    """Heights and derivatives of a face at each pair of x and y."""
+    """Heights h of a face above a plane, and their derivatives, at each pair of x and y."""
 
     x: np.ndarray  # (nx,) mm, equally spaced
-    y: np.ndarray  # (ny,) mm
-    values: tuple[np.ndarray, ...]  # z, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y (mm, 1, 1, 1/mm), (nx, ny) each
+    y: np.ndarray  # (ny,) mm, equally spaced
+    values: tuple[np.ndarray, ...]  # h, ∂h/∂x, ∂h/∂y, ∂²h/∂x∂y (mm, 1, 1, 1/mm), (nx, ny) each
 
     @property
     def step(self) -> tuple[float, float]:
@@ -82,13 +82,13 @@ class Grid:
 
 @dataclass(frozen=True)
 class Patches(Surface):
-    """z = Σ over the corners of a cell of H H z + K H Δx z_x + H K Δy z_y + K K Δx Δy z_xy: bicubic Hermite patches.
+    """Bicubic Hermite patches: z - z0 = Σ over a cell's corners of H H h + K H Δx h_x + H K Δy h_y + K K Δx Δy h_xy.
 
     The first factor is a function of s (along x), the second of t (along y); s and t run from 0 to 1 across a cell.
-    At s = 0, H = (1 + 2 s)(1 - s)² and K = s (1 - s)²; at s = 1, H = s² (3 - 2 s) and K = -s² (1 - s).
+    For the corners at s = 0, H = (1 + 2 s)(1 - s)² and K = s (1 - s)²; at s = 1, H = s² (3 - 2 s) and K = -s² (1 - s).
     """
 
-    z: float  # plane from which the heights are measured (mm)
+    z: float  # position z0 of the plane from which the heights h of the grid are measured (mm)
     grid: Grid
     kind: Literal["patches"] = "patches"
 
@@ -99,7 +99,7 @@ class Patches(Surface):
 
     @classmethod
     def through(cls, face: Surface, x: np.ndarray, y: np.ndarray) -> Patches:
-        """Return the bicubic spline through the heights of a face, as other programs interpolate a table of sags."""
+        """Return a bicubic spline through a face's heights at x, y (mm), as other programs interpolate such a table."""
         heights = sag(face, x[:, None], y[None, :]) - float(face.z)
         spline = RectBivariateSpline(x, y, heights, kx=min(3, len(x) - 1), ky=min(3, len(y) - 1))
         slopes = (spline(x, y, dx=i, dy=j) for i, j in ((1, 0), (0, 1), (1, 1)))
@@ -121,9 +121,9 @@ class Patches(Surface):
         return h, h_x, h_y
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
-        """Return (s in mm, hit): path length of rays from (x, y) in the plane z0 to the surface, by Newton's method.
+        """Return (s in mm, hit): path length of rays from (x, y) in the plane z0 to the surface, and True for a hit.
 
-        F(s) = s d_z - h(x + s d_x, y + s d_y), s ← s - F / F'.
+        Newton's method: F(s) = s d_z - h(x + s d_x, y + s d_y), s ← s - F / F'.  `sense` has no effect.
         """
         dx, dy, dz = direction
         s = torch.zeros_like(x)
@@ -134,7 +134,7 @@ class Patches(Surface):
         return s, residual.abs() < HIT_TOLERANCE
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Return the minimum and the maximum height (mm) of the points and of the plane z0."""
+        """Return the lowest and the highest height h (mm) of the grid's points, zero included."""
         heights = self.grid.values[0]
         return min(float(heights.min()), 0.0), max(float(heights.max()), 0.0)
 
@@ -143,7 +143,7 @@ Shapes = tuple[tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]], ...]
 
 
 def _in_cell(at: Tensor, nodes: np.ndarray, step: float) -> tuple[Tensor, Shapes]:
-    """Return the cell of each point, and its Hermite functions [H or K][corner], each with the derivative in s."""
+    """Return the cell of each coordinate `at`, and the functions there, [H or K][corner]: (value, derivative in s)."""
     place = ((at - float(nodes[0])) / step).clamp(0.0, len(nodes) - 1.0)
     cell = place.detach().nan_to_num(0.0).floor().clamp(0, len(nodes) - 2)
     s = place - cell
@@ -160,7 +160,7 @@ def _in_cell(at: Tensor, nodes: np.ndarray, step: float) -> tuple[Tensor, Shapes
 def axes(outline: Outline, points: int, least: int = 2) -> tuple[np.ndarray, np.ndarray]:
     """Return x and y (mm) of a grid over the outline's bounding box, with nearly square cells, centred on the axis.
 
-    points: number along the wider side, both ends included.  least: smallest number of points along each side.
+    points: number of points along the wider side, both ends included.  least: smallest number along the other side.
     """
     a, b = outline.half_extent
     spacing = 2 * max(a, b) / (points - 1)
@@ -192,7 +192,7 @@ def _is_flush(x: np.ndarray, y: np.ndarray, outline: Outline) -> bool:
 
 
 def on_grid(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return (z - face.z, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y) (mm, 1, 1, 1/mm) of a face at each pair of x and y (mm) in its net.
+    """Return (z - face.z, ∂z/∂x, ∂z/∂y, ∂²z/∂x∂y) (mm, 1, 1, 1/mm) of a face at each pair of x and y (mm).
 
     z = Σ_i Σ_j B_i(u(x)) B_j(v(y)) h_ij (Wang et al. 2023, Eq. 2) is a product of three matrices on a grid, and each
     derivative is the same product with derivatives of one or both bases.
@@ -212,9 +212,9 @@ def on_grid(face: BSplineSurface, x: np.ndarray, y: np.ndarray) -> tuple[np.ndar
 
 @torch.no_grad()
 def shift_between(lens: Lens, other: Lens, light: GridLight) -> Shift | None:
-    """Return the shift between the light of two lenses on the target where the RMS is largest in pixels.
+    """Return the shift between the light of two lenses, on the target where its RMS is largest in pixels.
 
-    None: no light reaches a target.
+    None: no light reaches any target.
     """
     found = []
     for screen in light.screens:
@@ -231,7 +231,7 @@ def shift_between(lens: Lens, other: Lens, light: GridLight) -> Shift | None:
 
 
 def shift_by_patches(lens: Lens, face: Surface, patches: Patches, light: GridLight) -> Shift | None:
-    """Return the shift of the light if these patches replace one face of a lens; None: no light reaches a target."""
+    """Return the shift of the light if `patches` replace `face` of a lens; None: no light reaches any target."""
     plain = replace(lens, losses=None).shaping("back")
     other = plain.with_back(patches) if face is lens.back else plain.with_front(patches)
     return shift_between(plain, other, light)
@@ -242,7 +242,7 @@ def shift_by_patches(lens: Lens, face: Surface, patches: Patches, light: GridLig
 
 @dataclass(frozen=True)
 class GridSag:
-    """Grid for OpticStudio, and the shift of the light by its interpolation."""
+    """Grid for OpticStudio, and the shift of the light that interpolation of the grid causes."""
 
     face: BSplineSurface
     grid: Grid
@@ -250,7 +250,7 @@ class GridSag:
 
     @classmethod
     def of(cls, lens: Lens, face: BSplineSurface, points: int | None = None, light: GridLight | None = None) -> GridSag:
-        """Return a grid with `points` along the wider side; None: at the knots, refined until the shift is small."""
+        """Return a grid with `points` along the wider side; None: through the knots, as fine as MAX_SHIFT requires."""
         if points is not None:
             return cls._at(lens, face, axes(lens.outline, max(points, MIN_ZEMAX_POINTS), MIN_ZEMAX_POINTS), light)
         grids = [at for parts in CELLS_PER_SPAN if (at := through_knots(face, lens.outline, parts)) is not None]
@@ -289,13 +289,13 @@ class GridSag:
         return text.getvalue()
 
     def note(self, name: str) -> str:
-        """Return a sentence on the points of the file `name` and on the shift of the light."""
+        """Return a sentence on the grid in the file `name` and on the shift of the light by its interpolation."""
         (dx, dy), grid = self.grid.step, self.grid
         size = f"{name}: {len(grid.x)} x {len(grid.y)} points, spacing {dx:.6g} x {dy:.6g} mm"
         if self.shift is None:
             return f"{size}."
         coarse = self.shift.maximum > MAX_SHIFT * self.shift.pixel
-        advice = "; omit --points for a grid through the knots" if coarse else ""
+        advice = "; without --points the grid goes through the knots" if coarse else ""
         return f"{size}; bicubic interpolation moves the light on the target by {self.shift}{advice}."
 
 

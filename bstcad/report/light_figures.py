@@ -1,8 +1,8 @@
 """Figures of the light on the target, as seen from the side that the scene states.
 
-Seen from the lens, along +z with y up, x grows to the left.  Grey tones are those of an eye or a camera (sRGB), and the
-scales of irradiance are linear.  Pictures have the shape (rows, columns) and the sum of the target.  "In coordinates"
-means row 0 at y max and column 0 at x min.
+Seen from the lens, along +z with y up, x increases to the left.  Grey tones are those of an eye or a camera (sRGB), and
+the scales of irradiance are linear.  Pictures have the shape (rows, columns) and the sum of the target.  A picture "in
+coordinates" has row 0 at y max and column 0 at x min.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ SEEN = {  # (target.seen_from, True if the light travels along -z after an odd n
 }
 LIT = 0.01  # fraction of the target's maximum above which a pixel is lit
 HEADROOM = 1.06  # end of the grey scale relative to the brightest value, so that uniform light differs from white paper
-MAX_GLARE = 2.0  # multiple of the target's maximum up to which the scale includes a hot spot
-GLARE_PERCENTILE = 99.9  # percentile of the irradiance at the end of the scale if a hot spot exceeds MAX_GLARE
+MAX_GLARE = 2.0  # multiple of the target's maximum up to which the scale includes the brightest pixel
+GLARE_PERCENTILE = 99.9  # percentile of the irradiance that the scale always includes
 MIN_SCALE = 0.1  # smallest end of a scale of differences, as a fraction of the largest difference
-TONES = 128  # number of grey tones: no visible loss, and PNG files a third as large
+TONES = 128  # number of grey tones: without visible loss, the PNG files are a third as large as with more tones
 MARK_LENGTH = 0.045  # length of the marks of a cut, as a fraction of the picture's side
 CUTS = {"centre": BLUE, "brightest point": VERMILION}  # position of a cut: colour
 PERCENT_LIT = "% of mean of lit pixels"  # label of a scale of differences
@@ -64,7 +64,7 @@ COLUMNS = 4  # pictures of spectral lines per row
 PANEL_WIDTH, MAX_PANEL_HEIGHT = 2.4, 4.8  # size of the picture of a spectral line (inches)
 MANY_OUTLIERS = 300  # number of outliers from which on their dots are small
 FORM_UNITS = ((1e-3, 1e3, "µm"), (0.0, 1e6, "nm"))  # (smallest size in mm, factor, unit as written)
-BINS = 60  # bins of the histogram of trials
+BINS = 60  # number of bins of the histogram of trials
 MAX_WORST_TRIALS = 3  # number of the worst trials that are drawn
 # CIE 1931 standard observer, sums of Gaussians with two widths: weight, centre, width below and above the centre (nm).
 # Wyman, Sloan and Shirley, Journal of Computer Graphics Techniques 2(2), 2013, multi-lobe fit.
@@ -81,8 +81,8 @@ TO_SRGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.05
 class View:
     """Position of a target, and the side from which it is seen."""
 
-    x: Extent
-    y: Extent
+    x: Extent  # extent of the target along x
+    y: Extent  # extent of the target along y
     seen_from: str  # lens | behind
     optic: str = "lens"  # lens | mirror
     folded: bool = False  # True if the light reaches the target along -z
@@ -127,11 +127,11 @@ class View:
         return values[:, ::-1] if self.seen_from == "lens" else values
 
     def tones(self, light: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """Return the grey tones (uint8) of the flux in each pixel, on the scale of the picture `wanted`."""
+        """Return grey tones (uint8) of `light`, the flux in each pixel; the scale also suits the target `wanted`."""
         return tones(self.irradiance(light), self.irradiance(wanted))
 
     def irradiance(self, flux: np.ndarray) -> np.ndarray:
-        """Return the flux in each pixel divided by the pixel's area, relative to the mean area."""
+        """Return the flux in each pixel, divided by the ratio of the pixel's area to the mean area."""
         areas = self.receiver.areas(self.x, self.y, flux.shape)
         return flux if areas is None else flux / areas
 
@@ -147,12 +147,12 @@ def lit_mean(target: np.ndarray) -> float:
 
 
 def rrmsd(target: np.ndarray, irradiance: np.ndarray) -> float:
-    """Return sqrt(Σ (E_s - E)² / Σ E²), E_s simulated, E target: the merit function of stage 2; Wang et al. 2023."""
+    """Return the RRMSD of Wang et al. 2023, sqrt(Σ (E_s - E)² / Σ E²), where E_s is simulated and E the target."""
     return float(np.sqrt(np.sum((irradiance - target) ** 2) / np.sum(target**2)))
 
 
 def brightest(target: np.ndarray, irradiance: np.ndarray) -> float:
-    """Return the end of a scale for both pictures: above the brightest pixel, unless it is a hot spot."""
+    """Return the end of a scale for both pictures: above the brightest pixel, but below the peak of a hot spot."""
     peak = float(target.max())
     glare = min(float(irradiance.max()), MAX_GLARE * peak)
     return HEADROOM * max(peak, glare, float(np.percentile(irradiance, GLARE_PERCENTILE)))
@@ -177,7 +177,7 @@ def srgb_grey() -> ListedColormap:
 
 
 def draw_picture(axes: Axes, values: np.ndarray, view: View, **shades: Any) -> Any:
-    """Draw `values`, in coordinates, from the side of the view, in a frame."""
+    """Draw `values`, which are in coordinates, as seen from the side of the view, in a frame; return the image."""
     axes.set_xlabel(view.labels[0])
     axes.spines[:].set(visible=True, color=GREY, linewidth=0.6)
     place = {"extent": (*view.across, *view.y), "origin": "upper", "interpolation_stage": "data"}
@@ -222,7 +222,7 @@ def _largest(values: np.ndarray, spot: float = MIN_SCALE) -> float:
 
 
 def plain_ticks(axis: Any, low: float, high: float) -> None:
-    """Set ticks of a logarithmic axis at 1, 2, 5 times powers of ten, closer within a decade, as plain numbers."""
+    """Set ticks of a logarithmic axis from low to high as plain numbers: 1, 2, 5 per decade; more if high ≤ 8 low."""
     from matplotlib.ticker import LogLocator, NullLocator
 
     close = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9)
@@ -293,15 +293,15 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
     view.note(
         figure,
         f"  The grey tones look as the light looks to an eye (sRGB); the scale states the {view.receiver.light}.\n"
-        "Marks at the edges: the cuts that another figure shows, through the centre (blue) and through the brightest "
-        "point (vermilion, ring).",
+        "Marks at the edges: positions of the cuts in another figure, through the centre (blue) and through the "
+        "brightest point (vermilion, ring).",
     )
     return figure
 
 
 @styled
 def reach_picture(target: np.ndarray, reachable: np.ndarray, view: View) -> Figure:
-    """Draw the target, and beside it the target with the part that no light can reach in vermilion.
+    """Draw the target, and beside it the target again, in vermilion where no light can reach it.
 
     target, reachable: (rows, columns) in coordinates; reachable is True where light can reach the target.
     """
@@ -323,7 +323,7 @@ def reach_picture(target: np.ndarray, reachable: np.ndarray, view: View) -> Figu
 def ghost_picture(target: np.ndarray, ghost: np.ndarray, view: View) -> Figure:
     """Draw the light that is reflected twice inside the lens, in percent of the mean of the lit pixels.
 
-    ghost: (rows, columns) in coordinates, multiplied by the factor that gives the irradiance the sum of the target.
+    ghost: (rows, columns) in coordinates, multiplied by the same factor as the irradiance, which has the target's sum.
     """
     share = 100.0 * view.irradiance(ghost) / lit_mean(view.irradiance(target))
     figure = new_figure(5.6, 4.6, layout="compressed")
@@ -368,7 +368,7 @@ def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Fig
 def spectral_lines(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[SpectralLine], view: View) -> Figure:
     """Draw the picture of all spectral lines in colour, then the picture of each line alone.
 
-    target, irradiance of all lines, picture of each line: (rows, columns) in coordinates, with equal sums.
+    target, irradiance (of all lines), line.picture: (rows, columns) in coordinates, with equal sums.
     """
     even = view.irradiance(target)
     unit = lit_mean(even)
@@ -390,8 +390,8 @@ def spectral_lines(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[S
         axes.set_ylabel(view.labels[1])
     view.note(
         figure,
-        "  In colour, as a camera with white balance for the source: the lines differ where it is not grey.\n"
-        "In grey: the light of one line alone, on the same scale.",
+        "  Colour: as by a camera with white balance for the source; the lines differ where the picture is not grey.\n"
+        "Grey: the light of one line alone, on the same scale.",
     )
     return figure
 
@@ -411,8 +411,8 @@ def primary(wavelength: float) -> np.ndarray:
 def balanced(pictures: Sequence[np.ndarray], wavelengths: Sequence[float], shares: Sequence[float]) -> np.ndarray:
     """Return linear red, green and blue (rows, columns, 3) of lines whose pictures (rows, columns) have equal sums.
 
-    Each component is divided by its value for the source's spectrum, so that light of this spectrum is grey.  A
-    component that no line has is the mean over all lines.
+    Each component is divided by its value for the source's spectrum, so that light of this spectrum is grey.  If no
+    line has a component, it is the mean of the pictures, weighted by the shares of the lines.
     """
     parts = np.array([share * primary(nm) for nm, share in zip(wavelengths, shares, strict=True)])  # (lines, 3)
     white = parts.sum(0)
@@ -468,7 +468,7 @@ def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
         size = 3.0 if len(outliers) < MANY_OUTLIERS else 1.0
         face.plot(*outliers.T, ".", color="black", markersize=size, markeredgewidth=0)
         many = f"s: {len(outliers)} outliers, which are" if len(outliers) > 1 else ": an outlier, which is"
-        dots = f"  Black dot{many} left out."
+        dots = f"  Black dot{many} omitted."
     change, top = 100.0 * (predicted - designed) / unit, brightest(designed, predicted) / unit
     light_image = _grey(light, predicted / unit, view, top=top, title="Light of the made part, predicted")
     signed = _signed(changed, change, view, most=_largest(change), title="Made − designed light")
@@ -518,7 +518,7 @@ def worst_trials(
 ) -> Figure:
     """Draw the light as designed, the light of the worst trials, and below each trial its difference from the design.
 
-    worst: (number, RRMSD, picture) of each trial; picture (rows, columns) in coordinates, with the target's sum.
+    nominal: picture of the design; worst: (number, RRMSD, picture) of each trial; pictures as in irradiance_triptych.
     of: suffix such as ", target[0]" if there are several targets.
     """
     nominal = view.irradiance(nominal)

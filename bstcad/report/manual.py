@@ -14,8 +14,8 @@ from functools import cache
 from pathlib import Path
 from posixpath import dirname, join, normpath
 
-PLACES = (Path(__file__).parents[1] / "manual", Path(__file__).parents[2] / "docs")  # folders in a wheel, in sources
-SITES = (Path(__file__).parents[1] / "site", Path(__file__).parents[2] / "docs/_build/html")  # folders of built pages
+PLACES = (Path(__file__).parents[1] / "manual", Path(__file__).parents[2] / "docs")  # pages of a wheel, of the sources
+SITES = (Path(__file__).parents[1] / "site", Path(__file__).parents[2] / "docs/_build/html")  # their built pages
 FIRST = "index"  # name of the first page
 PAGES = ("checks", "remarks")  # pages of sections, without ".md"
 SECTION = re.compile(r"^\(([\w-]+)\)=\n+(### .+?)(?=\n+^(?:\([\w-]+\)=$|#{1,2} )|\s*\Z)", re.M | re.S)
@@ -41,7 +41,7 @@ def pages() -> dict[str, Path]:
 
 
 def name_of(topic: str) -> str | None:
-    """Return the name of a page for its name or the last part of the name; None: no page, or several."""
+    """Return the full name of the page whose name is `topic` or ends in /`topic`; None: no such page, or several."""
     name = topic.removesuffix(".md")
     ending = [each for each in pages() if each.endswith(f"/{name}")]
     return name if name in pages() else ending[0] if len(ending) == 1 else None

@@ -1,11 +1,10 @@
 """Drawing of a part on its data sheet, in mm of paper: a plan from the side of the back, and two sections.
 
-All views have one scale of the standard series (ISO 5455), in first-angle projection (ISO 128-30).  The plan, which is
-the view from the right, along -z, is left of the section that is seen along +x.  Inside the rim it is a contour map;
-flange and holes surround it.  Lines, arrows and dimensions follow ISO 128 and ISO 129-1, in black, so that a copy of
-a copy is legible.  They are drawn with matplotlib.  The drawing add-on of ezdxf 1.4.5 renders DIMENSION entities on
-such a page, but it fills the hole of "Ø" and converts text to curves, so that a reader cannot search the page or copy
-the SHA-256 from it.
+All views have one scale of the standard series (ISO 5455), in first-angle projection (ISO 128-30): the plan, which is
+the view along -z, lies to the left of the section that is seen along +x with z to the right.  Inside the rim the plan
+is a contour map of the back; flange and holes surround it.  Lines, arrows and dimensions follow ISO 128 and ISO 129-1,
+in black, so that a copy of a copy is legible.  matplotlib draws them: the drawing add-on of ezdxf 1.4.5 fills the hole
+of "Ø" and converts text to curves, so that a reader could not search the page or copy the SHA-256 from it.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ TAIL = 4.5  # length of a dimension line outside the measured length (mm)
 LETTERS, NOTES, NUMBERS = 2.5, 2.1, 1.9  # font sizes of dimensions, of leaders and notes, of numbers on contours (mm)
 CHAIN = (0, (14, 2.5, 2, 2.5))  # dashes and gaps of a centre line, in line widths
 FAMILY = STYLE["font.family"]
-MIN_FONT_SCALE = 0.8  # smallest factor on the size of a text that is too wide; it is then cut
+MIN_FONT_SCALE = 0.8  # smallest factor on the font size of a wide text; a text that is still too wide is cut
 UNKNOWN = "\u25a1"  # box for a character that the font lacks
 CONTOUR_POINTS, SECTION_POINTS = 241, 401  # points of the map of heights per axis, and of each face of a section
 MAX_CONTOURS = 18  # largest number of contour lines
@@ -105,9 +104,9 @@ class Paper:
     def dimension(
         self, ends: tuple[float, float], level: float, feet: tuple[float, float], text: str, upright: bool = False
     ) -> None:
-        """Draw a dimension along x between two ends, with the dimension line at y = level.
+        """Draw a dimension between the two `ends`, x of the measured points, with its line at y = level.
 
-        upright: along y, with the line at x = level, read from the right.  feet: y (upright: x) of the measured points.
+        feet: y of the measured points.  upright: x and y are exchanged, and the text is read from the right.
         """
 
         def at(along: float, beside: float) -> Point:
@@ -169,7 +168,7 @@ def width_of(text: str, size: float, bold: bool = False) -> float:
 
 
 def fitted(text: str, size: float, room: float, bold: bool = False) -> tuple[str, float]:
-    """Return (text, size) for a width (mm): scaled down to MIN_FONT_SCALE at least, then cut at its end."""
+    """Return (text, size) that fit into `room` (mm): scaled down to MIN_FONT_SCALE at least, then cut at the end."""
     size *= max(MIN_FONT_SCALE, min(1.0, room / max(width_of(text, size, bold), 1e-9)))
     if width_of(text, size, bold) > room * (1 + 1e-9):
         while text and width_of(f"{text}\u2026", size, bold) > room:
@@ -179,7 +178,7 @@ def fitted(text: str, size: float, room: float, bold: bool = False) -> tuple[str
 
 
 def wrapped(text: str, size: float, room: float, most: int) -> list[str]:
-    """Return the text in at most `most` lines of a width (mm), broken between words; the last line may be longer."""
+    """Return the text in at most `most` lines of width `room` (mm), broken between words; the last may be wider."""
     lines = [""]
     for word in drawable(text).split():
         longer = f"{lines[-1]} {word}".strip()
@@ -258,7 +257,7 @@ def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> Cro
 def _flange(
     flange: Flange, half: float, upright: bool, low: float
 ) -> tuple[list[shapely.Polygon], shapely.Geometry, list[np.ndarray]]:
-    """Return (in z, u) the flange's section on each side of the rim, its holes, and the edges of its planes."""
+    """Return the flange's section on each side of the rim, its holes, and the edges of its planes, all in (z, u)."""
     high, lean, b = low + flange.thickness, math.tan(math.radians(flange.draft)), flange.bevel
     reach = flange.outline.outline.half_extent[upright]
     foot, head = reach - lean * b, reach - lean * (flange.thickness - b)  # ends of the wall with draft
@@ -353,7 +352,7 @@ def scale_words(scale: float) -> str:
 
 
 def draw(paper: Paper, views: Views, *, left: float, low: float, right: float, high: float) -> float:
-    """Draw all views side by side in a part of the paper (mm); return the scale."""
+    """Draw all views side by side in the rectangle left, low, right, high of the paper (mm); return the scale."""
     scale = scale_for(views, right - left, high - low)
     a, b = views.outermost.half_extent
     wide, reach = 2 * scale * a, scale * max(a, b)
@@ -519,7 +518,7 @@ def _section(paper: Paper, views: Views, which: int, scale: float, *, left: floa
 def _thicknesses(
     views: Views, which: int, at: PaperFrame, reach: float
 ) -> Iterator[tuple[tuple[float, float], float, tuple[float, float]]]:
-    """Yield (ends z, level, feet) of the dimensions along z of edge or flange and of the part; see Paper.dimension."""
+    """Yield dimensions along z, of edge, flange, part and axis, as (ends in z, level, feet); see Paper.dimension."""
     cut, flange, (front, back) = views.cuts[which], views.mount.flange, views.vertices
     middle, top, foot = at.y, at.y + reach, at.y - reach
     if flange is None:

@@ -55,7 +55,7 @@ EXACT_FACES = (  # sentence on a freeform back, and on two freeform faces
 )
 SHEET, PART, LENS = "datasheet.pdf", "part.step", "lens.step"
 DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # mount.datum: plane z = 0
-EDGE_TOLERANCE = 1e-3  # largest fraction of an outline's area beyond an edge that counts as none
+EDGE_TOLERANCE = 1e-3  # fraction of an outline's area up to which the part outside an edge counts as zero
 
 Point = tuple[float, float, float]
 Measures = tuple[Point, Point, float | None]  # smallest and largest x, y, z (mm); volume (mm³), None: unknown
@@ -77,7 +77,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "material": material,  # None: only the index is known, or the optic is a mirror
         "index": lens.index,
         "outline": asdict(lens.outline),
-        "clear": lens.clear and tuple(map(asdict, lens.clear)),  # clear apertures of front and back; None: no mount
+        "clear": lens.clear and tuple(map(asdict, lens.clear)),  # clear apertures, front and back; None: whole outline
         "front": _own_outline(front) | _face(scene.lens.front.kind, lens.front_vertex, numbers) | fitted,
         "back": _face("bspline", vertex(lens), {}),
         "reflects": lens.reflects,  # True for a mirror
@@ -113,7 +113,7 @@ def _knots(shape: tuple[int, int]) -> str:
 def _face(kind: str, z: float, numbers: Mapping[str, float]) -> dict[str, Any]:
     """Return the entries of a surface with its vertex at z; missing curvature, radius and conic constant are None.
 
-    numbers: shape parameters.  Each curvature adds a radius, such as radius_x for curvature_x, None if it is 0.
+    numbers: shape parameters.  Each curvature adds a radius (mm), such as radius_x for curvature_x; None: infinite.
     """
     curvatures = {name: value for name, value in numbers.items() if name.startswith("curvature")}
     radii = {name.replace("curvature", "radius"): 1 / c if c else None for name, c in curvatures.items()}
@@ -233,7 +233,7 @@ def order_of(scene: Scene, lens: Lens, shape: Mapping[str, Any], folder: Path, f
 
 
 def measured(path: Path) -> Measures:
-    """Return the measures of the part in a STEP file, read by OCC; no volume if some faces cannot be integrated."""
+    """Return the measures of the part in a STEP file, read by OCC; volume None: some faces cannot be integrated."""
     from bstcad.verify import step_checks  # loads OCC, which the first process does not need
 
     lens, whole = step_checks.whole_part(path)
@@ -250,11 +250,11 @@ def part(
 ) -> dict[str, str]:
     """Return the facts of a part in a STEP file, in the order in which a machine is set up; no design is needed.
 
-    whole: part around the lens, whose outline then only encloses the edge of the back; None: a bare lens.
+    whole: part that contains the lens; the lens's outline then only encloses the edge of the back.  None: a bare lens.
     stated: density (g/cm³) in the file; None: the file states no density, or several.
-    placement: placement of the lens in the file, in words; None: lens and file have the same frame.
+    placement: position of the lens in the file (Placement.facts); None: lens and file have the same frame.
     """
-    import shapely  # takes 0.05 s, which a design does not need
+    import shapely  # the import takes 0.05 s, and a design does not need it
 
     shape, lies = describe(lens), list(zip(*_corners(lens, whole), strict=True))
     vertex = lens.front_vertex + shape["centre_thickness"]

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 BY_HAND = "by hand"  # DesignCourse.stopped of a lens that was changed after its design, or designed elsewhere
 MAX_REPORT_BYTES = 20_000_000  # size limit of a report (bytes): room for 300 000 points of the curve
-MAX_STRING_LENGTH = 1000  # characters of a string in a report that is read
+MAX_STRING_LENGTH = 1000  # largest number of characters of a string in a report that is read
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 LEFT_OUT = {  # LeftOut.kind: name of the effect in the report
     "fresnel": "Fresnel reflection",
@@ -93,15 +93,15 @@ class CurvePoint:
 
 
 class PrecisionTest(TypedDict):
-    """float32 against float64 on the merit function of the scene; see tailoring.stage2.PrecisionComparison."""
+    """Comparison of tailoring in float32 and in float64; see tailoring.stage2.PrecisionComparison."""
 
-    control_points: int  # control points per side
+    control_points: int  # number of control points along the longer side
     merit: Size  # relative difference of the merit before the first step
-    gradient: Size  # relative difference of the gradient's norm before the first step
-    evaluations: int  # evaluations in each precision
+    gradient: Size  # norm of the difference of the gradients before the first step, relative to the gradient's norm
+    evaluations: int  # number of evaluations in each precision
     rrmsd_float64: Rrmsd  # RRMSD after the evaluations in float64
     rrmsd_float32: Rrmsd  # RRMSD after the evaluations in float32
-    heights: Size  # largest difference of a control point after the evaluations (mm)
+    heights: Size  # largest difference between the heights of a control point after the evaluations (mm)
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class LineFigures:
 
 @dataclass(frozen=True)
 class DesignCourse:
-    """Course of a design; a value is None if the earlier report of the design is missing."""
+    """Course of a design; None: unknown, since the earlier report of the design is missing."""
 
     seconds_total: Seconds = 0.0  # time from the command to the verified lens
     stages: tuple[StageRecord, ...] = ()
@@ -126,10 +126,10 @@ class DesignCourse:
     transport: Mapping[str, Scalar] | None = None
     skipped_steps: int | None = None  # number of steps skipped because their gradient was not finite
     stopped: str | None = None  # reason why tailoring ended
-    twins: PrecisionTest | None = None  # float32 against float64
+    twins: PrecisionTest | None = None  # comparison of float32 with float64
 
     def with_stages(self, *last: StageRecord) -> DesignCourse:
-        """Return this record with `last` after its other stages; earlier stages of these names are removed."""
+        """Return this record with the stages `last` at its end, instead of earlier stages with their names."""
         names = [stage.name for stage in last]
         again = sum(stage.seconds for stage in self.stages if stage.name in names)
         seconds = self.seconds_total - again + sum(stage.seconds for stage in last)
@@ -142,7 +142,7 @@ class LeftOut:
     """An effect that is not simulated, and its estimated change (analysis.neglected_effects.Change)."""
 
     kind: str  # key of LEFT_OUT
-    flux_change: float | None  # change of the flux on the target, as a fraction
+    flux_change: float | None  # change of the flux on the target, as a fraction; None here and below: unknown
     rrmsd_change: float | None  # RRMSD of a lens that would be perfect without the effect
     blur_pixels: float | None  # full width of the blur on the target (pixels)
     detail: str = ""  # assumption of the estimate, or reason why nothing is known
@@ -191,11 +191,11 @@ class Contents:
     transport: Mapping[str, Scalar] | None = None
     skipped_steps: Annotated[int, Field(ge=0)] | None = None  # steps skipped: gradient not finite
     stopped: str | None = None  # reason why tailoring ended
-    twins: PrecisionTest | None = None  # float32 against float64; None: there was no time for it
+    twins: PrecisionTest | None = None  # comparison of float32 with float64; None: not made
     rrmsd_asked: Size | None = None  # accept.rrmsd of the scene; None: no limit
     rays_traced: int | None = None  # number of all rays of the verification
     shape: Mapping[str, float | None] | None = None  # analysis.shape.describe, volume (mm³)
-    # margin to total reflection (degrees) and of Newton's method, largest curvature (1/mm), number of non-finite values
+    # margin to total reflection (deg), smallest divisor in Newton's method, largest curvature (1/mm), non-finite values
     stability: Mapping[str, float | int | None] | None = None
     blur: Blur | None = None  # blur by the source's size; None: a point source or parallel light
     finest_detail: FinestDetail | None = None  # width of a point of the picture on the target
@@ -211,8 +211,8 @@ class Contents:
     # light beside the target)
     remaining_error: Mapping[str, Any] | None = None
     # bounds on the tailored faces: asked {key of [lens]: value}, at {key: fraction of the faces at the bound; None: a
-    # thickness at the bound}, tightest {key: position, in words}, both or front (true if not only the back is
-    # tailored); None: the scene has no bounds
+    # thickness at the bound}, tightest {key: position, in words}, both (true: both faces are tailored) or front (true:
+    # only the front is); None: the scene has no bounds
     bounds: Mapping[str, Any] | None = None
     judges: tuple[Judge, ...] = ()  # results of other programs (--against)
     # made part, from its point cloud; keys of measured.made_part, such as points, pv, rms, rrmsd_predicted, passed
@@ -345,7 +345,7 @@ def _with_remarks(contents: Contents, *more: Remark) -> Contents:
 
 
 def _finest_detail(scene: Scene, proof: Proof, screen: Screen, estimates: tuple[LeftOut, ...]) -> FinestDetail | None:
-    """Return the finest detail for the source size of the scene, else for the assumed one; None: there is neither."""
+    """Return the finest detail, for the size of the source in the scene or else the assumed size; None: no size."""
     if proof.blur:
         of = ", ".join(f"source.{key} = {size}" for key, size in extent(scene.source))
         return finest_detail(proof.blur.pixels, proof.lens, screen, of)
@@ -388,7 +388,7 @@ def too_steep(found: Steepness) -> list[str]:
 
 
 def bounds(found: Mapping[str, Any] | None) -> str:
-    """Return a sentence on the bounds on faces ([lens] tool_radius, max_slope, thicknesses) and where they are met."""
+    """Return a sentence on the bounds on faces ([lens] tool_radius, …) and where they are reached; "" for none."""
     return "".join(paragraphs("remarks.txt.j2", "bounds", found=found))
 
 
@@ -555,7 +555,7 @@ class Report:
                 f"Report {self.name!r}: {self.verdict}, RRMSD {rrmsds(self.contents)}, "
                 f"{percent(self.light_on_target)} of the source's light is on {self.worst.words}",
                 *(f"failed: {check.name}" + (f" ({check.where})" if check.where else "") for check in failed),
-                *(f"given up: {sentence}" for sentence in self.given_up),
+                *(f"remark: {sentence}" for sentence in self.given_up),
             ]
         )
 

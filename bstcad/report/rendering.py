@@ -43,17 +43,17 @@ VIEW_ANGLE = 26.0  # vertical angle of view (degrees)
 # The lens with its rays, in two views: the lens close up, and the whole path.
 WINDOW = (1920, 1080)  # size of the window (pixels)
 VIEW_WIDTHS = (5, 9)  # relative widths of the two views
-GROUND, INK, SOFT = "#0e1116", "#e6eaee", "#8b96a1"
+GROUND, INK, SOFT = "#0e1116", "#e6eaee", "#8b96a1"  # colours of the background, of the title, of captions and frames
 GLASS_FINISH = {"color": "#b9d4ea", "specular": 0.9, "opacity": 0.42}
 METAL_FINISH, LAMP = {"color": "#9aa3ad", "specular": 0.4}, "#fff3c4"
-DARKEST = 0.35  # start of the colour map of flux, so that the smallest flux is visible on the dark background
-ASIDE = (0.95, 0.42, 0.62)  # direction to the eye: sideways, up, and along the axis towards the seen side
+DARKEST = 0.35  # colour of zero flux, as a fraction of the colour map, so that it is visible on the dark background
+ASIDE = (0.95, 0.42, 0.62)  # direction to the eye for the whole path: x, y, and -seen_along times z
 NEAR = (0.9, 0.5, 0.75)  # direction to the eye in the close view, which faces the back
 TITLE_WIDTH = 46  # letters per line of the title
 PATH_ANGLE = 24.0  # vertical angle of view (degrees)
 PATH_FILL, LENS_FILL = 0.88, 0.6  # fraction of a view filled by the whole path, and by the lens close up
 SCREEN_OPACITY = 0.8  # opacity of a screen in front of another one
-RAY_REACH, RAY_STEP = 2.0, 5  # close view: length of the rays outside the lens (diagonals); every fifth ray is drawn
+RAY_REACH, RAY_STEP = 2.0, 5  # close view: rays outside the lens are 2 diagonals of it long; every fifth is drawn
 
 # The model that a reader can rotate.
 FINE, COARSE = 256, 64  # cells per axis of a net, and of a surface without knots
@@ -173,7 +173,7 @@ class LightPath:
 
     vertices: np.ndarray  # vertices of the lens, (n, 3)
     faces: np.ndarray  # vertex indices of its triangles, (k, 3)
-    rays: np.ndarray  # points of each ray from the source over the faces to the furthest screen, (rays, points, 3)
+    rays: np.ndarray  # points of each ray from the source via the faces to the furthest screen, (rays, points, 3)
     flux: np.ndarray  # flux of each ray at its end, (rays,), in millionths of the source's light
     screens: tuple[np.ndarray, ...]  # corners of each screen, (4, 3), around it from (x min, y min) via (x max, y min)
     pictures: tuple[np.ndarray, ...]  # tones of the irradiance on each screen, (rows, columns) uint8, row 0 at y max
@@ -238,7 +238,7 @@ def _close_rays(path: LightPath) -> np.ndarray:
 
 
 def _add_lens(plotter: Any, solid: Any, path: LightPath) -> None:
-    """Add the solid, of transparent glass or of metal, with two lights, and a point source in front of the lens."""
+    """Add the solid of transparent glass or of metal, two lights, and a sphere at a point source."""
     import pyvista
 
     finish = METAL_FINISH if path.mirror else GLASS_FINISH
@@ -285,7 +285,7 @@ def _add_screen(plotter: Any, screen: np.ndarray, picture: np.ndarray, opacity: 
 
 
 def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarray, filled: float) -> None:
-    """Set the camera along `towards`, y up, so that the points fill the fraction `filled` of the view."""
+    """Set the camera in the direction `towards`, y up, so that points (n, 3) fill the fraction `filled` of the view."""
     towards = _clear_of_screen(path, towards)
     right = np.cross([0.0, 1.0, 0.0], towards)
     right /= np.linalg.norm(right)
@@ -309,7 +309,7 @@ def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarra
 
 
 def _clear_of_screen(path: LightPath, towards: np.ndarray) -> np.ndarray:
-    """Return `towards` as a unit vector, mirrored in x so that the first screen does not cover the lens."""
+    """Return `towards` as a unit vector; the sign of x is such that the first screen does not cover the lens."""
     offset = path.screens[0][:, 0].mean() - path.vertices[:, 0].mean()
     return towards * [-1 if offset > 0 else 1, 1, 1] / np.linalg.norm(towards)
 
@@ -345,7 +345,7 @@ def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> st
         return np.stack([x.ravel()[at], y.ravel()[at]])
 
     def around(plane: Surface, inner: Outline) -> Iterator[np.ndarray]:
-        """Yield the quarters of a plane between an outline and that of the lens, in the form of `at_nodes`."""
+        """Yield the quarters of a plane between `inner` and the outline of the lens, in the form of `at_nodes`."""
         begin, end = (on_rim(outline, COARSE)[:, None] for outline in (inner, lens.outline))
         places = begin + np.linspace(0, 1, COARSE + 1)[:, None] * (end - begin)
         for k in range(4):
@@ -409,7 +409,7 @@ def data_url(picture: np.ndarray) -> str:
 
 
 def _steps(values: np.ndarray, low: float, size: float) -> np.ndarray:
-    """Return values as 16-bit integers, as fractions of the range from `low` to `low + size`."""
+    """Return values as 16-bit integers: 0 for `low`, STEPS for `low + size`."""
     return np.rint((values.ravel() - low) * (STEPS / size)).astype("<u2")
 
 

@@ -38,7 +38,7 @@ BADGES = {  # verdict of a report: (sign, style on the page, style on the termin
 }
 # style on the terminal of each kind of a plan's verdict
 PLAN_STYLES = {"blurred": "bold red", "beyond": "bold red", "within": "bold green", "no limit": "bold cyan"}
-GLASS_LINES = ("lost through the sides", "total internal reflection")  # lines omitted for a mirror if 0
+GLASS_LINES = ("lost through the sides", "total internal reflection")  # lines of the ledger that a mirror omits if 0
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
@@ -117,7 +117,7 @@ def html(
 ) -> bytes:
     """Return report.html, one file that contains pictures and styles and loads nothing.
 
-    figures: PNG bytes by name; a picture that is None or absent is omitted, with a sentence for the 3-D picture.
+    figures: PNG bytes by name; a picture that is None or absent is omitted, and a sentence replaces the 3-D picture.
     scene: TOML text with all defaults.  prescription: rows from bstcad.report.prescription.sections.  solid: JSON from
     bstcad.report.rendering.turnable; empty: a page without a script.  tolerances: HTML from bstcad.report.tolerances.
     sections: (heading, HTML) from a script of the user.
@@ -161,10 +161,10 @@ def base64_images(pictures: Mapping[str, bytes | None]) -> dict[str, str]:
 
 
 def junit(report: Contents) -> bytes:
-    """Return the checks of a design as a JUnit suite, one test case per check; a check without a limit passes.
+    """Return the checks of a design as a JUnit suite, one test case per check.
 
-    The time of the suite is that of the verification, and its output contains the remarks.  If the verdict is
-    NO_LIMIT, checks without a limit are skipped: neither passed nor failed.
+    A check without a limit is passed or, if the verdict is NO_LIMIT, skipped.  The time of the suite is that of the
+    verification, and its output contains the remarks.
     """
     unjudged = [check for check in report.checks if report.verdict == NO_LIMIT and check.limit is None]
     text = environment().get_template("junit.xml.j2").render(report=report, unjudged=unjudged)
@@ -221,7 +221,7 @@ def topic_tag(line: Check | Remark) -> tuple[str, str]:
 def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
     """Return tables of effects that are simulated and not simulated, from the entries of `plan --json`.
 
-    The verdict comes first if the effects decide it.
+    title: heading.  If the entries contain a verdict, which then follows from the effects alone, it comes first.
     """
     from rich.console import Group
     from rich.table import Table

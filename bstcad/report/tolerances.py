@@ -28,8 +28,8 @@ MAX_PAGE_BYTES = 30_000_000  # size limit of a page that is changed
 MAX_PICTURE_BYTES = 1_000_000  # size limit of a picture that is read
 PNG = b"\x89PNG\r\n\x1a\n"
 FIGURES = ("tolerance_trials", "tolerance_worst")  # names of the pictures
-MAX_DISAGREEMENT = 0.1, 0.03  # largest relative disagreement with full traces: 95th percentile, median
-MIN_FRACTION = 1e-3  # fraction of the change of the picture below which an error is listed in a second table
+MAX_DISAGREEMENT = 0.1, 0.03  # relative error up to which superposed pictures are trusted: 95th percentile, median
+MIN_FRACTION = 1e-3  # fraction of the mean square change below which an error is listed in a second table
 WIDEST = 10.0  # largest factor on the width of an error in the search for the loosest tolerances
 MAX_NAMED_ERRORS = 3  # number of errors that are named per trial
 
@@ -37,14 +37,14 @@ Yield = tuple[Fraction, Fraction, Fraction]  # lower bound, estimate and upper b
 Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
 Width = Annotated[float, Field(gt=0, le=1e6)]
 Spread = TypedDict("Spread", {"5 %": Size, "50 %": Size, "95 %": Size})  # percentiles of RRMSD
-Disagreement = TypedDict("Disagreement", {"median": Size, "95 %": Size})  # relative errors
+Disagreement = TypedDict("Disagreement", {"median": Size, "95 %": Size})  # relative errors of superposed pictures
 
 
 @dataclass(frozen=True)
 class Grade:
     """Grade of manufacture that gives the default widths of the errors."""
 
-    name: str  # moulded, diamond-turned or precise; none: only errors that the scene names
+    name: str  # "moulded", "diamond-turned" or "precise"; "none": only errors that the scene names
     words: str  # description of the grade
 
 
@@ -53,11 +53,11 @@ class Sensitivity:
     """Sensitivity to one error of manufacture, mounting or illumination."""
 
     # name of the error, such as lens.tilt_x; a form error is three fields, such as back.form_0, back.form_1 and
-    # back.form_2, which the report shows as the root of the sum of their squares
+    # back.form_2; the report states the root of the sum of the squares of their widths
     name: str
     words: str  # description of the error
     unit: str  # unit of limit and sigma
-    limit: Width  # width ±, in `unit`; for a field of a form error its standard deviation, the stated limit over √3
+    limit: Width  # width ±, in `unit`; of a field: standard deviation of its amplitude, the stated limit divided by √3
     # normal and uniform: inside the limit; field: a random field of normally distributed amplitude, without a bound
     distribution: Literal["normal", "uniform", "field"]
     cost: Width  # relative cost of the limit (default 1)
@@ -87,38 +87,38 @@ class Inverse:
 
 @dataclass(frozen=True)
 class TargetStudy:
-    """Results on one of several targets, from the same trials."""
+    """Results on one of several targets; the trials are those of all targets."""
 
     key: str  # target[0], target[1], …
     where: str  # position of the receiver, in words
     rrmsd: Rrmsd  # RRMSD of the design on this target
-    passed: Annotated[Yield, Field(alias="yield")]  # yield of the limit on this target
+    passed: Annotated[Yield, Field(alias="yield")]  # yield on this target alone, by superposed pictures
     passed_full: Annotated[Yield, Field(alias="yield_full")]  # yield of the trials traced in full
     passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of the full trials, screen adjusted
     rrmsd_trials: Spread  # RRMSD of the trials by superposed pictures
     rrmsd_full: Spread  # RRMSD of the trials traced in full
-    rrmsd_adjusted: Spread  # RRMSD of the full trials with this screen adjusted, superposed pictures
+    rrmsd_adjusted: Spread  # RRMSD of the full trials by superposed pictures, with this screen adjusted
     model_off: Disagreement  # disagreement of superposed pictures with full traces
     sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # the worst first
 
 
 @dataclass(frozen=True)
 class WavefrontStudy:
-    """Results on the wavefront from the same trials: RMS error in waves, piston and tilt removed."""
+    """Results on the wavefront, for the trials of the pictures: RMS error in waves, piston and tilt removed."""
 
     rms: Size  # RMS error of the design
     rms_trials: Spread  # RMS error of the trials by superposed wavefronts
     rms_full: Spread  # RMS error of the trials traced in full
     model_off: Disagreement  # disagreement of superposed wavefronts with full traces
     limit: Size | None = None  # accept.wavefront; None: no limit
-    # yield of the limit by superposed wavefronts
+    # yield by superposed wavefronts: fraction of the trials within `limit`; None: no limit
     passed: Annotated[Yield | None, Field(alias="yield")] = None
     passed_full: Annotated[Yield | None, Field(alias="yield_full")] = None  # yield of the trials traced in full
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Content of tolerance.json: one field per key, in the order of the file, which names `passed…` `yield…`."""
+    """Content of tolerance.json: one field per key, in the order of the file; the key of `passed…` is `yield…`."""
 
     __pydantic_config__ = STRICT
 
@@ -128,7 +128,7 @@ class Tolerances:
     seed: Annotated[int, Field(ge=0)]  # seed of the trials
     tubes: Count  # flux tubes per side, for each channel
     limit: Rrmsd  # largest RRMSD of a lens that passes
-    rrmsd: Rrmsd  # RRMSD of the design; with several targets, here and below that of the worst target of each lens
+    rrmsd: Rrmsd  # RRMSD of the design; if there are several targets, on the worst one, here and below for each lens
     trials: Count  # number of trials by superposed pictures
     full_trials: Count  # number of trials by full traces
     # yield by superposed pictures: lenses within `limit` on all targets and within the limit of the wavefront
@@ -137,9 +137,9 @@ class Tolerances:
     passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of the full trials, screen adjusted
     rrmsd_trials: Spread  # RRMSD of the trials by superposed pictures
     rrmsd_full: Spread  # RRMSD of the trials traced in full
-    rrmsd_adjusted: Spread  # RRMSD of the full trials with the screen adjusted, superposed pictures
+    rrmsd_adjusted: Spread  # RRMSD of the full trials by superposed pictures, with the screen adjusted
     model_off: Disagreement  # disagreement of superposed pictures with full traces
-    sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # sensitivities, the worst first
+    sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # largest change of the RRMSD first
     worst: Annotated[tuple[Trial, ...], Field(max_length=100)]  # worst of the fully traced trials
     inverse: Inverse | None = None  # None: no yield was requested
     targets: Annotated[tuple[TargetStudy, ...], Field(max_length=100)] | None = None  # None: there is one target
@@ -151,7 +151,7 @@ class Tolerances:
 
     @property
     def trusted(self) -> bool:
-        """True if superposed pictures, and wavefronts that have a limit, agree with the full traces."""
+        """True if superposed pictures agree with the full traces, and wavefronts too if they have a limit."""
         limited = self.wavefront is not None and self.wavefront.limit is not None
         found = (self.model_off, self.wavefront.model_off) if limited else (self.model_off,)
         return all(each["95 %"] <= MAX_DISAGREEMENT[0] and each["median"] <= MAX_DISAGREEMENT[1] for each in found)
@@ -206,7 +206,7 @@ def of_folder(folder: Path, optic: str) -> str:
 
 
 def put_into(page: Path, section: str) -> bytes | None:
-    """Return the page with this section instead of its present one; None if the page cannot be read or has none."""
+    """Return the page with `section` in the place of its section on tolerances; None: no such place or page."""
     try:
         text = files.contents(page, MAX_PAGE_BYTES).decode("utf-8")
     except (OSError, ValueError):

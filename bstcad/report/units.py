@@ -27,7 +27,7 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float | bool | None) -> str:
-    """Return a number with three significant digits, integers in full: 0.0284, 5.8, 6512, 3.2 × 10⁻⁷; yes, no, none."""
+    """Return a number: three digits (0.0284), an integer in full (6 512), else as 3.2 × 10⁻⁷; or yes, no, none."""
     if value is None:
         return "none"
     if isinstance(value, bool | np.bool_):
@@ -55,7 +55,7 @@ def about(value: float, unit: str = "") -> str:
 
 
 def quantity(value: float | bool | None, unit: str) -> str:
-    """Return a value in a unit that suits its size (3e-7 mm: 0.3 nm); below 0.001 of the smallest unit "< 0.001 pm"."""
+    """Return a value in a unit that suits its size (3e-7 mm: 0.3 nm), or "< 0.001 pm" if it is too small for any."""
     unit = {"°": "deg", "degrees": "deg", "1": ""}.get(unit, unit)
     if value is None or isinstance(value, bool | np.bool_) or not unit:
         return number(value)
@@ -86,7 +86,7 @@ def duration(seconds: float) -> str:
 
 
 def bound(check: Check) -> str:
-    """Return the limit of a check with ≤ or ≥: if a value below the limit passes, the limit is an upper one."""
+    """Return the limit of a check, with ≤ if a value below the limit passes, with ≥ if it fails."""
     value, limit, unit = check.value, check.limit, check.unit
     if limit is None:
         return ""
@@ -110,7 +110,7 @@ def exact(value: float) -> str:
 
 
 def mm(value: float) -> str:
-    """Return a length in mm, rounded to 0.001 mm; zeros at the end only if it is not exact: 4.379, 6.040, −0.5, 0."""
+    """Return a length in mm, rounded to 0.001 mm; only rounded values keep zeros at the end: 6.040, but −0.5, 0."""
     text = f"{value:.3f}" if abs(value) >= 5e-4 else "0"
     text = text.rstrip("0").rstrip(".") if "." in text and abs(value - float(text)) < 1e-6 else text
     return text.replace("-", "−")

@@ -156,7 +156,7 @@ def test_the_noise_is_borne_by_the_pixels_that_have_it():
 
 
 def test_an_unknown_judge_is_named_and_a_missing_program_says_how_to_install_it(tmp_path, monkeypatch):
-    with pytest.raises(SceneError, match="batiod: is not a known program; did you mean 'batoid'?"):
+    with pytest.raises(SceneError, match="'batiod' is not a known program; did you mean 'batoid'?"):
         commands.verify(tmp_path, against=("batiod",))
     monkeypatch.setattr(comparison.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MachineError, match=r"pip install 'bstcad\[judges\]'"):

@@ -230,7 +230,7 @@ def test_the_table_of_the_part_has_every_hole_at_its_place():
     ]  # fmt: skip
     told = dict(rows)
     assert (told["Lens cut to"], told["Flange"][:14]) == ("Ø15 mm", "26 × 24.5, R3 ")
-    assert told["Flange, from, to"] == "z = 0, 1.5 mm"
+    assert told["Flange, range of z"] == "z = 0 to 1.5 mm"
 
 
 @pytest.mark.parametrize("name", MOUNTED)

@@ -53,11 +53,11 @@ def test_the_light_moves_as_far_as_is_stated(points):
     assert [each[-1] for each in at] == pytest.approx([4.0, 3.0]) == [-each[0] for each in at]  # as large as the lens
     if points is None:  # through the knots, with one point between two: nothing moves
         assert off.max() < 1e-9 and grid.shift.maximum < 1e-9 and [len(each) for each in at] == [33, 25]
-        assert "omit --points" not in grid.note("a.dat")
+        assert "without --points" not in grid.note("a.dat")
     else:
         assert grid.shift.rms == pytest.approx(np.sqrt((off**2).mean()), rel=0.1)  # by 1500 points
         assert grid.shift.maximum == pytest.approx(off.max(), rel=0.3)
-        assert ("omit --points" in grid.note("a.dat")) == (grid.shift.maximum > MAX_SHIFT * grid.shift.pixel)
+        assert ("without --points" in grid.note("a.dat")) == (grid.shift.maximum > MAX_SHIFT * grid.shift.pixel)
         assert grid.shift.pixel == 0.25 and f"{points} x" in grid.note("a.dat")
 
 

@@ -142,7 +142,7 @@ def blurred(rrmsd):
 VERDICTS = [
     (0.1, predicted(0.02, 0.03, 0.04), "within", "an RRMSD of about 0.03 after about 30 s, in standard qualit"),
     (0.1, predicted(0.08, 0.12, 0.15), "open", "0.1, and the result will probably lie between 0.08 and 0.15."),
-    (0.1, predicted(0.2, 0.3, 0.4), "beyond", "the limit is 0.1 and will probably not be reached."),
+    (0.1, predicted(0.2, 0.3, 0.4), "beyond", "the limit is 0.1, and the RRMSD will probably exceed it."),
     (None, predicted(0.02, 0.03, 0.04), "no limit", "designs would pass with [accept] rrmsd = 0.0"),
     (0.1, {"predicted": None, "not_predicted": "too odd", "goals": [{"blur": None}]}, "not predicted", "too odd."),
     (0.1, blurred(0.3), "blurred", "The RRMSD will be 0.15 to 0.3 for any lens; the limit is 0.1."),
