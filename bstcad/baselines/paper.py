@@ -199,7 +199,7 @@ def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = (
 def tailor_to_irradiance(
     lens: Lens, bundles: Iterator[tuple[Rays, ...]], merit: TentMerit, steps: int, state: RaySearch | None = None
 ) -> Iterator[Iterate]:
-    """Minimise the RRMSD of tent binning, with new random rays in each step (Eq. 15)."""
+    """Minimise the square root of `merit`, without overshoot the RRMSD (Eq. 15), with new random rays in each step."""
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaf = parameters[0].detach().clone().requires_grad_()
