@@ -12,12 +12,12 @@ import os
 from importlib import import_module
 from typing import Any
 
-# Idle threads of the pools of torch and numba sleep instead of spinning, to be set before either is loaded.  With other
-# work on the machine the kernels are up to twenty times faster, without it equally fast.
+# Let idle threads of torch and numba sleep instead of spinning; this must be set before either library is loaded.
+# Kernels are then up to twenty times faster while other programs use the machine, and equally fast otherwise.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __version__ = "0.1.0"
-_HOMES = {
+_HOMES = {  # module of each public name, relative to bstcad
     **dict.fromkeys(("design", "open", "mounted", "Design"), "api"),
     "workbench": "app.widget",
     "Report": "report.record",

@@ -45,8 +45,8 @@ from bstcad.tailoring.merit import PictureError
 from bstcad.tailoring.run import Hooks
 from bstcad.transport.mapping import TransportMap
 
-RELATIVE_TOLERANCE = 1e-9  # largest relative difference of equal indices, and of ends of equal nets in net widths
-PREVIEW_TUBES = 521  # flux tubes per side for a picture that is not verified
+RELATIVE_TOLERANCE = 1e-9  # largest relative difference of indices that count as equal; for ends of nets, in net widths
+PREVIEW_TUBES = 521  # flux tubes per side of the light, for the picture of a design that is not verified yet
 AnyPath = str | os.PathLike[str]  # path of a file or of a folder
 
 
@@ -56,7 +56,7 @@ def design(
     """Design the lens for a scene or a scene file.  SceneError states the fault of an invalid scene.
 
     progress: show a progress bar in a terminal or notebook.  device: "auto", "cpu" or "cuda" (pipeline.device_for).
-    merit: function of picture and target, tensors (rows, columns) of flux, that stage 2 minimises instead of RRMSD².
+    merit: function of picture and target, tensors (rows, columns) of flux; stages 2 and 3 minimise it, not RRMSD².
     It must be differentiable and of the magnitude of RRMSD².  The verification still reports the RRMSD.
 
     On Linux the process keeps up to 2 GB of freed memory for its next design (bstcad.runs.processes.keep_freed).
@@ -108,12 +108,12 @@ class Design:
 
     @property
     def target(self) -> np.ndarray:
-        """Required flux per pixel of target[0], (rows, columns), sum 1; row 0 is y max, column 0 is x min."""
+        """Flux per pixel required on the first target, (rows, columns), sum 1; row 0 is y max, column 0 is x min."""
         return self._made.goals[0].picture
 
     @property
     def transport(self) -> TransportMap | None:
-        """Transport map of stage 1: points of the target, and the points of the face that send light to them (mm).
+        """Transport map of stage 1: points of the target, and where their light passes the lens (mm), see TransportMap.
 
         None for your own lens (with_lens, with_heights) and for a folder of an earlier version.  With several spectral
         lines, the map of the line with most light; for an extended source, the map for its centre.
@@ -125,7 +125,7 @@ class Design:
 
         lens: must have the outline and the index (at the main wavelength) of the scene, be a mirror if the scene has a
         mirror, and have a net as wide as the net of the scene; it is converted to float64 on the CPU.  A different
-        front or number of control points is stored in the scene of the new design; losses remain those of [[effects]].
+        front or number of control points is stored in the scene of the new design; losses are those of its [[effects]].
         The new design has no stages, history or transport map, and its report states "changed by hand".  SceneError
         names the property of a lens that does not fit.
         """
@@ -143,7 +143,7 @@ class Design:
             found = np.asarray(heights.detach().cpu() if isinstance(heights, torch.Tensor) else heights)
             if found.dtype.kind not in "fiu" or found.ndim != 2:
                 raise ValueError
-        except (TypeError, ValueError):  # includes lists of unequal length
+        except (TypeError, ValueError):  # numpy raises ValueError for rows of unequal length
             given = getattr(heights, "shape", type(heights).__name__)
             given = f"numbers of shape {tuple(given)}" if isinstance(given, tuple) else given
             raise SceneError(
@@ -160,12 +160,12 @@ class Design:
         """Return the exact solid, a cadquery.Solid for Workplane chains and assemblies.
 
         trim: closed plane cadquery.Wire inside the lens, to which the lens is cut; the z of the wire is ignored.
-        holes: such wires, or (x, y, diameter) in mm.  Walls are along z.  Only the boundaries of the designed faces
-        change, which takes a second; a boolean with a large net takes half a minute.  body: cadquery solid, such as a
-        flange, that is joined to the lens, see bstcad.mounted.  draft: draft angle (degrees) of the walls around the
-        lens, from 0.1 mm below the back's rim, or from the body, inwards to the front.  bevel: height along z (mm) of a
-        bevel at 45 degrees on the edge between walls and front.  SceneError if a wire is open, crosses itself or
-        another wire, or leaves the lens, if the body does not fit, or if walls would meet.
+        holes: such wires, or (x, y, diameter) in mm.  Trim and holes only change the boundaries of the designed faces,
+        in a second; a boolean operation on a large net would take half a minute.  body: cadquery solid, such as a
+        flange, that is joined to the lens, see bstcad.mounted.  draft: draft angle (degrees) of the outer walls, which
+        lean inwards to the front, from 0.1 mm below the back's rim or from the body; walls of holes stay along z.
+        bevel: height along z (mm) of a bevel at 45 degrees on the edge between walls and front.  SceneError if a wire
+        is open, crosses itself or another wire, or leaves the lens, if the body does not fit, or if walls would meet.
         """
         return self._named_solid(trim, holes, body, (draft, bevel)).solid
 
@@ -175,7 +175,7 @@ class Design:
     ) -> Path:  # fmt: skip
         """Write the `solid` of these arguments as STEP, with named faces and the scene's [part]; return the path.
 
-        The control points are written with all digits, which cadquery's own export rounds.  The file states area,
+        The control points have all digits; cadquery's own export would round them.  The file states area,
         volume and centroid, unless the body has freeform faces, for which OCC would take minutes.
         """
         from bstcad.cad import solid_properties, step_writing
@@ -197,10 +197,10 @@ class Design:
             return mounting.mounted(body, [mounting.PlacedLens(self.lens, trim, holes, draft=Draft(*walls))])
 
     def preview(self, control_points: int = 33) -> Any:
-        """Return a coarse copy of the solid for viewers: CQ-editor's show_object, a notebook's cell.
+        """Return a coarse copy of the solid for viewers, such as show_object of CQ-editor or a notebook's cell.
 
-        control_points: number of control points along the longer side of its back.  The copy is a cadquery.Solid for
-        display only, not for manufacture.
+        control_points: number of control points along the longer side of the copy's back.  The copy is a cadquery.Solid
+        for display only, not for manufacture.
         """
         from bstcad.cad.solid import coarse_copy, lens_solid
 
@@ -223,7 +223,7 @@ class Design:
     def export(self, *kinds: str, points: int | None = None) -> list[Path]:
         """Write additional files, by names such as "zemax", into the folder of the design; return their paths.
 
-        points: number of grid points along the wider side (default: number of control points; for OpticStudio, of
+        points: number of grid points along the wider side (default: number of control points; for "zemax", of
         knots).  SceneError if a name is unknown or the design has not been written.
         """
         return commands.export(self._own_folder(), kinds, points).paths
@@ -232,17 +232,17 @@ class Design:
         self, folder: AnyPath, *, progress: bool = True, effort: Effort | None = None,
         checks: Sequence[OwnCheck] = (), sections: Sequence[OwnSection] = (),
     ) -> Report:  # fmt: skip
-        """Write the folder as `bstcad generate` does, replace an earlier one, verify its files, and return the report.
+        """Write the files as `bstcad generate` does, in place of an earlier design, verify them, and return the report.
 
-        checks: functions of the verification's results (bstcad.verify.checks.Proof: lens, light, shape …) and of the
-        folder that return bstcad.Check records, which become part of the verdict.  sections: functions of the report's
-        record that return (heading, HTML) for report.html.  SceneError if the folder contains other files.
+        effort: limits of the verification; None: bstcad.Effort().  checks: functions of (proof, folder) that return
+        bstcad.Check records for the verdict; proof: verify.checks.Proof (lens, light, shape …).  sections: functions of
+        report.record.Contents that return (heading, HTML) for report.html.  SceneError if `folder` has other files.
         """
         folder = Path(folder).expanduser()
         files.check_free(folder)
         folder.parent.mkdir(parents=True, exist_ok=True)
         with files.exclusive(folder), progresses.for_script(progress) as shown:
-            limit = self.scene.tailoring.max_time if self.report is None else None  # limit for a new design only
+            limit = self.scene.tailoring.max_time if self.report is None else None  # only for a new design
             self._made = self._made.with_report_data()
             options = ProofOptions(effort, checks=checks, sections=sections, limit=limit)
             self.report = commands.write(self._made, folder, options, shown)
@@ -257,9 +257,9 @@ class Design:
         """Verify the design from its files and write its report again; without files, temporary files are used.
 
         measured: file of points of a made part (CSV, PLY or STL; mm), which is also verified, see Report.measured.
-        folder: folder for the report, figures and deviation map alone; the files of the design are not changed.
+        folder: folder for report, figures and deviation map of the made part; the design's folder is not changed.
         against: independent programs that also trace the design, "batoid" and "mitsuba", or your own judge
-        (bstcad.judges.comparison.OwnJudge).  All three need a written design.  checks, sections: see `write`.
+        (bstcad.judges.comparison.OwnJudge).  All need a written design.  effort, checks, sections: see `write`.
         """
         options = ProofOptions(effort, checks=checks, sections=sections)
         cloud, place = (Path(path).expanduser() if path else None for path in (measured, folder))
@@ -281,9 +281,9 @@ class Design:
     ) -> dict[str, Any]:  # fmt: skip
         """Study the tolerances of manufacture, mounting and source; write tolerance.json and return its entries.
 
-        grade: "moulded", "diamond-turned" or "precise", for errors without a tolerance in the scene.  wanted: yield
-        (0 to 1) for which the loosest tolerances are computed.  workers: number of processes for the traces; a script
-        that uses it needs `if __name__ == "__main__":`.  scheduler: address of a dask scheduler whose workers trace.
+        grade: "moulded", "diamond-turned" or "precise", for errors that no [[tolerance]] names; None: as in the scene.
+        wanted: yield (0 to 1) for which the loosest tolerances are computed.  workers: number of processes for the
+        traces, with which a script needs `if __name__ == "__main__":`.  scheduler: address of a dask scheduler instead.
         """
         from bstcad.tolerance.study import StudySettings  # loaded late, as in commands.tolerance
 
@@ -299,8 +299,8 @@ class Design:
     def picture(self, png: AnyPath | None = None, *, target: int = 0) -> np.ndarray:
         """Return the light on a target as a viewer at target.seen_from sees it: sRGB grey (rows, columns), uint8.
 
-        Each pixel of the target is a pixel of the picture; white is the end of the report's scale.  The light is from
-        the verification, or before it from a trace with fewer flux tubes.  png: file to write.  target: index, from 0.
+        Each pixel of the target is a pixel of the picture; white is the upper end of the report's scale.  The light is
+        from the verification, or else from a trace of few flux tubes.  png: file to write.  target: index, from 0.
         """
         wanted = self._made.goals
         if not 0 <= target < len(wanted):
@@ -313,7 +313,7 @@ class Design:
         return grey
 
     def _has_files(self) -> bool:
-        return self.folder is not None and (self.folder / "lens.step").exists()  # it may contain only the design
+        return self.folder is not None and (self.folder / "lens.step").exists()  # a kept design has none
 
     def _own_folder(self) -> Path:
         """Return the folder with the files of this design; SceneError if there is none."""
@@ -358,7 +358,7 @@ class Design:
         return f"RRMSD {number(values[-1])} as tailored; not verified yet" if values else "not verified yet"
 
     def _irradiance(self, number: int = 0) -> np.ndarray:
-        """Return the flux per pixel on a target (rows, columns), verified or a preview, scaled to the target's sum."""
+        """Return the flux per pixel (rows, columns) on target[number], with the target's sum, verified or a preview."""
         if self.report is not None:
             return self.report.irradiances[number]
         goal = self._made.goals[number]
@@ -369,7 +369,7 @@ class Design:
 def _adapted(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
     """Return (scene, lens): the scene with the front and the net of a user's lens, and the lens in float64 on the CPU.
 
-    front: front of the current lens; with an equal front the scene is unchanged.  SceneError if the lens does not fit.
+    front: front of the current lens; for an equal front the scene keeps its own.  SceneError if the lens does not fit.
     """
     if not (isinstance(lens, Lens) and isinstance(getattr(lens.back, "heights", None), torch.Tensor)):
         given = type(lens.back if isinstance(lens, Lens) else lens).__name__
@@ -393,12 +393,12 @@ def _adapted(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
         lens = lens.with_front(_on_net(lens.front_net, flat.front_net, "front"))
     elif not same_front(lens.front, front):
         scene = scene.changed({"lens.front": lens.front})
-        lens = lens.with_front(scene.lens.front_surface)  # the scene fits a net to a surface class of the user
+        lens = lens.with_front(scene.lens.front_surface)  # a net, if the front is of a user's class
     return scene, scene.assembled(replace(lens, back=back, index=scene.index))
 
 
 def _on_net(face: BSplineSurface, net: BSplineSurface, name: str) -> BSplineSurface:
-    """Return a face with the exact ends of the scene's net; SceneError if heights are not finite or ends differ."""
+    """Return a face with the exact ends of `net`; SceneError if its heights are not finite or its ends differ."""
     if not bool(torch.isfinite(face.heights).all()) or not math.isfinite(face.z):
         raise SceneError(f"with_lens: the {name} has heights that are not finite; give finite numbers in mm")
     for axis, own, theirs in (("x", face.x, net.x), ("y", face.y, net.y)):
@@ -421,7 +421,7 @@ def mounted(
     body: cadquery solid, or a Workplane with one solid, from which the shape of each lens is cut.  Around each lens it
     must be a plate between two planes z = const.  placed: pairs of a design (or bstcad.Lens) and the position of the
     origin of its scene in the body, (x, y) or (x, y, z) in mm.  trim, holes, draft, bevel: for each lens, as in
-    Design.solid.  SceneError if the body does not surround a lens, or a plane cuts the rim of a face.
+    Design.solid.  SceneError if the body does not surround a lens, or its planes cut the rim of an optical face.
     """
     from bstcad.cad import mounting
     from bstcad.cad.walls import Draft

@@ -1,6 +1,6 @@
 """The command line; each command calls a function of bstcad.commands, bstcad.sweep or bstcad.scene.
 
-Exit codes: 0 every check passed, 1 lens written but a check failed, 2 wrong input.
+Exit codes: 0 every check passed, 1 lens written but a check failed, 2 wrong input, 70 fault of bstcad, 130 Ctrl-C.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from bstcad import __version__
 from bstcad.runs import signals
 
-with signals.exit_on_signal():  # these libraries load for a quarter of a second
+with signals.exit_on_signal():  # loading these libraries takes a quarter of a second
     import typer
     import typer.core
     from rich.console import Console
@@ -39,11 +39,11 @@ if TYPE_CHECKING:
     from bstcad.scene.scene import Scene
     from bstcad.sweep.batch import BatchScene
 
-START_TIME = time.perf_counter()  # before the large libraries load, since their time counts
+START_TIME = time.perf_counter()  # start of the times in reports, which include the loading of the large libraries
 INTERRUPTED, INTERNAL_ERROR = 130, 70  # exit codes after Ctrl-C and after a fault of bstcad
 NOTHING_KEPT = "there was no lens yet, and nothing is kept"  # message of generate after Ctrl-C
 NOTHING_MORE = "nothing more is written"  # message of the other commands after Ctrl-C
-TERMINAL_INTERVAL, FILE_INTERVAL = 1.0, 30.0  # interval of a sweep's progress lines (s)
+TERMINAL_INTERVAL, FILE_INTERVAL = 1.0, 30.0  # pause (s) before a sweep repeats an unchanged progress text
 EXPORT_NAMES = ", ".join(files.EXPORTS)
 COMMAND_SYNONYMS = {  # wrong word -> command to suggest
     **dict.fromkeys(("design", "make", "run", "build", "create", "optimise", "optimize"), "generate"),
@@ -60,7 +60,7 @@ class _Commands(typer.core.TyperGroup):
     """Group of the commands, with a hint if the user types another word or only a file."""
 
     def invoke(self, context: Any) -> Any:
-        """Run the command; for Ctrl-C typer would keep only the exit code."""
+        """Run the command; raise Interrupted for Ctrl-C, for which typer would only set the exit code."""
         try:
             return super().invoke(context)
         except KeyboardInterrupt as error:
@@ -106,8 +106,8 @@ def _bstcad(context: typer.Context, version: Version = False) -> None:
 def loading() -> Iterator[None]:
     """Load libraries in the block: signals end this process at once, and the garbage collector is off.
 
-    The libraries are a million permanent objects.  Collections during the load would take half a second, and later
-    collections can skip them.
+    The libraries create a million permanent objects.  Garbage collections during the load would take half a second,
+    and later collections can skip these objects.
     """
     with signals.exit_on_signal():
         gc.disable()
@@ -136,7 +136,7 @@ def user_path(path: str | Path) -> Path:
 
 
 def design_folder(path: str | Path) -> Path:
-    """Return the path of an existing folder or file."""
+    """Return the path of an existing folder or file, with ~ expanded; SceneError if there is none."""
     path = user_path(path)
     if not path.exists():
         raise SceneError(f"{path}: no such folder; give a design's folder, such as outputs/thu")
@@ -151,7 +151,7 @@ def load_scene(path: Path, settings: list[str] | None, quality: str | None = Non
 
 
 def overrides(settings: list[str] | None, quality: str | None) -> dict[str, Any]:
-    """Return the changes of a scene on the command line, by key."""
+    """Return the values that --set and --quality give to a scene, by dotted key."""
     found: dict[str, Any] = {}
     for setting in settings or []:
         key, equals, value = setting.partition("=")
@@ -174,7 +174,7 @@ def note_on_stderr(line: str) -> None:
 
 @contextlib.contextmanager
 def slow_progress() -> Iterator[progress.ProgressFunction]:
-    """Show the progress of a sweep, at least once every TERMINAL_INTERVAL on a terminal, FILE_INTERVAL in a file."""
+    """Show a sweep's progress: new text at once, repeated text after TERMINAL_INTERVAL, or FILE_INTERVAL in a file."""
     terminal = Console(stderr=True)
     with progress.watch(terminal) as watched:
         yield progress.Throttled(watched, TERMINAL_INTERVAL if terminal.is_terminal else FILE_INTERVAL)
@@ -233,11 +233,11 @@ AsJson = option(bool, None, "Print the result as JSON, for programs.", "--json")
 Name = argument(str | None, "NAME", "Name of the scene; NAME.toml is written.")
 Picture = option(Path | None, "FILE", "Picture that the plate projects on a wall.")
 Light = option(str | None, "L", "Light source of the plate: sun, laser, lamp or led (default: laser).")
-Size = option(str | None, "MM", "Size of the plate: 80, 80x60 (width x height) or 120xphoto (as the photo).")
+Size = option(str | None, "MM", "Size of the plate: 80, 80x60 (width x height) or 120xphoto (shape of the photo).")
 Distance = option(str | None, "MM", "Distance of the wall (default: 5 times the size; for the sun 2.5 times).")
 Template = option(str | None, "T", "Copy this template instead; see --list.")
 Listed = option(bool, None, "List the templates.", "--list")
-Opened = argument(Path | None, "SCENE|DIR", "Scene file, folder of a design, or folder of both.", parser=user_path)
+Opened = argument(Path | None, "SCENE|DIR", "Scene file, design's folder, or folder of both.", parser=user_path)
 Port = option(int, "N", "Port on this machine (0: any free port).", min=0, max=65535)
 Browser = option(bool, None, "Open the page in the browser.", "--browser/--no-browser")
 Written = argument(Path, "DIR|STEP", "Folder of a design, or a single STEP file.", parser=design_folder)
@@ -251,9 +251,9 @@ Yield = option(float | None, "P", "Find the loosest tolerances with this yield (
 Seed = option(int, "N", "Seed of the random trials.", min=0)
 Trial = option(int | None, "N", "Write only the lens of this trial, as trial-N.step.", min=0)
 Kinds = option(str | None, "NAMES", f"Kinds of files, separated by commas: {EXPORT_NAMES}.", "--as")
-Points = option(int | None, "N", "Points along the longer side of a grid (default: control points; zemax: its knots).")
-Png = path_option("FILE", "Picture to write.", "--png", "-o")
-ReachPng = path_option("FILE", "Picture of the target and of the area that light can reach (second: FILE_2).", "--png")
+Points = option(int | None, "N", "Points along the longer side (default: number of control points; zemax: of knots).")
+Png = path_option("FILE", "PNG file to write.", "--png", "-o")
+ReachPng = path_option("FILE", "PNG of the target and of the area that light can reach (target[1]: FILE_2).", "--png")
 Budget = option(
     float,
     "S",
@@ -282,7 +282,7 @@ def generate(
 ) -> int:  # fmt: skip
     """Design a lens for a scene, write it, and verify the written files."""
     with loading():
-        processes.begin()  # both processes load their libraries at the same time
+        processes.begin()  # this process and the second one load their libraries at the same time
         wanted = load_scene(scene, settings, quality)
     folder = output or user_path(Path("outputs") / wanted.name)
     files.check_free(folder)
@@ -462,7 +462,7 @@ def tradeoff(
     scene: SceneFile, budget: Budget = 600.0, output: Output = None, settings: Settings = None, quality: Quality = None,
     scheduler: Scheduler = None,
 ) -> int:  # fmt: skip
-    """Measure accuracy against time: design a scene with one setting varied at a time; continue a stopped sweep."""
+    """Measure accuracy against time by designs of a scene with changed settings; a stopped sweep is continued."""
     if not 0 < budget < 1e7:
         raise SceneError(f"--budget {budget:g}: is not between 0 and 1e7; give the seconds for all runs, such as 600")
     with loading():

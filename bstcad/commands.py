@@ -63,11 +63,11 @@ from bstcad.verify.verdict import Check, verdict
 if TYPE_CHECKING:
     from bstcad.tolerance.study import StudySettings
 
-# Seconds reserved for the report in a run with a time limit, and smallest time for the rays of the verification.
+# In a run with a time limit: time reserved for the report, and smallest time for the rays of the verification (s).
 REPORT_TIME, MIN_RAY_TIME = 2.0, 0.5
 
 Drawing = Callable[..., Pictures]  # class of drawings, called with (scene, submit); NoPictures draws no figures
-# Additions of a script to a report: checks, from a proof and the folder of its files; section (heading, HTML).
+# Functions of a script that add to a report: checks, from (proof, folder of the files), or a section (heading, HTML).
 OwnCheck = Callable[[Proof, Path], Iterable[Check]]
 OwnSection = Callable[[Contents], tuple[str, str]]
 
@@ -77,7 +77,7 @@ class ProofOptions:
     """Options of a verification and of its report."""
 
     effort: Effort | None = None  # effort of the verification; None: measure.FULL
-    drawing: Drawing | None = None  # draws the figures of the report; None: Pictures
+    drawing: Drawing | None = None  # class that draws the figures of the report; None: Pictures
     checks: Sequence[OwnCheck] = ()  # additional checks
     sections: Sequence[OwnSection] = ()  # additional sections of report.html
     limit: float | None = None  # largest time of design and verification together (s; `write` only); None: no limit
@@ -108,7 +108,7 @@ def generate(
         if resume and state is None:
             keeper.say("there is no checkpoint; the design starts from the beginning")
         if not resume and keeper.path.exists():
-            keeper.say("a stopped design is here; the design starts from the beginning, since --resume is not given")
+            keeper.say("there is a checkpoint; the design starts from the beginning, since --resume is not given")
         with _checkpoint_on_error(keeper, refused=(SceneError,)), signals.stop_on_interrupt() as wished:
             hooks = replace(hooks, save=keeper, interrupted=wished)
             found = design(scene, device=device, hooks=hooks, began=began, start=state)
@@ -131,7 +131,7 @@ def with_default_net(scene: Scene, say: Callable[[str], None] = lambda line: Non
 
 
 def output_folder(folder: Path, stopped: str) -> Path:
-    """Return the folder to which a design is written: a stopped design never replaces a finished design."""
+    """Return `folder`, or FOLDER-unfinished for a design stopped by Ctrl-C that would replace a finished one."""
     if stopped != "interrupt" or not (folder / "report.json").exists():
         return folder
     if record.making(folder / "report.json").stopped == "interrupt":
@@ -161,7 +161,7 @@ def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), prog
         order = _order(made, proof.shape, building)
         drawn.sheet(_sheet(made, proof, figures_of(made.goals, proof.lights), irradiances[0], order=order))
         progress("report", 0, 1, "")
-        estimates = _left_out(made, proof)  # at the same time the pictures are drawn
+        estimates = _left_out(made, proof)  # while the second process draws the pictures
         drawn.result()
         made = replace(made, making=made.making.with_stages(StageRecord("report", time.perf_counter() - proven)))
         contents = replace(_contents(made, proof, estimates), order=order)
@@ -248,7 +248,7 @@ def _checkpoint_on_error(keeper: Keeper, refused: tuple[type[Exception], ...] = 
 
 @contextlib.contextmanager
 def _second_process_ended() -> Iterator[None]:
-    """End the second process after an error, since this process may still write to a folder that will be removed."""
+    """End the second process after an error, as that process may still write to a folder that will be removed."""
     try:
         yield
     except BaseException:
@@ -286,10 +286,10 @@ def verify(
             raise SceneError(f"{path}: a STEP file states no light, so it has no picture; give the design's folder")
         return examine(path)
     if place is not None and measured is None:
-        raise SceneError(f"{place}: is for the report of a made part; give the part's points with --measured CLOUD")
+        raise SceneError(f"{place}: this folder is only for the report of a made part; give its points with --measured")
     with folders.amending(path, place) as amended:
         made = read(path)
-        with scene_errors():  # before the slow steps
+        with scene_errors():  # reads the cloud first, since the next steps are slow
             cloud, part = clouds.load(measured, made.lens.apertures[1]) if measured else None, None
         with (options.drawing or Pictures)(made.scene, processes.submit) as drawn:
             with scene_errors(f"{path}: "):
@@ -351,7 +351,7 @@ def read(folder: Path) -> Made:
 
 
 def _name_of(cloud: Cloud, folder: Path) -> str:
-    """Return the subfolder of measured/ for a cloud: the name of its file, numbered if another has this name."""
+    """Return the name of a cloud's subfolder of measured/: its file's name, numbered if another cloud has the name."""
     stem = re.sub(r"[^\w.-]", "_", cloud.path.stem).strip(".") or "cloud"
     for k in itertools.count(1):
         name = stem if k == 1 else f"{stem}-{k}"
@@ -384,7 +384,7 @@ def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
     try:
         job = mount and path.is_file() and processes.submit(prescription.measured, path)
         found = processes.result(job, checks.time_limit(path)) if job else None
-    except (BrokenExecutor, ValueError, processes.Overdue):  # damaged part, see its check: order the lens
+    except (BrokenExecutor, ValueError, processes.Overdue):  # the part is damaged, as its check states
         found = None
     return prescription.order_of(made.scene, made.lens, shape, folder, found=found)
 
@@ -497,7 +497,7 @@ def show(folder: Path, png: Path | None) -> None:
 
 
 def light_path_in(folder: Path) -> LightPath:
-    """Return the lens in a folder, rays through this lens, and their pictures.  SceneError if no light arrives."""
+    """Return the lens in a folder, rays through it, and the pictures of the targets.  SceneError: no light arrives."""
     scene, nominal = folders.read_nominal(folder)
     wanted, irradiances = (goal.picture for goal in nominal.goals), folders.read_irradiances(folder, scene)
     path = light_path_of(scene, nominal.lens, [*zip(wanted, irradiances, strict=True)])

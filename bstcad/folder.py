@@ -87,8 +87,8 @@ def same_front(one: Surface, other: Surface) -> bool:
 # --- estimates of file sizes ------------------------------------------------------------------------------------------
 
 LARGE_STEP = 100e6  # smallest size of lens.step that is printed before a design (bytes)
-BYTES_PER_POINT = 83  # bytes of a control point's STEP statement and of a reference to it, without the two numbers
-OTHER_BYTES = 103_000, 1600  # bytes of all other statements: constant part, and per control point along a side
+BYTES_PER_POINT = 83  # bytes of a control point's STEP statement and of a reference to it, without #number in both
+OTHER_BYTES = 103_000, 1600  # bytes of all other statements: constant part, and part per control point of a side
 
 
 def step_size(scene: scenes.Scene, net: Sides | None = None) -> float:
@@ -180,8 +180,8 @@ def _flush(path: Path) -> None:
 def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
     """Yield a temporary folder whose files are moved to a design's folder when the block ends without an error.
 
-    place: folder for the report of a made part; then the temporary folder replaces this folder instead, and SceneError
-    if it contains other files.  SceneError, and nothing is written, if the design in `folder` has changed meanwhile.
+    place: folder for the report of a made part, which the temporary folder replaces instead; SceneError if `place` has
+    other files.  If the design in `folder` has changed meanwhile, SceneError is raised and nothing is written.
     """
     if place is not None:
         files.check_free(place, files.MADE_PART_FILES, "a made part's")
@@ -193,8 +193,8 @@ def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
             if _stamps(folder) == before:
                 raise
         if _stamps(folder) != before:
-            changed = "the design was replaced during the verification, so nothing is written"
-            raise SceneError(f"{folder}: {changed}; verify it again")
+            changed = "the design was replaced during this command, so nothing is written"
+            raise SceneError(f"{folder}: {changed}; run the command again")
         for path in sorted(Path(building).rglob("*")) if place is None else ():
             if path.is_dir():
                 files.folder_in_place(folder / path.relative_to(building))
@@ -203,7 +203,7 @@ def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
 
 
 def _stamps(folder: Path) -> list[tuple[object, ...]]:
-    """Return device and inode of the folder and of each file of PROVEN, and the size and time of the files."""
+    """Return device and inode of a folder and of its files in PROVEN, and the files' sizes and modification times."""
     found: list[tuple[object, ...]] = []
     for path in (folder, *(folder / name for name in PROVEN)):
         with contextlib.suppress(OSError):
@@ -237,7 +237,7 @@ def write_geometry(design: Made, folder: Path, submit: Submit = run_here) -> Cal
     """
     scene, lens = design.scene, design.lens
     stated = scene.name, scene.part.of(scene.lens)
-    sums = quadrature.of_lens(lens)  # in this process, whose kernels are loaded
+    sums = quadrature.of_lens(lens)  # computed in this process, which has loaded the kernels
     written = [submit(jobs.write_lens, lens, (folder / "lens.step").absolute(), *stated, sums)]
     if mount := scene.mount:
         written.append(submit(jobs.write_part, lens, mount, (folder / PART).absolute(), *stated))
@@ -276,8 +276,8 @@ def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) 
     it is absent if light can reach all bright pixels.
     Transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target, and transport_back
     or transport_entrance (c, r, 2), the points x, y (mm) where the light for (transport_x, transport_y) meets the last
-    tailored face (the back; the front if only the front is tailored, or for a mirror behind glass), or the plane of
-    the first vertex.
+    tailored face (the back; the front if only the front is tailored, or for a mirror behind glass), or the plane z =
+    const through the vertex of the first face.
     """
     lens, sent = design.lens, design.transport
     (m, n), front = lens.back_net.shape, lens.front
@@ -427,7 +427,7 @@ def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
 
 
 def _surface(net: np.ndarray, z: float) -> BSplineSurface:
-    """Return the surface of a control net (m, n, 3) in mm, to the last bit; heights from z if exact, else from 0."""
-    if not np.array_equal(z + (net[..., 2] - z), net[..., 2]):  # rounding would change the control points
+    """Return the surface of a control net (m, n, 3) in mm, to the last bit; its z is 0 if `z` would cause rounding."""
+    if not np.array_equal(z + (net[..., 2] - z), net[..., 2]):  # heights relative to z would be rounded
         z = 0.0
     return BSplineSurface.from_control_points(net, z)

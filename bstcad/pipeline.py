@@ -1,7 +1,7 @@
 """The stages of a design in order, from the blank of a scene to the tailored lens.
 
 Stage 1 comes first, then stage 2.  For a source of finite size stage 3 replaces stage 2 (`second_stage`); only the
-paper's procedure, which is for point sources, runs stage 2 before it.
+paper's procedure, which is for point sources, runs stage 2 before stage 3.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ from bstcad.transport.mapping import Mapping, TransportMap
 PROCEDURES: dict[str, tuple[str, Stage, Stage]] = {  # tailoring.method -> (name of stage 1, stage 1, stage 2)
     "least-squares": ("stage 1", stage1.steps, stage2.steps),
     "adam": ("stage 1", paper.stage1, paper.stage2),
-    "integration": ("integration", integration.steps, stage2.steps),  # with no evaluations in stage 2
+    "integration": ("integration", integration.steps, stage2.steps),  # stage 2 makes no evaluation
 }
 Stage1State = stage1.SlopeRound | paper.Level | two_faces.FrontRound
 Stage2State = stage2.TubeSearch | paper.RaySearch | stage2.Stage3State
-SOLUTION_SIGNS = {"convex": 1.0, "concave": -1.0}  # sign σ (light_behind.py) for each tailoring.solution
+SOLUTION_SIGNS = {"convex": 1.0, "concave": -1.0}  # sign σ (tailoring/light_behind.py) for each tailoring.solution
 DEVICES = ("auto", "cpu", "cuda")
 COMPARISON_STAGE = "float32 beside float64"  # name of the stage that compares precisions
 # Seconds for writing, verification and report on two cores: constant part, per net of 513 x 513 control points, per
@@ -141,7 +141,7 @@ def design(
     driver = Driver(hooks, began, limit=limit, reserve=reserved, record=start.record)
     precision = getattr(torch, knobs.precision)
     lens = scene.flat_lens(knobs.levels[0], as_wide_as=knobs.levels[-1]).to(precision, device)
-    if not scene.lens.back.optimise:  # no stage refines it
+    if not scene.lens.back.optimise:  # no stage refines a back that stays flat
         lens = lens.with_back(lens.back_net.refined(scene.lens.back.net))
     if fresh:
         driver.end("loading")  # loading of the libraries, the scene and its files
@@ -166,7 +166,7 @@ def design(
 
 
 def within_reach(scene: Scene, progress: Progress) -> tuple[tuple[Goal, ...], Edge | None]:
-    """Return (goals, edge): the goals of a scene restricted to their reachable parts, and the light at the edge.
+    """Return (goals, edge): the goals of a scene restricted to their reachable parts, and the light at their edge.
 
     `progress` reports each target that light cannot reach completely.  SceneError as in `reachable_part`.
     """
@@ -196,7 +196,7 @@ def task_of(scene: Scene, goals: Sequence[Goal], knobs: ResolvedTailoring, edge:
 
 
 def with_solution(scene: Scene, task: Task) -> Task:
-    """Return the task with the solution, convex or concave, that requires less of two freeform faces.
+    """Return the task of two freeform faces with the stated solution, or else the better one (`find_demand`).
 
     `task.progress` reports the angles and limits of the faces.  SceneError if the faces cannot make the pictures.
     """
@@ -222,10 +222,10 @@ def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tu
 
 
 def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | None]:
-    """Return (part, edge) of a scene with one goal: True in the pixels (rows, columns) that light can reach, and Edge.
+    """Return (part, edge) of a goal: True in the pixels (rows, columns) that light can reach, and light at their edge.
 
-    (None, None): light can reach the whole picture.  edge is None for a mirror, whose reach is limited by slope alone.
-    SceneError if light can reach no part, or not all of a target with target.unreachable = "refuse".
+    scene: has no other goal.  (None, None): light can reach the whole picture.  edge is None for a mirror, whose reach
+    only slope limits.  SceneError if light can reach no part, or not all of a target with unreachable = "refuse".
     """
     if scene.lens.front.is_tailored:  # with two tailored faces `with_solution` finds the limits
         return None, None
@@ -261,7 +261,7 @@ def unreachable(scene: Scene, part: np.ndarray, picture: np.ndarray) -> str:
 def resolved(scene: Scene, lens: Lens) -> Scene:
     """Return the scene with the designed front as a fixed front, so that a new design gives the same lens.
 
-    A scene with the paper's procedure, or with a front that is tailored together with the back, is returned unchanged.
+    A scene with the paper's procedure, or without free parameters of the front, is returned unchanged.
     """
     if scene.tailoring.resolved(lens.back_net.shape).method == "adam":
         return scene
@@ -280,7 +280,7 @@ def check_front(lens: Lens, scene: Scene) -> None:
 
 
 def _with_comparison(making: DesignCourse, task: Task, lens: Lens, before: int) -> DesignCourse:
-    """Return the record with the comparison of precisions for the lens of stage 1, inserted after `before` stages."""
+    """Return the record with the comparison of precisions for the lens of stage 1, as stage number `before`, from 0."""
     began, cpu = time.perf_counter(), time.process_time()
     comparison = cast(PrecisionTest, asdict(compare_precisions(task, lens)))
     stage = StageRecord(COMPARISON_STAGE, time.perf_counter() - began, cpu_seconds=time.process_time() - cpu)
@@ -354,7 +354,7 @@ def _stage2(
 ) -> tuple[Lens, str]:
     """Run stage 2, or stage 3 for an extended source, from the result of stage 1 or from a state.
 
-    Return the lens and the reason why the stage ended.  No lens of stage 1 or of a part is better than this lens.
+    Return (lens, stopped): the last lens of the stage, or a better earlier one, and the reason why the stage ended.
     """
     if state is None and not driver.reason_to_interrupt:  # an interrupt leaves stage 1 incomplete: do not save it
         driver.hooks.save(DesignState(driver.record, followed=followed))
@@ -422,8 +422,8 @@ def _is_changed(lens: Lens, other: Lens) -> bool:
 def device_for(asked: str) -> str:
     """Return the device of tailoring, "cpu" or "cuda"; SceneError for an unknown or missing device.
 
-    "auto" is the CPU, for which the kernels are compiled.  On a GPU the plain form in torch runs; its accuracy and
-    speed have not been measured.
+    "auto" is the CPU, for which the kernels are compiled.  A GPU runs the same functions in torch; their accuracy and
+    speed there have not been measured.
     """
     if asked not in DEVICES:
         raise SceneError(f"device: {asked!r} is not possible; give one of {', '.join(DEVICES)}")
@@ -478,16 +478,16 @@ def require_bounded_light(scene: Scene, rrmsd: float) -> float:
 
 
 def check_thickness(lens: Lens, scene: Scene) -> None:
-    """Raise SceneError, before the long stage 2, if front and back cross or the back reaches the next part."""
+    """Raise SceneError, before the long stage 2, if front and back cross or the back reaches what follows the lens."""
     thinnest, thickest = thickness_range(lens.plain())
     if not thinnest > 0:
         raise SceneError(
-            f"lens.front.z: the back that this target needs would cross the front by {-thinnest:.3g} mm; "
+            f"lens.front.z: the back that the target needs would cross the front by {-thinnest:.3g} mm; "
             f"lower lens.front.z by more than this, widen the target, or make the lens smaller"
         )
     room, key = scene.clearance(reach := lens.front.z + thickest)
     if not room > 0:
         raise SceneError(
-            f"{key}: the back that this target needs would reach this part, since it extends to z = {reach:.4g} mm; "
-            f"move the part further along +z, or lower lens.front.z"
+            f"{key}: the back that the target needs would reach this position, as it extends to z = {reach:.4g} mm; "
+            f"increase {key}, or lower lens.front.z"
         )

@@ -1,6 +1,6 @@
 """A lens with a flange and three screw holes, as one part: python templates/flanged_lens.py outputs/disk
 
-The flange is ordinary cadquery; bstcad makes it one with the lens, whose optical faces stay those of the design.
+The flange is an ordinary cadquery solid; bstcad joins it to the lens, whose optical faces do not change.
 """
 
 import sys
@@ -12,7 +12,7 @@ import bstcad
 design = bstcad.open(sys.argv[1] if len(sys.argv) > 1 else "outputs/disk")
 box = design.solid().BoundingBox()
 front = design.lens.front.z  # mm; the flange lies a little above the rim of the front
-reach = max(box.xlen, box.ylen) * 0.5**0.5  # mm; of the lens's corners from its axis
+reach = max(box.xlen, box.ylen) * 0.5**0.5  # mm; distance of the lens's corners from its axis
 
 flange = (
     cq.Workplane("XY", origin=(0, 0, front + 0.5))
@@ -24,7 +24,7 @@ flange = (
     .faces(">Z")
     .workplane()
     .polarArray(reach + 3.5, 90, 360, 3)
-    .cboreHole(3.2, 5.0, 0.5)  # for M3 screws: diameter, that of the head's seat, and its depth (mm)
+    .cboreHole(3.2, 5.0, 0.5)  # for M3 screws: diameters of hole and counterbore, depth of the counterbore (mm)
 )
 part = design.solid(body=flange)
 

@@ -1,7 +1,7 @@
 """The insert of a mould that forms the back of a lens: python templates/mould_insert.py outputs/disk
 
-The negative of the freeform face, turned over so that it looks up, larger by what the plastic shrinks, on a round block
-with a shoulder.
+The insert is a round block with a shoulder.  On its top is the negative of the freeform face, enlarged by the shrinkage
+of the plastic.
 """
 
 import sys
@@ -12,10 +12,10 @@ import cadquery as cq
 import bstcad
 
 design = bstcad.open(sys.argv[1] if len(sys.argv) > 1 else "outputs/disk")
-shrinkage = 0.005  # of PMMA, of every length
-below, shoulder = 12.0, 4.0  # mm, of the block under the face, and of its wider foot
+shrinkage = 0.005  # relative shrinkage of PMMA in every direction
+below, shoulder = 12.0, 4.0  # mm; heights of the block below the face, and of its wider foot
 
-# (x, y, z) -> (x, -y, -z) turns the lens over about x; then the steel lies below the face that the plastic fills.
+# (x, y, z) -> (x, -y, -z) rotates the lens by 180 degrees about x, so that the steel is below the face.
 back, outline = design.lens.back, design.lens.outline
 net = (1 + shrinkage) * back.control_points()[:, ::-1] * (1, -1, -1)
 face = bstcad.BSplineSurface.from_control_points(net)

@@ -1,6 +1,6 @@
 """A lens for every picture in a folder: python templates/picture_folder.py templates/disk.toml photos outputs/photos
 
-One scene for all, the picture of each in its place; each lens gets a folder of its own.
+All lenses use one scene, in which each picture replaces the target's; each lens has its own folder.
 """
 
 import sys

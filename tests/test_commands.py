@@ -373,7 +373,7 @@ class TestVerify:
         monkeypatch.setattr(checks, "verify", meanwhile)
         code, out, err = run(capsys, "verify", folder)
         assert code == 2 and out == "" and err.count("\n") == 1
-        assert "the design was replaced during the verification, so nothing is written" in err
+        assert "the design was replaced during this command, so nothing is written" in err
         assert [contents(place) for place in places] == before
 
 

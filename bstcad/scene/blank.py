@@ -27,7 +27,7 @@ from bstcad.scene.schema import COORDINATES, LENGTHS, FileContent, OneOrTwo, Rec
 from bstcad.step_text import part21
 from bstcad.step_text.placement import own_frame
 
-if TYPE_CHECKING:  # which loads numba
+if TYPE_CHECKING:  # importing this module loads numba
     from bstcad.optics.bspline import BSplineSurface
 
 # Range of (1 + k) c² r² of a conic at the rim: at 1 its tangent is vertical; below the minimum it is nearly a cone.
@@ -36,17 +36,17 @@ MAX_FITTED_SLOPE = 60.0  # degrees; steepest slope at the rim of a surface to wh
 MAX_RECESS_SLOPE = 80.0  # degrees; steepest slope at the rim of a front with an outline of its own
 MIN_RECESS_SAG = 1e-3  # mm; smallest sag at the rim of a front with its own outline, so that there is an edge
 MIN_RECESS_GAP = 1e-2  # mm; smallest distance between the outlines of the front and of the lens
-CONIC_CONSTANTS = (-1e3, 1e3)
+CONIC_CONSTANTS = (-1e3, 1e3)  # range of conic constants
 CURVATURES = (-1e3, 1e3)  # range of curvatures, 1/mm
 INDICES = (1.01, 5.0)  # range of the refractive index
 BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # keys of LensBlank that bound tailored faces
 
-NET_FILE = "front.npz"  # file name of the copy of the net of lens.front.file, beside a design
+NET_FILE = "front.npz"  # file in a design's folder with the net that was read from lens.front.file
 NET_REMEDY = "give the folder of a design, its design.npz or its lens.step"
-MAX_AXIS_SINE = 1e-9  # sine of the largest angle between a net and the axes of a file that counts as 0
+MAX_AXIS_SINE = 1e-9  # sine of the largest angle between the sides of a net and the axes that counts as no rotation
 UNIFORM_TOLERANCE = 1e-9  # mm; largest deviation of a net from uniform spacing in x and y
 VERTEX_TOLERANCE = 1e-12  # mm; a net whose vertex is this near to z = 0 is not shifted
-MAX_CONTROL_POINTS = 2049
+MAX_CONTROL_POINTS = 2049  # largest number of control points along a side
 NET_SIZES = (MIN_SIDE, MAX_CONTROL_POINTS)  # range of the control points per side of a net
 FIT_TOLERANCE = 1e-6  # mm; largest distance between a fitted net and its surface (a toroid, or a user's class)
 FIT_SIZES = (33, 65, 129, 257, 513, 1025)  # control points per side of a fitted net, tried in this order
@@ -65,8 +65,8 @@ class FileNet(FileContent):
 
     name = NET_FILE
     shape: tuple[int, int]  # control points along x and along y
-    x: tuple[float, float]  # extent along x, mm, in the frame of the lens
-    y: tuple[float, float]  # extent along y, mm
+    x: tuple[float, float]  # ends along x, mm, in the frame of the lens
+    y: tuple[float, float]  # ends along y, mm
     data: bytes = field(repr=False)  # heights of the control points above the vertex, (m, n), mm, float64
 
     @classmethod
@@ -93,7 +93,7 @@ class FileNet(FileContent):
 
 
 def read_net(path: Path) -> FileNet:
-    """Read the back face of the design at `path`; SceneError if it is missing or damaged.
+    """Read the back face of a design from its folder, design.npz or lens.step; SceneError if missing or damaged.
 
     A face of a STEP file keeps its position in x and y; its shift along z is dropped.
     """
@@ -164,7 +164,7 @@ class _Front:
     kind: str
     optimise: bool | tuple[str, ...] = False
     outline: Circle | None = None
-    file: FileNet | None = None  # net of a freeform front, with which its tailoring starts
+    file: FileNet | None = None  # net of a freeform front, at which its tailoring starts if it is tailored
     control_points: Sides | None = None
     reflect: bool = False
 
@@ -290,7 +290,7 @@ class ConicFront(_Front):
 
 
 class _FittedFront(_Front):
-    """A front that the lens approximates by a net, with curvatures curvature_x and curvature_y."""
+    """A front that is approximated by a fitted net; its record has the keys curvature_x and curvature_y."""
 
     def traced(self, outline: Outline) -> Surface:
         """Return the net within FIT_TOLERANCE of the surface, its vertex at z."""
@@ -316,7 +316,7 @@ class ToroidFront(_FittedFront):
     z: Annotated[float, VERTEX_Z]
     curvature_x: Annotated[float, Key("Curvature along x; positive: bent towards +z.", "1/mm", *CURVATURES)] = 0.0
     curvature_y: Annotated[float, Key("Curvature along y; positive: bent towards +z.", "1/mm", *CURVATURES)] = 0.0
-    kind: Annotated[Literal["toroid"], Key("A toroid, curved along x and y; a cylinder if one is 0.")] = "toroid"
+    kind: Annotated[Literal["toroid"], Key("A toroid; a cylinder if one curvature is 0.")] = "toroid"
 
     __pydantic_config__ = STRICT
 
@@ -395,7 +395,7 @@ FRONTS: dict[str, tuple[type[Any], Callable[..., Any]]] = {
 def as_front(value: Any, outline: Outline | None = None) -> Any:
     """Return the front of a scene for a surface of optics; return any other value as it is.
 
-    outline: outline of the lens, inside which a net is fitted to a surface of any other kind; None: ValueError.
+    outline: outline of the lens, for a net fitted to a surface of a kind that FRONTS does not have; None: ValueError.
     """
     if not hasattr(value, "relative_sag_and_slope"):
         return value
@@ -433,9 +433,9 @@ def fit_net(surface: Surface, outline: Outline) -> BSplineSurface:
 def net_extent(outline: Outline, net: Sides) -> tuple[float, float]:
     """Return half the width of a net in x and y (mm), so that it extends two spans past the rim of the lens.
 
-    Then x(t) is linear inside the rim.  In the end spans x(t) is quadratic, and the slope z'(t) / x'(t) a Möbius
-    function of t: its derivative grows eightfold inwards across 1.5 control points, for any heights.  The rim of the
-    light would be too bright, with a dark line beside it.  A net of 5 control points has no spans to spare.
+    Then x is linear in the spline parameter t inside the rim.  In the end spans x(t) is quadratic; d/dx of the slope
+    z'(t) / x'(t) grows eightfold inwards across 1.5 control points, for any heights.  With light there, the edge of the
+    picture would be too bright, with a dark line beside it.  A net of 5 control points per side ends at the rim.
     """
     reach = ((m - 1) / (m - 5) if m > 5 else 1.0 for m in as_pair(net))
     half_x, half_y = (factor * half for factor, half in zip(reach, outline.half_extent, strict=True))
@@ -443,7 +443,7 @@ def net_extent(outline: Outline, net: Sides) -> tuple[float, float]:
 
 
 def net_complaints(outline: Outline, points: Sides | None) -> Iterator[str]:
-    """Yield complaints about the control points of a net for a lens of this outline; None: they are chosen later."""
+    """Yield complaints about the number of control points of a net for a lens of this outline; None: chosen later."""
     m, n = as_pair(points or MIN_ROUND_POINTS)
     if outline.is_round and m != n:
         yield f"a round lens (lens.outline) needs a square net, not {m} x {n} control points; give one number"
@@ -493,7 +493,7 @@ class Back(Record):
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds on tailored faces everywhere inside the outline; None: unbounded.
+    """Bounds on tailored faces everywhere inside the outline; a field that is None is no bound.
 
     A tool cuts the back from +z and the front from -z; for the tool a valley is concave and a ridge convex.
     """
@@ -527,7 +527,7 @@ class LensBlank(Record):
 
     @property
     def passes(self) -> Passes:
-        """Sequence of the faces that light meets, and how each bends it."""
+        """Sequence of the faces that light meets, and whether each refracts or reflects."""
         return MIRROR if self.back.reflect else SECOND_SURFACE if self.front.reflect else LENS
 
     @property
@@ -576,14 +576,14 @@ class LensBlank(Record):
         return tuple(face for face in self.passes.faces if tailored[face])
 
     def front_net(self, net: Sides) -> Sides | None:
-        """Return the control points per side of a freeform front if the back has `net`; None without a net."""
+        """Return the control points per side of the front's net if the back has `net`; None if the front has no net."""
         if self.front.is_tailored:
             return self._tailored_front_net(net)
         fixed = _net_of(self.front.surface, self.outline) if isinstance(self.front, _FittedFront) else self.front.file
         return None if fixed is None else simplified(fixed.shape)
 
     def _tailored_front_net(self, net: Sides) -> Sides:
-        """Return the control points per side of a tailored front if the back has `net`, in the scene's ratio."""
+        """Return the control points per side of a tailored front: `net` of the back times the ratio in the scene."""
         own = self.front.file.shape if self.front.file else self.front.control_points
         if own is None:
             return net
@@ -617,7 +617,7 @@ class LensBlank(Record):
         return 2 * half_x / (m - 1), 2 * half_y / (n - 1)
 
     def doubts(self) -> Iterator[str]:
-        """Yield a doubt about oblong cells: square cells carry finer detail with the same number of control points."""
+        """Yield a warning about oblong cells: square cells give finer detail with the same number of control points."""
         if self.back.control_points is None:
             return
         (width, height), (m, n) = self.cells, as_pair(self.back.net)

@@ -1,6 +1,6 @@
 """Dotted keys of a scene file, such as lens.back.z or target[1].text, and how to set and find their values.
 
-A number in brackets counts the tables of a list from 0.  A single table is the same as a list of one.
+A number in brackets is the index of a table in a list, from 0.  A single table counts as a list of one table.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Step = tuple[str, int | None]
 
 
 def override(data: dict[str, Any], key: str, value: Any, shown: str) -> None:
-    """Set the value of a dotted key and remove its alternatives (ONE_OF); None removes it; shown: key in messages."""
+    """Set a dotted key of `data` and remove its alternatives (ONE_OF); None removes the key; shown: key in messages."""
     steps = []
     for part in key.split("."):
         if (match := STEP.fullmatch(part)) is None:
@@ -47,7 +47,7 @@ def override(data: dict[str, Any], key: str, value: Any, shown: str) -> None:
 
 
 def tables_at(node: Any, key: str, shown: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield (key, value) of a dotted key, once for each table of a list; nothing if it is not set."""
+    """Yield (key, value) of a dotted key below `node` (key: `shown`), once per table of a list; nothing if not set."""
     name, _, rest = key.partition(".")
     if isinstance(node, list):
         for k, part in enumerate(node):
@@ -74,7 +74,7 @@ def _inner(table: dict[str, Any], steps: Sequence[Step], shown: str) -> dict[str
     elif listed and inner:
         inner = inner[0]
     if not isinstance(inner, dict):
-        raise SceneError(f"{shown}: {name} is not a table; set all of it at once")
+        raise SceneError(f"{shown}: {name} is not a table; set the key {name} itself")
     return inner
 
 
@@ -90,7 +90,7 @@ def _set_table(table: dict[str, Any], name: str, number: int, value: Any, shown:
 def _tables(found: Any, name: str, shown: str) -> list[Any]:
     """Return the value of a key as a list of tables."""
     if not isinstance(found, dict | list):
-        raise SceneError(f"{shown}: {name} is not a table; set all of it at once")
+        raise SceneError(f"{shown}: {name} is not a table; set the key {name} itself")
     return [found] if isinstance(found, dict) else found
 
 

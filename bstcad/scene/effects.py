@@ -51,8 +51,7 @@ class Absorption(Record):
 class Ghost(Record):
     """Light reflected twice inside the lens, in verification.
 
-    A scene with a ghost also has `fresnel`, since its faces reflect: for bare faces and
-    unpolarised light unless the scene states other values.
+    The faces then reflect light: as `fresnel` states, or else as bare faces reflect unpolarised light.
     """
 
     kind: Annotated[Literal["ghost"], Key("Light reflected twice inside the lens, in verification.")]
@@ -78,13 +77,13 @@ class Own(Record):
 def effect(name: str, makes: LossFactory) -> Own:
     """Return an effect of your own for scene.changed({"effects": [...]}): a loss of flux at faces or in the glass.
 
-    makes(wavelength in nm) returns an object with a method share(cos_in, cos_out, path).  It returns the fraction of
+    makes(wavelength in nm) returns an object with a method share(cos_in, cos_out, path), which returns the fraction of
     each ray's flux that continues: a tensor of the shape of the arguments, differentiable in them.  cos_in and cos_out
-    are the cosines of incidence and of refraction (or reflection), path is the path before the face in mm.  The loss
-    acts at each face that light crosses or is reflected by; with the attribute in_glass = True it acts along the path
-    in the glass only.  The ledger counts the lost flux as "taken by NAME".  The scene file contains NAME.  A script
-    that opens such a design calls `effect` first; an installed package declares an entry point NAME = "module:makes"
-    of the group "bstcad.effects" instead.
+    are the cosines of the angles of incidence and of refraction (or reflection); path is the length (mm) of the ray
+    before the face.  The loss acts at each face that refracts or reflects light; if the object has the attribute
+    in_glass = True, it acts only along paths in the glass.  The ledger counts the lost flux as "taken by NAME".  The
+    scene file contains only NAME, so a script calls `effect` before it opens such a design; an installed package
+    declares an entry point NAME = "module:makes" of the group "bstcad.effects" instead.
     """
     _REGISTERED[name] = makes
     return Own(kind="own", name=name)
@@ -101,7 +100,7 @@ OneEffect = TypeVar("OneEffect", bound=Record)
 
 
 def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
-    """Yield complaints about effects named twice, impossible for the lens or the mirror, or without data."""
+    """Yield complaints about effects that are named twice, impossible for this optic, or without data."""
     for k, effect in enumerate(effects):
         key, glass = f"effects[{k}]", lens.passes.enters
         if any(_name(effect) == _name(other) for other in effects[:k]):
@@ -135,7 +134,7 @@ def find_effect(effects: Effects, kind: type[OneEffect]) -> OneEffect | None:
 
 
 def reflection_of(effects: Effects) -> Fresnel | None:
-    """Return the reflection of the scene: of bare faces if it has only a ghost; None if it has neither effect."""
+    """Return the reflection of a scene: of bare faces if only a ghost is stated; None without either effect."""
     bare = Fresnel(kind="fresnel") if find_effect(effects, Ghost) else None
     return find_effect(effects, Fresnel) or bare
 
@@ -150,7 +149,7 @@ def ghost(effects: Effects) -> GhostTracer | None:
 
 
 def losses(effects: Effects, lens: LensBlank, wavelength: float) -> Losses | None:
-    """Return the losses at a wavelength (nm); None if there are none, and then their module is not loaded.
+    """Return the losses at a wavelength (nm); None without loading optics.losses if there are none.
 
     Raises ValueError, in one sentence, if the data of the material do not suffice.
     """

@@ -59,7 +59,7 @@ class Window(Record):
         return self.curvature
 
     def complaints(self, key: str) -> Iterator[str]:
-        """Yield the faults of the table; key: key of the table."""
+        """Yield the faults of the table; key: dotted key of the table."""
         if (self.material is None) == (self.index is None):
             yield f'{key}: needs exactly one of material and index; give for example material = "N-BK7"'
         lower, upper = self.faces()
@@ -73,7 +73,7 @@ class Window(Record):
         return _tilted_faces(self, self.z + self.thickness / 2)
 
     def interfaces(self, sense: int, wavelength: float) -> tuple[Interface, ...]:
-        """Return the faces in the order of light along sense · z, at a wavelength (nm)."""
+        """Return the faces in the order in which light along sense · z (sense 1 or -1) meets them; wavelength in nm."""
         n = stated_index(self.material, self.index, wavelength)
         pairs = zip(self.faces()[::sense], (Refract(1.0, n), Refract(n, 1.0)), strict=True)
         return tuple(Interface(face, self.outline, law, Status.BLOCKED) for face, law in pairs)
@@ -137,9 +137,9 @@ def turns(elements: Sequence[Window | Mirror]) -> int:
 
 
 def interfaces(elements: Sequence[Window | Mirror], sense: int, wavelength: float) -> tuple[Interface, ...]:
-    """Return the interfaces of the elements for light along sense · z at a wavelength (nm).
+    """Return the interfaces of the elements for light that starts along sense · z (sense 1 or -1); wavelength in nm.
 
-    Light outside their outlines is BLOCKED; before the lens, `Scene.around` counts it as missing the lens.
+    The status of light outside their outlines is BLOCKED; `Scene.around` changes it to MISSED_FRONT before the lens.
     """
     found: list[Interface] = []
     for element in elements:

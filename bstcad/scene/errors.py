@@ -25,9 +25,9 @@ NOT_BUILT = {  # unknown word for a feature that bstcad does not have yet: begin
     **dict.fromkeys(("diffraction", "coherent", "interference"), "wave optics is"),
     **dict.fromkeys(("scatter", "scattering", "bsdf", "haze"), "scattering is"),
 }
-# Key of a single target at the beginning of a sentence or inside it; key of one of several targets.
+# Patterns: key of a single target at the beginning of a sentence or inside it; key of one of several targets.
 THE_TARGET, ONE_TARGET = re.compile(r"^target(?=[.:])|(?<=\s)target(?=\.[a-z])"), re.compile(r"target\[\d+\]")
-SIMILARITY = 0.7  # smallest ratio of difflib at which a known word is proposed; "ies" and "pixels" have 0.67
+SIMILARITY = 0.7  # smallest ratio of difflib at which a known word is proposed; for "ies" and "pixels" it is 0.67
 
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
 SENTENCES = {  # sentence for each type of error of pydantic; {shown} is the value
@@ -86,8 +86,8 @@ def _applies(location: tuple[int | str, ...], data: Any) -> bool:
 class _Location:
     """Location of a validation error in the JSON schema.
 
-    pydantic's location also holds the tags of unions ('source', 'collimated', 'aperture', 'Circle', 'radius').  They
-    choose the record and are not part of the dotted key.
+    pydantic's location also contains the tags of unions ('source', 'collimated', 'aperture', 'Circle', 'radius').  They
+    select the record and are not part of the dotted key.
     """
 
     def __init__(self, problem: ErrorDetails):

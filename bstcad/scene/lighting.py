@@ -9,7 +9,7 @@ from bstcad.optics.emitters import Emitter
 from bstcad.optics.outlines import Outline
 from bstcad.scene.blank import INDICES, LensBlank
 
-MIN_BEAM_COVERAGE = 0.9  # smallest width of a beam as a fraction of the lens's width; the rest of the lens is wasted
+MIN_BEAM_COVERAGE = 0.9  # ratio of the widths of beam and lens below which a warning calls the rest of the lens dark
 IRRADIANCE_SAMPLES = 200  # points per side of the lens at which the irradiance is sampled
 
 
@@ -21,7 +21,7 @@ def complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
         yield f"source.{width}: missing, and a {source.profile} profile needs it; add it in {unit}"
     for other in source.widths.values():
         if other != width and getattr(source, other) is not None:
-            yield f"source.{other}: a {source.profile} profile does not use it; remove it, or change the profile"
+            yield f"source.{other}: a {source.profile} profile does not use this key; remove it, or change the profile"
     yield from _spectrum(source, lens)
     first = getattr(lens, lens.passes.faces[0])
     yield from (f"source.{complaint}" for complaint in source.complaints(first.z, lens.optic))
@@ -45,7 +45,7 @@ def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:
         return
     low, high = INDICES
     for index in (n for n in indices if lens.material is not None and not low <= n <= high):
-        found = f"the index of {lens.material} is {index:.4g} at this wavelength, not between {low:g} and {high:g}"
+        found = f"the index of {lens.material} at source.wavelength is {index:.4g}, not between {low:g} and {high:g}"
         yield f"lens.material: {found}; choose a material that transmits the light of the source"
 
 
@@ -79,7 +79,7 @@ def unlit_complaints(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator
 
 
 def doubts(source: Emitter, rim: Outline, key: str) -> Iterator[str]:
-    """Yield doubts about a parallel beam much narrower than the lens, or wider; key: key of the rim."""
+    """Yield warnings about a parallel beam that is wider or much narrower than the lens; key: dotted key of the rim."""
     beam, _ = source.spot(0.0)
     if beam is None:  # without an edge
         return

@@ -22,8 +22,8 @@ from bstcad.scene.schema import COORDINATES, LENGTHS, Record
 
 MAX_DRAFT = 30.0  # degrees; largest draft angle of the walls of a lens
 MIN_WEB = 0.1  # mm; smallest width of material between a hole and any other edge
-LAND = 0.1  # height of the wall without draft below the back's rim, mm; for walls below 1 mm a fraction of the wall
-ITERATIONS = 60  # iterations for the end of a wall; each halves the error on a front of slope 0.5
+LAND = 0.1  # height of the upright wall below the back's rim, mm; for walls below 1 mm, fraction of their height
+ITERATIONS = 60  # iterations for the end of a bevel or wall; on a front of slope 0.5 each at least halves the error
 MIN_CLOSING = 0.25  # smallest approach of a wall with draft to the front (mm per mm of height)
 MIN_CLEAR_APERTURE = 1e-3  # smallest clear aperture of the front after draft and bevel, as a fraction of the rim
 LENS_COLOUR, MIRROR_COLOUR = "#9ed3f580", "#c8ccd0"
@@ -33,7 +33,7 @@ COLOUR = re.compile(r"#(?:[0-9a-fA-F]{6}|[0-9a-fA-F]{8})")
 
 @dataclass(frozen=True)
 class Part:
-    """Entries of the title block of a drawing; None: the file does not state the entry."""
+    """Entries of the title block of a drawing; None: the default that the key states, or else no entry."""
 
     number: Annotated[str | None, Key("Number of the part; the scene's name if absent.")] = None
     author: Annotated[str | None, Key("Author of the file.")] = None
@@ -207,7 +207,7 @@ class Mount(Record):
         """Return the largest distance (mm) by which draft and bevel move the edge of the front inwards.
 
         From (p, top), p on the rim, a line of the wall goes down to the front, and inwards along m by tan(draft) per mm
-        of depth.  The bevel cuts its end at 45 degrees.  Iteration finds the ends of cad.walls.LeaningPiece.ends.
+        of depth.  The bevel cuts its end at 45 degrees.  Iteration finds the same ends as cad.walls.LeaningPiece.ends.
         """
         (x, y), tangent = rim.rim_points(), math.tan(math.radians(self.draft))
         m_x, m_y = rim.inset_direction(x, y)
@@ -236,7 +236,7 @@ def parting(back: Surface, front: Surface, x: np.ndarray, y: np.ndarray) -> floa
     return float(low - min(LAND, LAND * (low - high)))
 
 
-# ---- complaints: each relies on the absence of those before it -------------------------------------------------------
+# ---- complaints: each relies on the absence of earlier faults --------------------------------------------------------
 
 
 def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:

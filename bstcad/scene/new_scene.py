@@ -23,13 +23,13 @@ SIZE = 80.0  # default size of a plate, mm
 WIDTH_TO_THICKNESS = 10.0  # ratio of the width of a plate to its thickness
 MIN_THICKNESS = 3.0  # mm; smallest thickness of a plate
 RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # ranges of the options, mm
-BLUR_MARGIN = 1.1  # ratio of the limit to the RRMSD of the blurred picture; standard quality ends well below
+BLUR_MARGIN = 1.1  # ratio of accept.rrmsd to the RRMSD of the blurred picture; standard quality stays well below it
 MIN_RRMSD, MAX_RRMSD = 0.05, 0.25  # smallest and largest accept.rrmsd of a new scene
 
 LIKE_THE_PHOTO = re.compile(r"(?:([^xX×]+)[xX×])?photo")  # size with the photo's proportions: "photo" or "120xphoto"
 
 TEMPLATE = Path(__file__).with_name("plate.toml.j2")
-COMMENT_COLUMN = 32  # column of the comments behind short lines
+COMMENT_COLUMN = 32  # column at which comments begin after short lines
 COMMENT_WIDTH = 118  # characters in a line of comment
 
 
@@ -38,8 +38,8 @@ class Light:
     """A light for which a plate is made; plate.toml.j2 has its table [source]."""
 
     name: str  # value of the option --light
-    of: str  # the light in a sentence, "an LED"
-    header: str  # description of the light, true for other lengths in the scene too
+    of: str  # name of the light in sentences, such as "an LED"
+    header: str  # description of the light, which stays true if the user changes lengths in the scene
     pixels: int = 256  # pixels along the longer side of the target
     size: float = 0.0  # size of the source: mm for a lamp, degrees for parallel light; 0: no blur
     square: bool = False  # True for a square chip, False for a disc
@@ -54,7 +54,7 @@ LIGHTS = {name: Light(name, **table) for name, table in _TABLES.items()}  # ligh
 
 @dataclass(frozen=True)
 class Plate:
-    """A plate, the wall behind it and the light before it."""
+    """A plate with the light before it and the wall behind it."""
 
     light: Light
     width: float  # mm
@@ -99,7 +99,7 @@ class Plate:
         return self.magnification * self.side / self.light.pixels
 
     def source_image(self, distance: float) -> float:
-        """Return the size (mm) of the source's image at a distance L (mm): 2 L tan(δ / 2), d L / before for a lamp."""
+        """Return the size (mm) of the source's image at distance L (mm): lamp s L / before, parallel 2 L tan(s / 2)."""
         if self.before:
             return self.light.size * distance / self.before
         return 2 * distance * math.tan(math.radians(self.light.size / 2))
@@ -115,7 +115,7 @@ class Plate:
         """Return a sentence on the finest detail; blurred: RRMSD of the picture blurred by the source's image."""
         wide, detail = self.magnification * self.side, self.detail(self.distance)
         text = f"The finest detail on this wall is {detail:.2g} mm wide"
-        if self.light.square:  # traced: 4.86 mm over the whole plate, 5.77 mm at its centre
+        if self.light.square:  # traced detail: 4.86 mm with the whole plate, 5.77 mm with its centre
             text += " behind the centre of the plate, and less beside it, where the chip is seen at an angle"
         text += f", 1/{wide / detail:.0f} of the picture's {wide:.4g} mm"
         if blurred is None:
@@ -126,7 +126,7 @@ class Plate:
         elif self.light.hint:
             text += f"; {self.light.hint}"
         if blurred > MAX_RRMSD:
-            text += f". The blur is too large for this picture: it changes it by an RRMSD of {blurred:.2g}"
+            text += f". The blur is too large for this picture, which it changes by an RRMSD of {blurred:.2g}"
         return f"{text}."
 
     def blur_rrmsd(self, scene: Scene) -> float | None:
@@ -141,7 +141,7 @@ class Plate:
         return even_image(image).deviation(scene.target.irradiance())
 
     def text(self, name: str, picture: Path | None = None, blurred: float | None = None) -> str:
-        """Return the text of the scene file, with the picture at that path, or else with letters."""
+        """Return the text of the scene file; picture: path (None: letters); blurred: as for `expectation`."""
         import jinja2  # slow to load, and not needed for a list of the templates
 
         text = jinja2.Template(
@@ -174,8 +174,8 @@ def new_scene(
     """Write NAME.toml to `folder`, a commented scene that loads; SceneError for an existing file.
 
     The scene is a plate with a picture as large as its shadow on the wall, or a copy of a template.  light: a name of
-    LIGHTS.  size: size of the plate, mm: one number, width by height "80x60", or with the proportions of the picture
-    "photo" or "120xphoto".  distance: distance of the wall, mm.  picture: path, relative to `folder`; None: letters.
+    LIGHTS.  size: size of the plate, mm: one number, width x height "80x60", or, with the proportions of the picture,
+    "photo" or "120xphoto".  distance: from plate to wall, mm.  picture: path, relative to `folder`; None: letters.
     """
     from bstcad.scene.picture import photo_size, read_picture, safe_name  # slow to load
 
@@ -211,13 +211,13 @@ def new_scene(
 
 
 def in_proportions(side: float, shown: tuple[int, int]) -> str:
-    """Return the size of a plate with a picture's proportions (width, height) and the longer side (mm): "80x53.3"."""
+    """Return the size of a plate, such as "80x53.3": longer side (mm), proportions of a picture (width, height)."""
     width, height = (max(side * each / max(shown), RANGES["size"][0]) for each in shown)
     return f"{width:.4g}x{height:.4g}"
 
 
 def _lengths(name: str, given: str | float, example: str, count: int) -> list[float]:
-    """Return the lengths (mm) of an option, at most `count`, separated by x: 80 or "80x60"."""
+    """Return the lengths (mm) in the value of an option, at most `count`, separated by x, such as 80 or "80x60"."""
     try:
         found = [float(length) for length in re.split("[xX×]", str(given))]
     except ValueError:
@@ -232,13 +232,13 @@ def _lengths(name: str, given: str | float, example: str, count: int) -> list[fl
 
 
 def _align_comment(line: str) -> str:
-    """Return a line with its comment in the column of comments, or two spaces behind a longer line."""
+    """Return a line with its comment moved to COMMENT_COLUMN, or to two spaces after the keys of a longer line."""
     keys, mark, comment = line.rpartition(" # ")
     return f"{keys:{COMMENT_COLUMN - 2}}  # {comment}" if mark else line
 
 
 def _toml_string(text: str) -> str:
-    """Return a text as a TOML string, which has the syntax of JSON."""
+    """Return a text as a TOML string, with the syntax of JSON."""
     return json.dumps(text, ensure_ascii=False)
 
 
@@ -250,7 +250,7 @@ def templates() -> dict[str, str]:
 
 
 def _template(template: str, name: str) -> str:
-    """Return the text of a template with another name of the scene."""
+    """Return the text of a template in which the scene has this name."""
     known = list(templates())
     if template not in known:
         raise SceneError(f"--template {template}: is unknown; {nearest(template, known, 'the templates are')}")

@@ -41,17 +41,17 @@ DESCRIPTION = 270  # tag of the description in a TIFF file
 IRRADIANCE = "irradiance"  # description of the file of an array, whose floats are irradiance
 MAX_PICTURE_PIXELS = 64_000_000  # largest number of pixels of a picture
 MAX_PICTURE_SIDE = 65_535  # largest number of pixels along a side, the limit of JPEG
-TILE_WIDTH, TILE_LENGTH = 322, 323  # tags of a TIFF file, which is decoded by whole tiles
+TILE_WIDTH, TILE_LENGTH = 322, 323  # tags with the size of a TIFF file's tiles, each of which is decoded as a whole
 MAX_TILE = 4096**2  # largest number of pixels of a tile; programs write tiles of up to 1024 per side
 MAX_PICTURE_SIZE = 400_000_000  # bytes; 64 million pixels of three 16-bit channels
 MAX_PROFILE_SIZE = 10_000_000  # bytes of an ICC profile; profiles of printers have a few millions
 STRIP_ROWS = 256  # rows of a picture that are processed at a time
 INTEGERS = "16 bits or more and no colour tag: its values are read as sRGB; with gamma = 1, as irradiance"
 FLOATS = "floats and no colour tag: they are read as irradiance; with gamma = 2.2, as brightness on a screen"
-MAX_BLACK = 8 / 255  # largest value that is black; of a logo in black on transparency, the opacity is the picture
+MAX_BLACK = 8 / 255  # largest value that counts as black; a picture in black on transparency is read from its opacity
 MAX_GAMMA = 10.0  # largest exponent that a file may state; the smallest is its inverse
 LINEAR, PQ, HLG = 8, 16, 18  # transfer characteristics of a cICP chunk (ITU-T H.273)
-SWAPPED = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}  # opposite byte order of each order
+SWAPPED = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}  # opposite of Pillow's byte orders
 DEVICE = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.IGNORECASE)  # names of devices on Windows
 Sample = Literal["astronaut", "camera"]  # scikit-image's bundled pictures, public domain and CC0
 SAMPLES: tuple[str, ...] = get_args(Sample)
@@ -97,7 +97,7 @@ def read_picture(path: Path) -> Picture:
 
 
 def kind_of(data: bytes, name: str = "the picture") -> str:
-    """Return the file name suffix for the content of a picture, ".png"; SceneError if too large or not a picture."""
+    """Return a picture's file name suffix by its content, such as ".png"; SceneError if too large or not a picture."""
     with decoding(name):
         return FORMATS[str(_open_picture(name, data).format)]
 
@@ -105,7 +105,7 @@ def kind_of(data: bytes, name: str = "the picture") -> str:
 def from_array(values: np.ndarray) -> Picture:
     """Return a picture of an array of irradiance on any scale, (rows, columns), row 0 at the top.
 
-    The array is stored as a TIFF file of float32 with maximum 1, beside its design.  SceneError for other arrays.
+    The array is stored as a TIFF file of float32 with maximum 1.  SceneError if it is not an irradiance.
     """
     for fault in _array_faults(values):
         raise SceneError(f"target.image: {fault}")
@@ -201,7 +201,7 @@ def _tags(image: Image.Image) -> Mapping[int, Any]:
 
 
 def _is_avif(data: bytes) -> bool:
-    """Return True if a brand of a HEIF file, in its first box, is AVIF: size, "ftyp", brand, version, more brands."""
+    """Return True if a HEIF file has a brand of AVIF; its first box: size, "ftyp", brand, version, more brands."""
     end = min(struct.unpack(">I", data[:4])[0], 1024)
     return data[8:12] in AVIF or any(data[at : at + 4] in AVIF for at in range(16, end, 4))
 
@@ -267,7 +267,7 @@ class Photo:
         return self.curve(alpha)
 
     def numbers(self, box: PixelBox) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return pixel values (h, w, channels), integers or floats from 0 to 1, and opacity (h, w) or None."""
+        """Return pixel values (h, w, channels), integers or floats from 0 to 1, and opacity (h, w); None: opaque."""
         image, low, alpha = self.image.crop(box), self.low and self.low.crop(box), None
         if image.mode.startswith(("I", "F")):
             return self._one_channel(image)
@@ -284,7 +284,7 @@ class Photo:
         return np.asarray(image.convert("RGB")), alpha
 
     def _one_channel(self, image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return `numbers` of one channel of 16 or 32 bits or floats; a PNG may state one transparent value."""
+        """Return `numbers` for one channel of 16 or 32 bits or floats; a PNG may state one transparent value."""
         values, clear = np.asarray(image), image.info.get("transparency")
         alpha = (values != clear).astype(np.float64) if isinstance(clear, int) else None
         if values.dtype.kind == "u" and values.dtype.itemsize == 2:
@@ -434,7 +434,7 @@ def _grey_curve(profile: Conversion) -> Curve:
 
 
 def letters(text: str, width: int, height: int) -> Image.Image:
-    """Draw a text in a picture of this size (mode L), centred, over 84 % of the width or 80 % of the height."""
+    """Draw a text in a picture of this size (mode L), centred; it fills 84 % of the width or 80 % of the height."""
     at_100 = _ink(text, 100.0)
     scale = min(0.84 * width / at_100.width, 0.80 * height / at_100.height)
     ink = _ink(text, max(100.0 * scale, 1.0))

@@ -16,7 +16,7 @@ from scipy.special import erf
 from bstcad.optics.key import Key
 from bstcad.scene.schema import LENGTHS, Record
 
-# Gauss-Legendre nodes per quadrature cell in which E changes by a factor up to about e, or up to its fourth root.
+# Gauss-Legendre nodes per quadrature cell of a super-Gaussian: in cells up to w / n wide, and in cells below w / (4 n).
 NODES, FEWER_NODES = 8, 4
 MAX_VALUES = 1 << 20  # values of E computed at a time
 DARK = 1e-20  # E, relative to the centre, below which a pixel has no light
@@ -55,7 +55,7 @@ class DiscProfile(_Profile):
         within = corner_area(x[None, :], y[:, None], self.radius)
         fraction = np.abs(np.diff(np.diff(within, axis=0), axis=1)) / cell(pixels, size)
         nearest, farthest = (np.hypot(*np.meshgrid(*ends)) for ends in zip(*map(_distances, (x, y)), strict=True))
-        whole = [nearest >= self.radius, farthest <= self.radius]  # to the last bit
+        whole = [nearest >= self.radius, farthest <= self.radius]  # exactly 0 or 1
         return np.select(whole, [0.0, 1.0], fraction)
 
 
@@ -122,7 +122,7 @@ class SuperGaussianProfile(_Profile):
         for row in range(0, len(y), high):
             strip = y[row : row + high]
             r = np.hypot(x.ravel(), strip.reshape(-1, 1))
-            with np.errstate(over="ignore"):  # far outside, where E is 0
+            with np.errstate(over="ignore"):  # far outside the profile, where E is 0
                 light = np.exp(-2 * (r / w) ** n).reshape(*strip.shape, *x.shape)
             first = rows.start + row
             found[first : first + len(strip), columns] = np.einsum("iajb,a,b->ij", light, of_y, of_x, optimize=True)
@@ -168,12 +168,12 @@ def corner_area(x: np.ndarray, y: np.ndarray, radius: float) -> np.ndarray:
 def _distances(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distances (mm) of each pixel's nearest and farthest point from the centre, along one axis."""
     ends = np.abs(at[1:]), np.abs(at[:-1])
-    across = at[1:] * at[:-1] < 0  # True for a pixel on the axis
+    across = at[1:] * at[:-1] < 0  # True for a pixel that contains 0
     return np.where(across, 0.0, np.minimum(*ends)), np.maximum(*ends)
 
 
 def _lit_pixels(at: np.ndarray, reach: float) -> tuple[np.ndarray, slice]:
-    """Return the edges of the pixels within reach of a profile, and the slice of these pixels."""
+    """Return the edges (mm) of the pixels within `reach` (mm) of the centre, and the slice of these pixels."""
     low, high = np.minimum(at[1:], at[:-1]), np.maximum(at[1:], at[:-1])
     lit = np.flatnonzero((low < reach) & (high > -reach))
     first, last = int(lit[0]), int(lit[-1]) + 1
@@ -181,7 +181,7 @@ def _lit_pixels(at: np.ndarray, reach: float) -> tuple[np.ndarray, slice]:
 
 
 def _nodes(at: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes (pixels, nodes) and weights (nodes,) for means over pixels with these edges."""
+    """Return nodes (pixels, nodes) and weights (nodes,) for means over pixels, in cells of at most `width` (mm)."""
     pitch = abs(float(at[1] - at[0]))
     node, weight = np.polynomial.legendre.leggauss(FEWER_NODES if 4 * pitch < width else NODES)
     cells = max(math.ceil(pitch / width), 1)

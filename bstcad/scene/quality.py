@@ -28,12 +28,12 @@ BASELINES = {  # methods without limits of time, accuracy or shape: name in mess
     "integration": ("point-by-point integration", "tailoring.method"),
 }
 COARSEST_GRID = 64  # smallest number of cells per side of the transport problem; it costs almost no time
-VERIFICATION_POINTS = 32  # points of an extended source for the pictures and margins of a verification, not its RRMSD
-VERIFICATION_DRAW = 1 << 12  # number of the random sample of these points; each further line has the next number
+VERIFICATION_POINTS = 32  # points of an extended source in a verification; the RRMSD is from random points instead
+VERIFICATION_DRAW = 1 << 12  # number of the set of these points; each further spectral line has the next number
 
 
 class Tailoring(Record):
-    """The effort of tailoring; a setting that is None has the value of its quality (PRESETS)."""
+    """The effort of tailoring; a setting that is None has the value of `quality` in PRESETS."""
 
     quality: Annotated[Literal["draft", "standard", "fine", "paper"], Key("Effort; fine has the smallest error.")] = (
         "standard"
@@ -56,7 +56,7 @@ class Tailoring(Record):
     ] = None
     stage2_iterations: Annotated[int | None, Key("Iterations of stage 2.", "", 0, 1_000_000, example=120)] = None
     overshoot: Annotated[
-        float | None, Key("Weight of light beside the target, per pixel².", "", 0.0, 1e3, example=0.03)
+        float | None, Key("Weight of light beside the target, per pixel² of distance.", "", 0.0, 1e3, example=0.03)
     ] = None
     source_points: Annotated[int | None, Key("Sample points of an extended source.", "", 2, 4096)] = None
     solution: Annotated[
@@ -78,18 +78,18 @@ class Tailoring(Record):
 
     @property
     def chosen_method(self) -> str:
-        """Method that the scene states, else that of its quality."""
+        """Method that the scene states, or else the method of its quality."""
         return self.method or PRESETS[self.quality]["method"]
 
     def resolved(self, net: Sides) -> ResolvedTailoring:
-        """Return the settings with all values set, for a net of control points per side, or along x and along y.
+        """Return the settings with all values set; net: control points per side of the back, or along x and along y.
 
-        Levels of an oblong net are pairs, with cells in the same proportions.  Defaults: at least two rays per cell
-        of the net along x and along y (two in all for a draft), and at most two cells of the transport per cell.
+        Levels of an oblong net are pairs, with cells in the same proportions.  Defaults: at least two rays per cell of
+        the net along x and along y (a draft: two in all per cell); at most twice as many cells per side in the map.
         """
         levels = tuple(level if isinstance(level, tuple) else coarser(net, level) for level in self.levels or ())
         preset = dict(PRESETS[self.quality], levels=levels or coarse_to_fine(net))
-        # With fewer than two rays per cell and direction a checkerboard remains; a draft ends before it appears.
+        # With fewer than two rays per cell and direction a checkerboard grows in the net; a draft ends before it does.
         rays_per_cell = 2**0.5 if self.quality == "draft" else 2
         preset["rays"] = max(preset["rays"], math.ceil(rays_per_cell * side(net)))
         if self.method == "integration":
@@ -113,7 +113,7 @@ class Tailoring(Record):
             if who and getattr(self, name) is not None:
                 yield f"tailoring.{name}: {who} cannot end early; remove it, or choose another {other}"
         if who and lens.bounded_by:
-            yield f"lens.{lens.bounded_by[0]}: {who} has no such bounds; remove it, or choose another {other}"
+            yield f"lens.{lens.bounded_by[0]}: {who} has no such bounds; remove this key, or choose another {other}"
         if who and lens.front.is_tailored:
             yield f"lens.front.optimise: {who} cannot tailor a freeform front; remove it, or choose another {other}"
         if self.method == "integration" and lens.front.free:
@@ -145,14 +145,14 @@ class ResolvedTailoring(Tailoring):
 
 
 def coarse_to_fine(net: Sides) -> tuple[Sides, ...]:
-    """Return nets of 33, 129 and 513 control points along the longer side, if clearly coarser, and the net itself."""
+    """Return nets of 33, 129 and 513 control points on the longer side, if clearly coarser than `net`, and `net`."""
     points = max(as_pair(net))
     return (*(coarser(net, m) for m in (33, 129, 513) if 1.5 * m < points), net)
 
 
 # ---- [[tolerance]]: none by default; a later table replaces values of an earlier one ---------------------------------
 
-# Names of errors; "lens.decentre" means both lens.decentre_x and lens.decentre_y.
+# Names of errors; "lens.decentre" means both lens.decentre_x and lens.decentre_y, and so on.
 Name = Literal[
     "lens.decentre", "lens.decentre_x", "lens.decentre_y", "lens.axial",
     "lens.tilt", "lens.tilt_x", "lens.tilt_y", "lens.clocking",
@@ -165,13 +165,13 @@ Name = Literal[
     "screen.tilt", "screen.tilt_x", "screen.tilt_y", "screen.clocking",
 ]  # fmt: skip
 FORM, RIPPLE = ("back.form", "front.form"), ("back.ripple",)
-FACE_ERRORS = {"correlation_length": FORM, "period": RIPPLE, "pattern": RIPPLE}  # key: errors that can have it
-TWO_FACE_ERRORS = ("front.", "lens.wedge")  # errors of a lens with two refracting faces; zero unless a table names them
+FACE_ERRORS = {"correlation_length": FORM, "period": RIPPLE, "pattern": RIPPLE}  # key -> errors that can have this key
+TWO_FACE_ERRORS = ("front.", "lens.wedge")  # errors of lenses with two refracting faces; zero if no table names them
 NONE = "none"  # grade of an error that is always zero
 
 
 class Tolerance(Record):
-    """The tolerance of one error, or of several; None: the value of an earlier table, or of the grade."""
+    """The tolerance of one error, or of several; a key that is None has the value of an earlier table or the grade."""
 
     name: Annotated[Name | None, Key("Name of the error; lens.decentre is both x and y; all if absent.")] = None
     grade: Annotated[
@@ -197,7 +197,7 @@ class Tolerance(Record):
 
 
 def settings_of(tables: Sequence[Tolerance], error: str) -> dict[str, Any]:
-    """Return the settings of an error from all tables; of grade and limit, the later one replaces the earlier."""
+    """Return the settings of an error from all tables; a later grade replaces an earlier limit, and vice versa."""
     merged: dict[str, Any] = {}
     for stated in (table.stated for table in tables if table.covers(error)):
         for one, other in (("grade", "limit"), ("limit", "grade")):

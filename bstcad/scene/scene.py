@@ -1,8 +1,8 @@
 """A scene: frozen tables in mm, degrees and nm, read from TOML or changed by values of Python.
 
 A fault is reported before any work starts, as one sentence (SceneError): the key, the fault and a remedy.  Only the
-first fault is reported, and each check relies on those before it.  Unknown keys are refused, never ignored.  A table
-is a record of bstcad.optics where one exists.
+first fault is reported, and each check relies on earlier checks.  Unknown keys are refused, never ignored.  A table is
+a record of bstcad.optics if there is one for it.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from bstcad.scene.target import Target, Targets, coplanar_complaints
 if TYPE_CHECKING:
     from bstcad.optics.measure import Draw, GhostTracer
 
-MESH_TOLERANCE = 1e-3  # mm; default distance of mesh facets from a lens of up to 100 mm
+MESH_TOLERANCE = 1e-3  # mm; default maximum distance of mesh facets from a lens up to 100 mm wide
 IMAGE_KEY = re.compile(r"target(\[\d+\])?\.image")  # dotted keys of images
 SEARCH_RANGE = 0.999  # fraction of the possible range of a parameter of the front that tailoring searches
 FLOAT32_ROUNDING = 2.0**-24  # largest relative rounding error of a coordinate in float32
@@ -263,7 +263,7 @@ class Scene(Record):
         return before, elements.interfaces(self.behind, 1, wavelength)
 
     def clearance(self, highest: float) -> tuple[float, str]:
-        """Return (gap, key) of the part that follows a lens up to z = highest; gap in mm, negative if they cross."""
+        """Return (gap, key) of the nearest element or target behind a lens up to z = highest; mm, negative: crossed."""
         room = [(elements.lowest(self.behind) - highest, "behind[0].z")] if self.behind else []
         if not self.light_path.is_folded:
             for target, key in zip(self.targets, self.target_keys, strict=True):
@@ -299,19 +299,19 @@ class Scene(Record):
         """Return the light as a weighted sum of channels; a point source of one wavelength is one channel.
 
         points: number of points of an extended source, divided among its lines (default: tailoring.source_points).
-        draw: number of the random draw of these points.
+        draw: number of the set of these points.
         """
         if points is None:
             points = self.tailoring.points_of_source
         return self._with_losses(channels_of(self.source, self.lens.index_at, points, draw))
 
     def verification_channels(self) -> tuple[Channel, ...]:
-        """Return the channels of a verification: more and other points of an extended source than in tailoring."""
+        """Return the channels of a verification: an extended source has other points than in tailoring."""
         return self.channels(VERIFICATION_POINTS, VERIFICATION_DRAW)
 
     @property
     def draw(self) -> Draw | None:
-        """Function of (points, seed) that samples the channels of an extended source; None: a point source."""
+        """Function of (points, seed) that samples the channels of an extended source; None for other sources."""
         if self.source.extent is None:
             return None
         return lambda points, seed: self._with_losses(drawn_channels(self.source, self.lens.index_at, points, seed))
@@ -420,7 +420,7 @@ def _method_complaints(scene: Scene) -> Iterator[str]:
 
 
 def _doubts_of_goals(scene: Scene) -> Iterator[str]:
-    """Yield doubts about fewer goals than tailored faces, as a face is idle, and more goals, as none is met exactly."""
+    """Yield warnings: with fewer goals than tailored faces a face is idle, with more no goal is met exactly."""
     lens, wave = scene.lens, scene.wavefront
     different: list[Target] = []
     for target in scene.targets:  # light parallel to the axis makes one picture on every plane, which is one goal
@@ -471,8 +471,8 @@ def of_text(
 ) -> Scene:
     """Read the scene from the text of a TOML file.
 
-    data: the tables of the text.  path: its file, which need not exist.  bounds: folders; a path into one of them
-    must not lead out of it by links.  Raises SceneError, with the line of the fault as a note.
+    data: the tables of the text.  path: its file, which need not exist.  bounds: folders; a path into one of them must
+    not lead out of them by symbolic links.  Raises SceneError, with the line of the fault as a note.
     """
     try:
         for key, value in (overrides or {}).items():
@@ -492,9 +492,9 @@ def of_text(
 def _validated(
     data: dict[str, Any], folder: Path, given: Mapping[str, FileContent] | None = None, bounds: Sequence[Path] = ()
 ) -> Scene:
-    """Return the scene of the tables of a file.
+    """Return the scene with the tables `data` of a file.
 
-    given: contents of files by their names; other files are relative to `folder`.
+    given: contents of files by their names; other files are read, relative to `folder`.  bounds: see `of_text`.
     """
     for key in data["tolerances"] if isinstance(data.get("tolerances"), dict) else ():
         table = "lens" if key.endswith("_thickness") else "accept"

@@ -18,7 +18,7 @@ NESTED = "is nested too deeply; give a scene file like those in templates"
 
 
 def read(path: Path) -> tuple[str, dict[str, Any]]:
-    """Read the text and the tables of a scene file; SceneError if it cannot be read as one."""
+    """Read (text, tables) of a scene file; SceneError if it cannot be read or is not valid TOML."""
     if os.path.isdir(path):
         inside = min(path.glob("*.toml"), default=path / "scene.toml")
         raise SceneError(f"{path}: is a folder; give a scene file, such as {inside}")
@@ -34,7 +34,7 @@ def read(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 def tables(text: str, path: Path) -> dict[str, Any]:
-    """Parse the text of a scene file; path: its name in messages."""
+    """Parse the text of a scene file; path: path of the file, for messages."""
     if too_dotted(text):
         raise SceneError(f"{path}: a line has more than {MAX_DOTS} dots; shorten that line")
     try:
@@ -48,7 +48,7 @@ def tables(text: str, path: Path) -> dict[str, Any]:
 
 
 def _fault(text: str, fault: str) -> str:
-    """Return a fault of tomllib, "Expected ']' (at line 3, column 5)", with its line and a remedy."""
+    """Return the sentence `fault` of tomllib, such as "Expected ']' (at line 3, column 5)", with a remedy."""
     lines = text.split("\n")
     fault = fault.replace("at end of document", f"at line {len(lines)}, column {len(lines[-1]) + 1}")
     place = re.search(r"at line (\d+)", fault)

@@ -79,8 +79,8 @@ def contents(value: Any, key: str = "") -> Iterator[tuple[str, FileContent]]:
 def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], example: str) -> tuple[Any, ...]:
     """Return the annotations of a field of type `kind` that is written as a path and contains the content of the file.
 
-    A path is relative to the scene file, or to the user's home.  If the context of a validation has `bounds`, folders,
-    a path into one of them must not lead out of them by links.
+    A path is relative to the scene file, or to the user's home with ~.  `bounds` in the context of a validation are
+    folders: a path into one of them must not lead out of them by symbolic links.
     """
 
     def content(given: Any, info: ValidationInfo) -> Any:
@@ -104,14 +104,14 @@ def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], exam
 
 
 def _check_links(path: Path, bounds: Sequence[Path]) -> None:
-    """Raise ValueError if a path into one of these folders, or the archive of a design there, leads out of them."""
+    """Raise ValueError if symbolic links lead `path`, or design.npz in the folder `path`, out of `bounds` (folders)."""
     for each in (path, path / "design.npz") if bounds else ():
         plain = Path(os.path.abspath(each))
         if any(plain.is_relative_to(folder) for folder in bounds) or each.resolve() != plain.resolve():
             try:
                 files.within(each, *bounds)
             except ValueError as error:
-                raise ValueError(f"{str(path)!r} {error}; copy the file itself there") from None
+                raise ValueError(f"{str(path)!r} {error}; put a copy of the file there instead") from None
 
 
 def leaving_out(**defaults: Any) -> Any:
@@ -128,7 +128,7 @@ def leaving_out(**defaults: Any) -> Any:
 
 
 class _Tables(GenerateJsonSchema):
-    """JSON schema of TOML tables: without null, and the tag of a union is required."""
+    """Generator of the JSON schema of TOML tables: without null, and with the tag of a union required."""
 
     def nullable_schema(self, schema: Any) -> dict[str, Any]:
         return self.generate_inner(schema["schema"])
@@ -192,7 +192,7 @@ def records(node: Node) -> list[Node]:
 
 
 def tags(record: Node) -> dict[str, Any]:
-    """Return the tag of a table in a union: {"kind": "plane"}."""
+    """Return the tag of a table in a union, such as {"kind": "plane"}."""
     keys = record["properties"]
     return {name: keys[name]["const"] for name in TAGS if "const" in keys.get(name, ())}
 
@@ -206,7 +206,7 @@ def _parts(node: Node) -> list[Node]:
 class Row:
     """A key as `bstcad keys` prints it."""
 
-    key: str  # dotted key, with [] behind a list of tables
+    key: str  # dotted key, with [] after the name of a list of tables
     unit: str
     range: str
     default: str

@@ -1,6 +1,6 @@
 """The target: its picture, its position, the fit of the picture, and the side from which it is seen.
 
-Row 0 of an array is the top, column 0 the left, as a viewer sees the picture.
+Row 0 of a picture is its top and column 0 its left, as a viewer sees it; `Target.irradiance` orders columns by x.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ WITHOUT_GAMMA = ("text", "uniform", "profile")  # keys of targets without an ima
 MAX_TARGETS = 8  # largest number of targets of a scene
 NOTICEABLE = 0.01  # RRMSD between two readings of a picture above which a remark states the reading
 PLANE_DISTANCE = 1e-3  # mm; smallest distance between the planes of two targets
-LARGEST_IN_METRES, FARTHEST_IN_METRES = 0.5, 10.0  # largest plausible numbers in metres: width of a lens, z of a target
-MAX_REDUCTION = 20.0  # largest plausible ratio between the widths of a lens and its target
+LARGEST_IN_METRES, FARTHEST_IN_METRES = 0.5, 10.0  # m; largest plausible width of a lens, and z or width of a target
+MAX_REDUCTION = 20.0  # largest plausible ratio of the width of a lens to the width of its target
 EDGE_ON = math.sin(math.radians(1.0))  # sine of the smallest angle between the line of sight and a target's plane
-GRAZING_VIEW = 8.0  # degrees between view and target plane; RRMSD 0.07 at 30, 0.33 at 10, 1.6 at 5
+GRAZING_VIEW = 8.0  # degrees; a flatter view of a target gets a warning (RRMSD 0.07 at 30, 0.33 at 10, 1.6 at 5)
 DIRECTIONS = {1: "+z", -1: "-z"}
 
 PictureFile = Annotated[
@@ -149,7 +149,7 @@ class Target(Record):
         return self.sample if self.image is None else self.image
 
     def as_rotated(self, shown: Pixels) -> Pixels:
-        """Return width and height of a picture after the target's rotation."""
+        """Return the width and height `shown` of a picture after the target's rotation."""
         return shown[::-1] if self.rotate in (90, 270) else shown
 
     @property
@@ -172,7 +172,7 @@ class Target(Record):
         return columns, rows
 
     def fewer_pixels(self, factor: float) -> tuple[int, int]:
-        """Return columns and rows divided by a factor, at least MIN_PIXELS and a pixel per half profile."""
+        """Return columns and rows divided by a factor, at least MIN_PIXELS and one per half width of the profile."""
         sides = zip(self.columns_rows, self.size, self._half_profile, strict=True)
         minimum = ((n, max(MIN_PIXELS, math.ceil(size / half))) for n, size, half in sides)
         columns, rows = (min(max(round(n / factor), fewest), max(n, MIN_PIXELS)) for n, fewest in minimum)
@@ -208,7 +208,7 @@ class Target(Record):
             yield f"target.z: the target at z = {self.z:g} is not {behind} is at z = {back:g}; move it further along +z"
 
     def follows(self, words: str, z: float, sense: int) -> Iterator[str]:
-        """Yield complaints about a target that does not follow the last element, at z, along sense · z."""
+        """Yield complaints about a target that does not follow the element `words` at z (mm) along sense · z (±1)."""
         if not sense * (self.z - z) > 0:
             where = f"the target at z = {self.z:g} must follow the {words} at z = {z:g}"
             yield f"target.z: {where} along {DIRECTIONS[sense]}, as the light travels; move one of them"
@@ -218,11 +218,11 @@ class Target(Record):
         return self.screen.plane.clearance(lens.outline, highest)
 
     def grazed(self, lens: LensBlank) -> Iterator[str]:
-        """Yield a doubt about a tilted target that the lens sees nearly edge-on."""
+        """Yield a warning about a tilted target that is nearly edge-on, seen from the lens."""
         plane, vertex = self.screen.plane, (0.0, 0.0, lens.back.z)
         if plane.tilt is None or not isinstance(plane, PlaneReceiver):
             return
-        sine = -plane.height(vertex) / math.dist(plane.middle, vertex)  # the plane misses the lens: no zero
+        sine = -plane.height(vertex) / math.dist(plane.middle, vertex)  # the plane misses the lens: not zero
         if sine < math.sin(math.radians(GRAZING_VIEW)):
             angle = math.degrees(math.asin(max(sine, -1.0)))
             yield (
@@ -405,7 +405,7 @@ def _curve_remark(photo: picture.Photo, light: np.ndarray, part: Window, pixels:
 
 
 def _ink(text: str, pixels: Pixels, size: Size) -> np.ndarray:
-    """Return the fraction of ink per pixel (rows, columns) of a text on an area (width, height)."""
+    """Return the fraction of ink per pixel (rows, columns) of a text that fills an area of `size` (width, height)."""
     aspect, side = size[0] / size[1], min(4 * max(pixels), 4096)  # drawn finer and averaged, for smooth edges
     width, height = max(round(side * min(aspect, 1.0)), 16), max(round(side * min(1 / aspect, 1.0)), 16)
     image = picture.letters(text, width, height)
@@ -470,9 +470,9 @@ def _fit_remark(shown: Pixels, target: Target) -> str:
 
 
 def average(light: Callable[[PixelBox], np.ndarray], size: Pixels, window: Window, pixels: Pixels) -> np.ndarray:
-    """Return the means (rows, columns) of a picture over the pixels of a window; outside the picture it is dark.
+    """Return the exact means (rows, columns) of a picture, dark outside its edges, over the pixels of a window.
 
-    light: function that returns the values of a box.  The means are exact, and the picture is read in strips.
+    light: function that returns the values of a box.  size: size of the picture, which is read in strips.
     """
     left, top = (max(int(start), 0) for start in window[:2])
     right, bottom = (min(math.ceil(stop), side) for stop, side in zip(window[2:], size, strict=True))
@@ -483,7 +483,7 @@ def average(light: Callable[[PixelBox], np.ndarray], size: Pixels, window: Windo
 
 
 def overlap(size: int, pixels: int, start: float = 0.0, stop: float | None = None) -> csr_array:
-    """Return the averaging matrix (pixels, size): the fraction of each pixel, from start to stop, per input."""
+    """Return the matrix (pixels, size) of means over equal pixels from start to stop of `size` inputs of width 1."""
     stop = size if stop is None else stop
     edges = start + np.arange(pixels + 1) * (stop - start) / pixels
     edges[-1] = stop

@@ -119,7 +119,7 @@ class TestLight:
               "source.real_divergence": 0.01}, "for a laser's beam; --light sun, lamp or led"),
         (["--light", "sun", "--distance", "5000"], {"accept.rrmsd": new_scene.MAX_RRMSD},
          "is 46 mm wide, 1/2 of the picture's 80 mm; on a wall at 200 mm it is 1.9 mm (--distance 200). The blur "
-         "is too large for this picture: it changes it by an RRMSD of 0."),
+         "is too large for this picture, which it changes by an RRMSD of 0."),
         # 2 mm at 400 mm before the plate: on a wall 200 mm behind it 1 mm, and the shadow is 1.5 times the plate
         (["--light", "lamp", "--distance", "200"], {"source.kind": "point", "source.diameter": 2, "lens.front.z": 400,
                                                     "target.size": (120, 120)}, "is 1.1 mm wide, 1/106 of the"),
