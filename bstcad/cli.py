@@ -439,7 +439,7 @@ def export(folder: Folder, kinds: Kinds = None, points: Points = None) -> int:
 def show(folder: Folder, png: Png = None) -> int:
     """Show a lens with its rays, coloured by their flux, and the target with its picture."""
     if png is not None and (png.suffix.lower() != ".png" or png.is_dir()):
-        raise SceneError(f"--png {png}: is not a file name of a PNG; give one such as light.png")
+        raise SceneError(f"--png {png}: is not the name of a PNG file; give a name such as light.png")
     if png is not None and not png.absolute().parent.is_dir():
         raise SceneError(f"--png {png}: the folder {png.parent} does not exist; create it first")
     commands = load_commands()

@@ -73,7 +73,7 @@ def test_what_cannot_be_shown_is_one_sentence(small_design, tmp_path, capsys, mo
         ((folder,), "no display for a window; give --png FILE"),
         ((tmp_path / "none",), "no such folder"),
         ((tmp_path / "empty", "--png", tmp_path / "a.png"), "scene.toml"),
-        ((folder, "--png", tmp_path / "a.jpg"), "is not a file name of a PNG"),
+        ((folder, "--png", tmp_path / "a.jpg"), "is not the name of a PNG file"),
         ((folder, "--png", tmp_path / "none" / "a.png"), "create it first"),
     ):
         code, err = said(capsys, "show", *arguments)

@@ -145,7 +145,7 @@ class Flange(Record):
         Key("Further holes [x, y, diameter].", "mm", *COORDINATES, example=[[14.0, 0.0, 3.2]]),
     ] = ()
     draft: Annotated[float, Key("Draft angle of the outer walls, which narrow upwards.", "degrees", 0.0, 45.0)] = 0.0
-    bevel: Annotated[float, Key("Bevel at 45 degrees of the edges of the outer walls.", "mm", 0.0, 1e5)] = 0.0
+    bevel: Annotated[float, Key("Height of the bevels, at 45 degrees, of the outer walls.", "mm", 0.0, 1e5)] = 0.0
 
     def all_holes(self) -> list[tuple[float, float, float]]:
         """Return (x, y, diameter) of the screw holes and of the further holes, mm."""
@@ -161,7 +161,7 @@ class Mount(Record):
     ] = "source"
     rim: Annotated[Shape | None, Key("Rim of the lens after cutting; lens.outline if absent.")] = None
     draft: Annotated[float, Key("Draft angle of the walls, which narrow downwards.", "degrees", 0.0, MAX_DRAFT)] = 0.0
-    bevel: Annotated[float, Key("Bevel at 45 degrees of the edge between walls and front.", "mm", 0.0, 1e5)] = 0.0
+    bevel: Annotated[float, Key("Height of the bevel, at 45 degrees, from walls to front.", "mm", 0.0, 1e5)] = 0.0
     flange: Annotated[Flange | None, Key("A plate around the lens, one piece with it.")] = None
 
     def origin(self, front: float) -> float:

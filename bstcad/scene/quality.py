@@ -45,7 +45,7 @@ class Tailoring(Record):
     ] = None
     levels: Annotated[
         tuple[OneOrTwo, ...] | None,
-        Key("Control points of the nets, from coarse to fine.", "", *NET_SIZES, example=[129, 257]),
+        Key("Control points per side of the nets, from coarse to fine.", "", *NET_SIZES, example=[129, 257]),
     ] = None
     transport_grid: Annotated[int | None, Key("Cells per side of the transport map.", "", 16, 2049, example=512)] = None
     transport_iterations: Annotated[int | None, Key("Transport map iterations.", "", 1, 100_000, example=100)] = None
@@ -173,13 +173,13 @@ NONE = "none"  # grade of an error that is always zero
 class Tolerance(Record):
     """The tolerance of one error, or of several; a key that is None has the value of an earlier table or the grade."""
 
-    name: Annotated[Name | None, Key("Name of the error; lens.decentre is both x and y; all if absent.")] = None
+    name: Annotated[Name | None, Key("Name of the error; lens.decentre is both x and y; all errors if absent.")] = None
     grade: Annotated[
-        Literal["moulded", "diamond-turned", "precise", "none"] | None, Key("Grade of the limit; none: no error.")
+        Literal["moulded", "diamond-turned", "precise", "none"] | None, Key("Grade for the limit; none: no error.")
     ] = None
-    limit: Annotated[float | None, Key("Limit (±) in the error's unit; RMS of form and ripple.", "", 1e-12, 1e4)] = None
+    limit: Annotated[float | None, Key("Limit (±) in the error's unit; form, ripple: RMS.", "", 1e-12, 1e4)] = None
     distribution: Annotated[
-        Literal["normal", "uniform"] | None, Key("Distribution; normal is truncated at the limit, 2 σ.")
+        Literal["normal", "uniform"] | None, Key("Distribution; normal is truncated at the limit, which is 2 σ.")
     ] = None
     cost: Annotated[float | None, Key("Cost of the limit, relative to the other errors.", "", 1e-6, 1e6)] = None
     correlation_length: Annotated[float | None, Key("Correlation length of a form error.", "mm", 1e-3, 1e4)] = None

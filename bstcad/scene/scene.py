@@ -91,7 +91,7 @@ class Scene(Record):
         AfterValidator(lambda name: picture.safe_name(name) or name),
         Key("Name of the design and of its folder.", example="my-lens"),
     ]
-    title: Annotated[str, Key("One line for the report.")] = ""
+    title: Annotated[str, Key("Title of the report, one line.")] = ""
     source: Annotated[Collimated | Point, Field(discriminator="kind"), Key("The source of light.")]
     lens: Annotated[LensBlank, Key("The lens before tailoring, and the bounds on its tailored faces.")]
     targets: Annotated[Targets, Field(alias="target"), Key("Picture and its position; several: [[target]] tables.")]

@@ -64,7 +64,7 @@ class Target(Record):
     x: Annotated[tuple[float, float], Key("Ends of the target along x.", "mm", *COORDINATES, example=[-200.0, 200.0])]
     y: Annotated[tuple[float, float], Key("Ends of the target along y.", "mm", *COORDINATES, example=[-200.0, 200.0])]
     tilt: Annotated[Tilt, Key("Tilt about x, then about y.", "degrees", -89.0, 89.0, remedy=AIM)] = None
-    pixels: Annotated[OneOrTwo, Key("Pixels: longer side, or [columns, rows].", "", MIN_PIXELS, 4096, example=512)]
+    pixels: Annotated[OneOrTwo, Key("Pixels on the longer side or [columns, rows].", "", MIN_PIXELS, 4096, example=512)]
     text: Annotated[str | None, Key("Text as the picture, centred, as large as fits with a margin.")] = None
     image: Annotated[PictureFile | None, Key("Picture file, relative to the scene file.", example="photo.jpg")] = None
     sample: Annotated[picture.Sample | None, Key("Sample picture of scikit-image.")] = None
@@ -73,7 +73,7 @@ class Target(Record):
         Profile | None, Key("Irradiance of this shape instead of a picture.", example={"shape": "disc", "radius": 6.0})
     ] = None
     gamma: Annotated[
-        float | None, Key("Irradiance = (pixel value)^gamma; the file's if absent.", "", 0.1, 10.0, example=1.0)
+        float | None, Key("Irradiance = (pixel value)^gamma; if absent, as in the file.", "", 0.1, 10.0, example=1.0)
     ] = None
     invert: Annotated[bool, Key("Negative of the picture.", example=True)] = False
     seen_from: Annotated[Literal["lens", "behind"], Key("Side from which the picture is not mirrored.")] = "lens"
@@ -87,7 +87,7 @@ class Target(Record):
         Key("Part to show: [left, top, right, bottom] as fractions.", "", 0.0, 1.0, example=[0.1, 0.0, 0.9, 1.0]),
     ] = None
     outline: Annotated[Outlined | None, Key("Outline of the picture, centred; dark outside.")] = None
-    unreachable: Annotated[Literal["dark", "refuse"], Key("Unreachable parts: dark, or refuse the scene.")] = "dark"
+    unreachable: Annotated[Literal["dark", "refuse"], Key("Parts without light: dark, or refuse the scene.")] = "dark"
     weight: Annotated[float, Key("Weight of the target's squared error.", "", 1e-6, 1e6, example=2.0)] = 1.0
 
     written = leaving_out(weight=1.0)
