@@ -50,7 +50,7 @@ WRONG = {
         ({"lens.material": "PNMA"}, "lens.material: 'PNMA' is not a known material; did you mean 'PMMA'"),
         ({"source.wavelength": "2000"}, "lens.material: the index of PMMA is known from 404.7 to 1083 nm"),
         ({"lens.material": "main/Ag/Johnson"},
-         "lens.material: the index of main/Ag/Johnson is 0.052.* not between 1.01 and 5"),
+         "lens.material: the index of main/Ag/Johnson at source.wavelength is 0.052.* not between 1.01 and 5"),
         ({"source.wavelength": "0.65"}, "source.wavelength: 0.65 nm .* did you mean 650 nm"),
         ({"source.profile": "gaussian"}, "source.radius_1e2: missing, and a gaussian profile needs it"),
         ({"source.radius_1e2": "3"}, "source.radius_1e2: .* uniform profile"),
