@@ -1,4 +1,4 @@
-"""Walls around a lens, between rails: closed sequences of edges in which walls meet optical faces or each other.
+"""Walls around a lens, between rails: closed sequences of edges along which walls meet optical faces or each other.
 
 An upright wall is a plane, a cylinder or the extrusion of a cubic.  A wall with draft, or a bevel, is a plane, a cone
 or a ruled surface.  Each edge is built once for the two faces that meet in it.  In space and in the parameter planes,

@@ -1,7 +1,7 @@
 """Fit the form error of a made face as a spline, separate it from measurement noise, and state its figures.
 
 The deviation is modelled as a polynomial plus a random field.  The field is a spline on a net over the lens whose
-cosine amplitudes c_k are Gaussian with a variance S that depends only on the frequency; the points add white noise of
+cosine amplitudes c_k are Gaussian with a variance S that depends only on the frequency; the points have white noise of
 variance σ².  S (in bands of a quarter octave) and σ are estimated from the points.  The form error is the posterior
 mean, the linear estimate of heights, slopes and curvatures with the minimum error.  The posterior can be sampled.
 """
@@ -74,7 +74,7 @@ class FormError:
         return replace(finer, heights=finer.heights + torch.from_numpy(interpolating_net(values)))
 
     def posterior_sample(self, draw: np.ndarray, sign: float = 1.0) -> FormError:
-        """Return a sample of the posterior; draw: standard normal numbers (m, m); sign: ±1, their factor."""
+        """Return a sample of the posterior; draw: standard normal numbers (m, m); sign: ±1, factor of `draw`."""
         change = torch.from_numpy(scipy.fft.idctn(draw * self.spread, norm="ortho"))
         return replace(self, random_field=replace(self.random_field, heights=self.random_field.heights + sign * change))
 
@@ -162,7 +162,7 @@ def _field(
 def _motion_by_relief(
     motions: np.ndarray, off: np.ndarray, whitened: np.ndarray, *, noise2: float, reach: float
 ) -> np.ndarray:
-    """Return the motion (k,) by generalised least squares; whitened: σ² V⁻¹ motions (n, k)."""
+    """Return the motion (k,) by generalised least squares; whitened: σ² V⁻¹ motions (n, k); noise2: σ²."""
     normal = whitened.T @ motions / noise2
     size, directions = np.linalg.eigh((normal + normal.T) / 2)
     detected = size > 1 / (MAX_RELIEF_UNCERTAINTY * reach) ** 2  # determined by fine relief

@@ -93,7 +93,7 @@ def _cloud_checks(
     name, where = "made part: fraction of outliers among the points of the face", "clean the part and measure it again"
     yield Check.at_most(name, alignment.outlier_fraction, MAX_OUTLIER_FRACTION, where=where, id="made-outliers")
     (factor, uncertainty), name = scale, "made part: error of the scale of the cloud"
-    limit, where = max(SCALE_TOLERANCE, SCALE_SIGMAS * uncertainty), f"it is {factor:.5f} times the design"
+    limit, where = max(SCALE_TOLERANCE, SCALE_SIGMAS * uncertainty), f"the cloud is {factor:.5f} times the design"
     yield Check.at_most(name, abs(factor - 1), limit, where=where, id="made-scale")
     x, y, _ = alignment.pose.shift
     name, where = "made part: decentre in the frame of the cloud", f"x {x:+.4g} mm, y {y:+.4g} mm"

@@ -1,1 +1,1 @@
-"""Verification of a design: its written files are measured and compared with it."""
+"""Verification of a design: the written files are measured and compared with the design."""

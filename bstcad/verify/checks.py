@@ -1,4 +1,4 @@
-"""Proof of a design: its written files are measured and compared with it.
+"""Proof of a design: the written files are measured and compared with the design.
 
 The proof is independent of the optimisation.  Net and knots are read by a parser that is not OCC, the surface is
 sampled with OCC, the mesh is read back from the STL, and the irradiance is traced through the geometry of the STEP
