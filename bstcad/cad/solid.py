@@ -185,7 +185,7 @@ def _hole_loop(name: str, hole: cadquery.Wire | Sequence[float]) -> list[LoopPie
 
 
 def cap(patch: Patch, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
-    """Return the back or front inside the first rail and outside the others; along: use rails forwards."""
+    """Return the back or front inside the first rail and outside the others; along: True to use rails forwards."""
     loops = [rail.along() if along else rail.against() for rail in rails]
     face = face_inside(patch.surface, patch.outward, *loops)
     for rail in rails if patch.uv is not None else ():

@@ -418,7 +418,7 @@ def clear_apertures(front: np.ndarray, back: np.ndarray) -> tuple[Outline, Outli
         corner = round(corner, APERTURE_DECIMALS) if corner > CIRCLE_TOLERANCE else 0.0
         rim = Rounded(width, height, corner_radius=corner) if corner else Rectangle(width, height)
     if not (off := np.abs(rim.depth(*back.T)).max()) <= CIRCLE_TOLERANCE:
-        raise ValueError(f"the back's edge is {off:.2g} mm off a circle or rectangle about the axis; make it one")
+        raise ValueError(f"the back's edge is {off:.2g} mm off a circle or rectangle about the axis; correct the edge")
     inset = float(rim.depth(*front.T).max())
     return rim.inset(round(inset, APERTURE_DECIMALS)) if inset > CIRCLE_TOLERANCE else rim, rim
 

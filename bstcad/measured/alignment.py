@@ -187,7 +187,7 @@ def _least_squares(face: BackFace, cloud: np.ndarray, pose: Pose) -> Pose:
 def gauss_newton_step(
     face: BackFace, points: np.ndarray, distances: np.ndarray, normals: np.ndarray, weight: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a Gauss-Newton step (6,) towards zero distances, and orthonormal motions (6, k) that points determine."""
+    """Return a Gauss-Newton step (6,) to zero distances, and orthonormal motions (6, k) that the points determine."""
     columns = face.columns(points, normals)
     weight = np.full(len(points), 1 / len(points)) if weight is None else weight / weight.sum()
     weighted = columns * weight[:, None]
