@@ -1,4 +1,4 @@
-"""The thread that makes previews: first for the newest scene of each page; slower answers follow when it is idle.
+"""The thread that makes previews: first for the newest scene of each page; slower answers follow when there is none.
 
 A request of a page replaces the page's earlier request, whose work ends at the next step.  The answers come in the
 order of STAGES: a quick preview, a refined preview, the effects that are left out, and predictions for each quality.

@@ -1,4 +1,4 @@
-"""Run designs in cold processes, measure their time and error, calibrate this machine, and store records on disk.
+"""Run designs in new processes (cold runs), measure their time and error, calibrate this machine, and store records.
 
 The time of a run is the time of the whole command: imports, picture, tailoring, writing and verification.  The RRMSD of
 all lenses is measured with one reference: stratified rays on the pixels of the base scene.

@@ -1,8 +1,8 @@
 """Command `bstcad tradeoff`: measure what accuracy costs in time for a scene, by runs within a budget of seconds.
 
 A run is a design of the base scene with some settings changed.  One knob (setting) is varied at a time, then pairs.
-The budget limits the sum of the times of all runs of all sweeps in a folder, on any machine.  A run that is predicted
-to exceed the budget is not started.  A run that takes longer is stopped when it exceeds the budget by MAX_OVERRUN.
+The budget limits the sum of the times of all runs by this version of bstcad in a folder, on any machine.  A run that is
+predicted to exceed the budget is not started; a run that exceeds the budget by the fraction MAX_OVERRUN is stopped.
 
 The folder contains the base scene (scene/), the record of each run (runs/), and the results (results.py).  A run with a
 record is not repeated, so an interrupted sweep continues, and a larger budget adds runs.
@@ -157,7 +157,7 @@ def _adam_points(own: bool) -> Points:
 
 
 def _joint_points(*varied: tuple[str, Any, Sequence[float]]) -> Points:
-    """Return points that vary keys together: (key, value of the base, multiples); a net is scaled by its spans."""
+    """Return points that vary keys together: (key, base value, multiples) of each.  A net is scaled by its spans."""
     points = {}
     for multiples in zip(*(multiples for _, _, multiples in varied), strict=True):
         values = {
