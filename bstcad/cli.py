@@ -628,7 +628,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         code = INTERRUPTED
     except (signals.Terminated, Exception) as error:
-        if ended := signals.termination():  # the exception may have been replaced on its way
+        if ended := signals.termination():  # another exception may have replaced Terminated
             return _say(f"ended by {ended.name}; {note(error) or 'nothing is kept'}", 128 + ended.number)
         sentence, code = sentence_of(error), 2
         if sentence is None:

@@ -87,7 +87,7 @@ def same_front(one: Surface, other: Surface) -> bool:
 # --- estimates of file sizes ------------------------------------------------------------------------------------------
 
 LARGE_STEP = 100e6  # smallest size of lens.step that is printed before a design (bytes)
-BYTES_PER_POINT = 83  # bytes of a control point's STEP statement and of a reference to it, without #number in both
+BYTES_PER_POINT = 83  # bytes of a control point's STEP statement and of a reference to it, without its number's digits
 OTHER_BYTES = 103_000, 1600  # bytes of all other statements: constant part, and part per control point of a side
 
 

@@ -93,7 +93,7 @@ class DesignState:
     """State from which a design can be continued; a checkpoint stores it under the names of its fields."""
 
     record: DesignRecord  # stage times and history so far
-    first: Stage1State | None = None  # state of stage 1; None: it has ended
+    first: Stage1State | None = None  # state of stage 1; None: it has not begun, or it has ended
     followed: Stage1Result | None = None  # result of stage 1; None: it has not ended
     second: Stage2State | None = None  # state of stage 2 or 3; None: it has not begun, or it has ended
     best: RatedLens | None = None  # best lens at the end of a part of stage 2 or 3 so far; None: no part has ended
@@ -330,7 +330,7 @@ def _stage1(
     driver.end(name, rrmsd)
     if bounds is not None:
         driver.hooks.progress(BOUNDS_STAGE, 0, 1, "")
-        if lens.shapes("front"):  # stage 2 allows for a shift of the back, but does not shift it
+        if lens.shapes("front"):  # shifted before stage 2, which corrects the light but does not shift the back
             lens = place_back(lens, lens.back.z, task.min_thickness, bounds)
         lens = enforce_bounds(lens, bounds)
         check_thickness(lens, scene)

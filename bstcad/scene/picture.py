@@ -236,7 +236,7 @@ class Photo:
     profile: Conversion | None = None  # the picture's ICC profile; None: the colours are sRGB
     low: Image.Image | None = None  # second bytes of 16-bit colours; Pillow keeps only the first bytes
     white: float = 1.0  # pixel value of white, for files with neither 8 nor 16 bits
-    other_curve: Curve | None = None  # other possible curve, if the file states none and its depth is uncommon
+    other_curve: Curve | None = None  # other possible curve of a file without a stated curve and of an uncommon depth
     assumed: str = ""  # sentence on the assumed curve; "": none is assumed
     several: bool = False  # True if the file has further pictures
 

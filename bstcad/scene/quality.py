@@ -23,11 +23,11 @@ PRESETS: dict[str, dict[str, Any]] = {
     | {"method": "adam", "overshoot": 0.0, "precision": "float32"}
     | {"transport_grid": 1024, "rays": 1024, "stage2_iterations": 500, "source_points": 64},
 }
-BASELINES = {  # methods without limits of time, accuracy or shape: name in messages, and the key that selects another
+BASELINES = {  # methods without limits of time, accuracy or shape: name in messages, key that selects another method
     "adam": ("the paper's procedure", "tailoring.quality"),
     "integration": ("point-by-point integration", "tailoring.method"),
 }
-COARSEST_GRID = 64  # smallest number of cells per side of the transport problem; it costs almost no time
+COARSEST_GRID = 64  # smallest number of cells per side of the transport problem; such a grid costs almost no time
 VERIFICATION_POINTS = 32  # points of an extended source in a verification; the RRMSD is from random points instead
 VERIFICATION_DRAW = 1 << 12  # number of the set of these points; each further spectral line has the next number
 

@@ -282,7 +282,7 @@ class Drawing:
 
 
 def with_distinct_names(given: Target | tuple[Target, ...]) -> tuple[Target, ...]:
-    """Return all targets of a scene, with a different file name for each image: the copies are in one folder."""
+    """Return all targets of a scene, with a different file name for each image, since the copies are in one folder."""
     images: dict[str, bytes] = {}  # contents by name in lower case, as a file system may compare names
 
     def distinct(image: Picture) -> Picture:
@@ -357,7 +357,7 @@ IRRELEVANT = {"z": 0.0, "tilt": None, "weight": 1.0, "outline": None, "seen_from
 
 def drawing(target: Target) -> Drawing:
     """Return the irradiance of a target's picture per pixel, before its outline, and remarks on it."""
-    return _drawing(target.model_copy(update=IRRELEVANT))  # these keys do not change the drawing
+    return _drawing(target.model_copy(update=IRRELEVANT))  # these keys do not change the drawing, which is cached
 
 
 @functools.lru_cache(maxsize=4)  # a photograph takes half a second, and is needed for the check and for the design
