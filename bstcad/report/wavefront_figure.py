@@ -57,7 +57,7 @@ def words(error: WavefrontError) -> str:
     """Return a line on the removed tilt, the angles between rays and requested rays, and the rounding error."""
     piston, (along_x, along_y) = error.without_piston, error.tilt
     return (
-        f"Removed tilt: ({number(along_x)}, {number(along_y)}) µrad; RMS with this tilt: {number(piston.rms)} waves.  "
+        f"Removed tilt: ({number(along_x)}, {number(along_y)}) µrad; with this tilt, RMS {number(piston.rms)} waves.  "
         f"Angles to the requested rays: RMS {number(error.angle_rms)} µrad, maximum {number(error.angle_max)} µrad.  "
         f"Rounding error: {number(error.floor)} waves."
     )
