@@ -60,7 +60,7 @@ def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
     if (first := channels[0].source).kind not in LAMPS:
         return f"Mitsuba has no lamp for the light of {type(first).__name__}"
     if first.parallel and points_per_line(channels) > 1:
-        return "parallel light starts from one plate for each direction, and these plates would block each other"
+        return "parallel light of many directions starts from a plate per direction, and these plates block each other"
     if lens.passes.sense < 0 and first.parallel:
         return "a parallel beam that comes down to a mirror starts from a plate, which would block the reflected light"
     return ""
