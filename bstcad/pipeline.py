@@ -232,7 +232,7 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
     channels = scene.with_source_scaled(0.0).channels()
     light = max(channels, key=lambda channel: channel.weight)  # channel of stage 1
     lens, grazing = light.through(scene.flat_lens(REACH_NET)), MAX_EXIT_ANGLE
-    if refracts := lens.passes.largest_turn(light.index) is not None:
+    if refracts := lens.passes.largest_deflection(light.index) is not None:
         grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.source, lens))
     part = reachable(light.source, lens, goal, grazing=grazing)
     if part is not None and scene.lens.front.free:  # another front may send light further
@@ -250,7 +250,7 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
 
 def unreachable(scene: Scene, part: np.ndarray, picture: np.ndarray) -> str:
     """Return a sentence, without full stop, on the unreachable part of a target and the reason."""
-    found = unreached(picture, part, scene.lens.passes.largest_turn(scene.index))
+    found = unreached(picture, part, scene.lens.passes.largest_deflection(scene.index))
     area, light = (f"{100 * (found[key] or 0.0):.2g} %" for key in ("area", "light"))
     why = "no slope up to 70 degrees sends light there"
     if found["angle"] is not None:
@@ -454,7 +454,7 @@ def purpose(scene: Scene, device: str) -> dict[str, Any]:
 
 def require_light(lens: Lens, rrmsd: float) -> float:
     """Return the RRMSD after stage 1; SceneError if no light reaches the target, as no later stage can correct this."""
-    angle = lens.passes.largest_turn(lens.index)
+    angle = lens.passes.largest_deflection(lens.index)
     if not math.isfinite(rrmsd) and angle is None:
         raise SceneError(
             "target: no light from the mirror reaches the target; move the target nearer to where a flat mirror would "

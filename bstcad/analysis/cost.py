@@ -223,7 +223,7 @@ class ControlCells:
     coarsest cosines of the tile.  The energy of the other cosines is a lower bound of the squared error.
     """
 
-    a_pixel: np.ndarray = field(repr=False)  # number of cells that light each pixel, (rows, columns), row 0 = y max
+    cells_per_pixel: np.ndarray = field(repr=False)  # cells that light each pixel, (rows, columns), row 0 = y max
     target: np.ndarray = field(repr=False)  # target picture, (rows, columns)
 
     def floor(self, finer: float = 1.0) -> float:
@@ -231,7 +231,7 @@ class ControlCells:
 
         finer: factor of the number of control points per side.
         """
-        tiles, cells = (_tiles(picture) for picture in (self.target, self.a_pixel))
+        tiles, cells = (_tiles(picture) for picture in (self.target, self.cells_per_pixel))
         energy = dctn(tiles, axes=(1, 2), norm="ortho").reshape(len(tiles), -1)[:, COARSE_TO_FINE] ** 2
         made = np.floor(np.minimum(finer**2 * cells.sum((1, 2)), TILE_PIXELS**2)).astype(int)
         left = np.where(np.arange(TILE_PIXELS**2) >= made[:, None], energy, 0.0)

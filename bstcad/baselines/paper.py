@@ -25,7 +25,7 @@ from bstcad.optics.rays import Landed, Rays
 from bstcad.optics.sides import Sides
 from bstcad.optics.trace import clear_window, trace
 from bstcad.tailoring import slope_map
-from bstcad.tailoring.merit import landing
+from bstcad.tailoring.merit import mean_square_miss
 from bstcad.tailoring.minimise import AdamState, Best, Iterate, adam, minimise
 from bstcad.tailoring.run import Parameters, StageStep, Task, maker
 from bstcad.transport.bfm import TransportStep
@@ -86,7 +86,7 @@ def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: 
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaves = [p.detach().clone().requires_grad_() for p in parameters]
-        merit = landing(trace(rays, with_parameters(lens, leaves, task.free), screen.plane), aim)
+        merit = mean_square_miss(trace(rays, with_parameters(lens, leaves, task.free), screen.plane), aim)
         return float(merit.detach()), list(torch.autograd.grad(merit, leaves)), float("nan")
 
     steps, rates = task.knobs.stage1_iterations, [STAGE1_RATES[nearest], *(FRONT_RATES[name] for name in task.free)]

@@ -88,7 +88,7 @@ class Collimated(Emitter):
         The aperture stays in a plane z = const when the light is rotated, and is too wide by the factor 1 / cos: by
         1.5e-6 of its size at 0.1 degrees.
         """
-        if not (motion.turns or self.tilted):  # light along z has the same irradiance on all planes
+        if not (motion.rotates or self.tilted):  # light along z has the same irradiance on all planes
             x, y = (p + d for p, d in zip(self.centre or (0.0, 0.0), motion.shift, strict=False))
             return self if (x, y) == (0.0, 0.0) and self.centre is None else replace(self, centre=(x, y))
         width = 2 * math.hypot(*self.aperture.half_extent)

@@ -59,7 +59,7 @@ class Screen:
         (new_x, new_y, z), (old_x, old_y, _) = motion.point(self.middle), self.middle
         (left, right), (low, high) = self.x, self.y
         x, y = (left - old_x + new_x, right - old_x + new_x), (low - old_y + new_y, high - old_y + new_y)
-        if not motion.turns:
+        if not motion.rotates:
             return replace(self, x=x, y=y, z=z)
         e_x, e_y, n = map(motion.direction, clocked(axes(self.tilt or (0.0, 0.0)), self.clocking))
         return replace(self, x=x, y=y, z=z, tilt=tilt_of(n), clocking=clocking_of((e_x, e_y, n)))

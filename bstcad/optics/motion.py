@@ -42,7 +42,7 @@ class Motion:
         return Motion(self.rotation @ first.rotation, shift=self.point(first.point(ORIGIN)))
 
     @property
-    def turns(self) -> bool:
+    def rotates(self) -> bool:
         """True if the motion contains a rotation."""
         return not np.array_equal(self.rotation, np.eye(3))
 

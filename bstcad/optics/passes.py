@@ -75,7 +75,7 @@ class Passes:
         return 1 if self.steps[0].face == "front" else -1
 
     @property
-    def turn(self) -> int:
+    def reversal(self) -> int:
         """Direction along z of the emergent light relative to the incident light: 1 or -1."""
         return (-1) ** sum(law is Reflect for _, law in self.steps)
 
@@ -84,7 +84,7 @@ class Passes:
         by_law = {Reflect: 2.0 * (index if self.enters else 1.0), Refract: abs(index - 1)}
         return sum(by_law[self.steps[k].law] for k in self.numbers_of(face))
 
-    def largest_turn(self, index: float) -> float | None:
+    def largest_deflection(self, index: float) -> float | None:
         """Return the largest deflection (degrees) by one face, limited by total internal reflection; None: a mirror."""
         return None if self.reflects else math.degrees(math.acos(1 / index))
 

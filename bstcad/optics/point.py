@@ -113,7 +113,7 @@ class Point(Emitter):
 
     def moved(self, motion: Motion, entrance: float) -> Point:
         """Return the point source after a motion."""
-        tilt = self.tilt if not motion.turns else tilt_of(motion.direction(self.axes[2]))
+        tilt = self.tilt if not motion.rotates else tilt_of(motion.direction(self.axes[2]))
         return replace(self, position=motion.point(self.position), tilt=tilt)
 
     def with_wider_cone(self, by: float) -> Point | None:

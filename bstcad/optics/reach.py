@@ -140,6 +140,6 @@ def reach_margin(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing:
 def unreached(picture: np.ndarray, part: np.ndarray, angle: float | None) -> dict[str, float | None]:
     """Return the fractions of area and light of a picture that lie outside its reachable `part` (True: reachable).
 
-    angle: largest deflection (degrees) of the face (Passes.largest_turn), copied to the result.
+    angle: largest deflection (degrees) of the face (Passes.largest_deflection), copied to the result.
     """
     return {"area": float(1 - part.mean()), "light": float(picture[~part].sum() / picture.sum()), "angle": angle}

@@ -326,7 +326,7 @@ def contents_of(
 def _unreached(scene: Scene, goal: Goal) -> dict[str, float | None] | None:
     if goal.reachable is None:
         return None
-    return unreached(goal.whole, goal.reachable, scene.lens.passes.largest_turn(scene.index))
+    return unreached(goal.whole, goal.reachable, scene.lens.passes.largest_deflection(scene.index))
 
 
 def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:

@@ -131,7 +131,7 @@ def _tilted_faces(element: Window | Mirror, middle: float) -> tuple[Plane | Sphe
     return tuple(faces)
 
 
-def turns(elements: Sequence[Window | Mirror]) -> int:
+def reversal(elements: Sequence[Window | Mirror]) -> int:
     """Return -1 for an odd number of mirrors, which reverse the light along z, or else 1."""
     return -1 if sum(element.kind == "mirror" for element in elements) % 2 else 1
 
@@ -144,7 +144,7 @@ def interfaces(elements: Sequence[Window | Mirror], sense: int, wavelength: floa
     found: list[Interface] = []
     for element in elements:
         found += element.interfaces(sense, wavelength)
-        sense *= turns((element,))
+        sense *= reversal((element,))
     return tuple(found)
 
 
@@ -177,7 +177,7 @@ class LightPath:
     @property
     def sense(self) -> int:
         """Direction along z, 1 or -1, of the light that leaves the source."""
-        return turns(self.before) * self.lens.passes.sense
+        return reversal(self.before) * self.lens.passes.sense
 
     @property
     def is_folded(self) -> bool:
@@ -214,7 +214,7 @@ class LightPath:
             [(Station.of(f"{name}[{k}]", element), element.kind == "mirror") for k, element in enumerate(of)]
             for name, of in (("before", self.before), ("behind", self.behind))
         )
-        stops = [*before, (optic, lens.passes.turn < 0), *behind]
+        stops = [*before, (optic, lens.passes.reversal < 0), *behind]
         if start is not None:
             stops.insert(0, (Station(key, "the source", start, start), False))
         elif sense < 0:
@@ -225,7 +225,7 @@ class LightPath:
             if not (other.low - one.high if sense > 0 else one.low - other.high) > 0:
                 follows = " must follow ".join(f"{p.words}, z = {p.low:.6g} to {p.high:.6g}," for p in (other, one))
                 yield f"{other.key}: {follows} along {DIRECTIONS[sense]}, as the light travels; move one of them"
-        sense = turns(self.behind)
+        sense = reversal(self.behind)
         for key, target in self.targets.items():
             if self.behind:
                 last = self.behind[-1]

@@ -221,7 +221,7 @@ class Scene(Record):
     @property
     def folded(self) -> bool:
         """True if the light reaches the targets along -z, after an odd number of mirrors behind the lens."""
-        return elements.turns(self.behind) < 0
+        return elements.reversal(self.behind) < 0
 
     @property
     def index(self) -> float:

@@ -122,9 +122,10 @@ def _choose_for_target(scene: Scene) -> Choice:
     scenes = [scene.changed({NET_KEY: net}) for net in candidate_nets(scene)]
     lens = coarse_lens(scenes[0])
     light, image = area_cells(scenes[0], lens), blur_rrmsd(scenes[0], lens)
-    a_pixel = [light.a_pixel.sum() / math.prod(each.lens.cells) / light.target.size for each in scenes]  # on average
+    pixels = light.target.size
+    mean_cells = [light.cells_per_pixel.sum() / math.prod(each.lens.cells) / pixels for each in scenes]  # per pixel
     candidates: list[Candidate] = []
-    for each, cells, coarser_cells in zip(scenes, a_pixel, [0.0, *a_pixel], strict=False):
+    for each, cells, coarser_cells in zip(scenes, mean_cells, [0.0, *mean_cells], strict=False):
         if coarser_cells > SUFFICIENT_CELLS:
             break
         likely = net_rrmsd(light, each, image)
@@ -182,8 +183,8 @@ def seam_shift(scene: Scene) -> float:
     radius, target = scene.lens.tool_radius, scene.target
     if radius is None:
         return math.inf
-    turn = max(scene.lens.passes.deflection(face, scene.index) for face in scene.lens.tailored_faces)
-    throw = abs(target.screen.plane.per_radian(scene.lens.back.z)) * turn / radius
+    deflection = max(scene.lens.passes.deflection(face, scene.index) for face in scene.lens.tailored_faces)
+    throw = abs(target.screen.plane.per_radian(scene.lens.back.z)) * deflection / radius
     return throw * math.sqrt(math.prod(scene.lens.cells)) * math.sqrt(math.prod(target.screen.per_unit))
 
 
@@ -233,7 +234,7 @@ def net_rrmsd(light: ControlCells, scene: Scene, image: float = 0.0) -> float:
     width, height = scene.lens.cells
     finer = 1 / math.sqrt(width * height)
     other_tiles = tuple(slice(TILE_PIXELS // 2 if side > TILE_PIXELS // 2 else 0, None) for side in light.target.shape)
-    between = replace(light, a_pixel=light.a_pixel[other_tiles], target=light.target[other_tiles])
+    between = replace(light, cells_per_pixel=light.cells_per_pixel[other_tiles], target=light.target[other_tiles])
     floors = (FLOOR_FACTOR * light.floor(finer), FLOOR_FACTOR * between.floor(finer))
     halved = (HALVED_FACTOR * light.floor(finer / 2), HALVED_FACTOR * between.floor(finer / 2))
     by_net = factor * math.hypot(*floors, *halved) / math.sqrt(2) + rest

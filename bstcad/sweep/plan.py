@@ -105,8 +105,8 @@ def _goal_effects(scene: Scene, lens: Lens, key: str) -> dict[str, Any]:
     goal = replace(scene.goals[0], key=key)
     goal = goal.restricted(reachable_part(scene, goal)[0])
     part, target = goal.reachable, goal.picture
-    whole, turn = goal.whole, lens.passes.largest_turn(scene.index)
-    beyond = None if part is None or whole is None else unreached(whole, part, turn)
+    whole, deflection = goal.whole, lens.passes.largest_deflection(scene.index)
+    beyond = None if part is None or whole is None else unreached(whole, part, deflection)
     estimates, image = left_out(scene, lens, target), blur(scene.channels(), lens, scene.target.screen, target)
     rounded = {"blur": image and round_numbers(asdict(image), 3), "unreachable": beyond and round_numbers(beyond, 3)}
     return {"key": key, "left_out": [asdict(estimate) for estimate in estimates], **rounded}

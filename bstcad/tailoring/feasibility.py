@@ -6,10 +6,10 @@ between lens and target, or light would have to leave the back outside of the ou
 would have to deflect light by more than refraction can.
 
 At an index of 1.49 a front can deflect light by up to 48 degrees.  A back that cancels this deflection is nearly
-vertical, and remains so in stage 2.  If the front would have to deflect light by more than MAX_GENTLE_TURN, stage 1
-therefore raises the dark parts of the furthest picture, which cause the largest deflections, to a floor; stage 2 uses
-the unchanged picture.  (Example: two faces 6 mm apart that have to deflect light by 38 degrees, for a square and
-letters.  RRMSD 0.34 and 0.63 after 100 evaluations per round without this floor, 0.37 and 0.48 with it.)
+vertical, and remains so in stage 2.  If the front would have to deflect light by more than MAX_GENTLE_DEFLECTION,
+stage 1 therefore raises the dark parts of the furthest picture, which cause the largest deflections, to a floor;
+stage 2 uses the unchanged picture.  (Example: two faces 6 mm apart that have to deflect light by 38 degrees, for a
+square and letters.  RRMSD 0.34 and 0.63 after 100 evaluations per round without this floor, 0.37 and 0.48 with it.)
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from bstcad.optics.reach import largest_deflection
 from bstcad.tailoring import light_behind
 from bstcad.tailoring.light_behind import LightBehind
 from bstcad.tailoring.run import Task, no_progress
-from bstcad.tailoring.slope_map import corners_of, lit_window, square_grid
+from bstcad.tailoring.slope_map import lit_corners, lit_window, square_grid
 from bstcad.tailoring.stage2 import with_pixels
 from bstcad.tailoring.two_faces import front_map
 from bstcad.transport.mapping import Solver
@@ -35,7 +35,7 @@ TRIAL_CELLS, TRIAL_PIXELS = 64, 128  # cells per side of the coarse maps, pixels
 TRIAL_ITERATIONS = 100  # iterations of the coarse maps
 MAX_UNSERVED = 0.5  # largest fraction of the light whose rays may miss the outline or cross each other
 REPORTED_FRACTION = 1e-3  # smallest such fraction that is reported
-MAX_GENTLE_TURN = 30.0  # largest deflection at the front for which the furthest picture needs no floor (degrees)
+MAX_GENTLE_DEFLECTION = 30.0  # largest deflection at the front for which the furthest picture needs no floor (degrees)
 TRIED_FLOORS = (0.1, 0.2, 0.4, 1.0)  # floors, relative to the mean of the furthest picture, tried in this order
 SOLUTION_NAMES = {1.0: "convex", -1.0: "concave"}  # names of the solutions with the sign σ of light_behind.py
 
@@ -49,10 +49,10 @@ class Demand:
     rms_angle: float  # RMS angle to the axis over the rays (degrees)
     crossed: float  # fraction of the light whose rays would cross between lens and target
     outside: float  # fraction of the light that would leave the back outside of the outline
-    turn: float  # largest angle by which the front deflects light (degrees); NaN: not computed
+    deflection: float  # largest angle by which the front deflects light (degrees); NaN: not computed
     limit: float  # largest angle by which a front can deflect light (degrees)
     floor: float = 0.0  # irradiance, relative to the mean, to which stage 1 raises dark parts of the furthest picture
-    lifted_turn: float = math.nan  # largest deflection by the front with this floor (degrees)
+    lifted_deflection: float = math.nan  # largest deflection by the front with this floor (degrees)
 
     @property
     def rank(self) -> tuple[float, float]:
@@ -64,12 +64,12 @@ class Demand:
         """Yield sentences on angles, on a floor, and on each failure with its remedy; thickness: mm, at the centre."""
         yield (
             f"{SOLUTION_NAMES[self.solution]} solution: light leaves the lens at up to {self.angle:.3g} degrees from "
-            f"the axis, and the front deflects it by up to {self.turn:.3g} degrees"
+            f"the axis, and the front deflects it by up to {self.deflection:.3g} degrees"
         )
         if self.floor:
             yield (
                 f"stage 1 raises the dark parts of the furthest target to {100 * self.floor:g} % of its mean "
-                f"irradiance, so that the front deflects light by at most {self.lifted_turn:.3g} degrees"
+                f"irradiance, so that the front deflects light by at most {self.lifted_deflection:.3g} degrees"
             )
         if self.crossed > REPORTED_FRACTION:
             yield (
@@ -82,10 +82,10 @@ class Demand:
                 f"{100 * self.outside:.3g} % of the light would have to leave the back outside of lens.outline; "
                 "make the targets smaller, or lens.outline wider"
             )
-        if self.turn > self.limit:
+        if self.deflection > self.limit:
             yield (
-                f"the front would have to deflect light by {self.turn:.3g} degrees, but refraction deflects it by at "
-                f"most {self.limit:.3g} degrees; make the lens thicker than {thickness:.3g} mm"
+                f"the front would have to deflect light by {self.deflection:.3g} degrees, but refraction deflects it "
+                f"by at most {self.limit:.3g} degrees; make the lens thicker than {thickness:.3g} mm"
             )
 
 
@@ -97,38 +97,38 @@ def find_demand(task: Task, lens: Lens) -> Demand:
     best, light = min(solutions, key=lambda one: one[0].rank)
     if is_infeasible(best):
         return best
-    best = replace(best, turn=_largest_turn(task, lens, light))
-    lifted = [replace(best, lifted_turn=best.turn)]
+    best = replace(best, deflection=_largest_deflection(task, lens, light))
+    lifted = [replace(best, lifted_deflection=best.deflection)]
     for floor in TRIED_FLOORS if len(task.goals) > 1 and task.wave is None else ():
-        if lifted[-1].lifted_turn <= MAX_GENTLE_TURN:
+        if lifted[-1].lifted_deflection <= MAX_GENTLE_DEFLECTION:
             break
         _, light = _demand(replace(task, floor=floor), best.solution, lens)
-        lifted.append(replace(best, floor=floor, lifted_turn=_largest_turn(task, lens, light)))
-    return min(lifted, key=lambda each: max(MAX_GENTLE_TURN, each.lifted_turn))
+        lifted.append(replace(best, floor=floor, lifted_deflection=_largest_deflection(task, lens, light)))
+    return min(lifted, key=lambda each: max(MAX_GENTLE_DEFLECTION, each.lifted_deflection))
 
 
 def _demand(task: Task, solution: float, lens: Lens) -> tuple[Demand, LightBehind]:
-    """Return the demand of a solution on coarse grids (turn: NaN), and its rays behind the lens, made not to cross."""
+    """Return the demand of a solution on coarse grids (deflection: NaN), and its rays behind it, made not to cross."""
     knobs = task.knobs.model_copy(update={"transport_grid": TRIAL_CELLS, "transport_iterations": TRIAL_ITERATIONS})
     task = replace(with_pixels(task, TRIAL_PIXELS), knobs=knobs, solution=solution, progress=no_progress)
     light = light_behind.light_for_task(task)
-    angle = np.degrees(np.arccos(light.direction[2].clip(-1, 1)))[corners_of(light.picture)]
+    angle = np.degrees(np.arccos(light.direction[2].clip(-1, 1)))[lit_corners(light.picture)]
     crossed = light.crossed_fraction(lens.back)
     near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
     served = light_behind.without_crossings(light, near.receiver, lens.back, TRIAL_CELLS)
     outside = served.fraction_outside(lens.back, lens.apertures[1].scaled(1 + 1e-3).contains)
     limit, largest, rms = math.degrees(largest_deflection(lens.index)), float(angle.max()), np.sqrt((angle**2).mean())
-    return Demand(solution, largest, float(rms), crossed, outside=outside, turn=math.nan, limit=limit), served
+    return Demand(solution, largest, float(rms), crossed, outside=outside, deflection=math.nan, limit=limit), served
 
 
 @torch.no_grad()
-def _largest_turn(task: Task, lens: Lens, light: LightBehind) -> float:
+def _largest_deflection(task: Task, lens: Lens, light: LightBehind) -> float:
     """Return the largest angle (degrees) between the directions of a ray before the front and in the glass."""
     front, source = lens.shaping("front"), task.heaviest.source
     window, b = lit_window(source, front), light.intersect(lens.back)
     grid = square_grid(source, front, window, TRIAL_CELLS)
     slopes = front_map(front, grid, window, light.picture, b=b, q=None, solver=Solver())
-    lit = corners_of(light.picture)
+    lit = lit_corners(light.picture)
     x, y = (torch.from_numpy(q[lit]) for q in slopes.face_points)
     way = torch.from_numpy(b[:, lit]) - torch.stack([x, y, lens.front.sag_and_slope(x, y)[0]])
     coming = source.rays(x, y, lens.entrance.z, 1.0).direction

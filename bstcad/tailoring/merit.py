@@ -17,9 +17,9 @@ sums over the channels of the light.  For a source of finite size the picture is
 wave there (wavefront_error.py), without piston.
 
 The Hessian: let e be the flux density on the last face, and E the irradiance of the target where its light lands.  A
-change δz of the face moves this light by L ∇δz, where L = |∂t/∂p| (mm) is the throw, the change of the landing point t
-per change of the slope p (for small angles the distance times n - 1), and so changes E by about E L Δδz.  The light of
-an area dA_b of the face falls on the area dA_t = (e / E) dA_b of the target, so that the squared error is
+change δz of the face moves this light by L ∇δz, where L = |∂t/∂p| (mm) is the leverage, the change of the landing
+point t per change of the slope p (for small angles the distance times n - 1), and so changes E by about E L Δδz.
+The light of an area dA_b of the face falls on the area dA_t = (e / E) dA_b of the target, so that the squared error is
 
     ∫ δE² dA_t  =  ∫ (E L Δδz)² (e / E) dA_b  =  L² ∫ e E (Δδz)² dA_b.
 
@@ -70,13 +70,14 @@ LAPLACIAN_POWER = 0.5  # power of the Laplacian in `SobolevVariable`
 COARSE_LAPLACIAN_POWER = 0.75  # power of the Laplacian in `CoarseVariable`, whose knot spans are wider than a pixel
 TARGET_BLUR = 1.0  # standard deviation of the blur of the target before the local weight is computed (pixels)
 WEIGHT_SMOOTHING = 1.5  # standard deviation of the smoothing of the weight's logarithm (control points)
-MAX_LOCAL_WEIGHT = 4.0  # largest local weight; the smallest is 1 / MAX_LOCAL_WEIGHT, before the division by the throw
-MIN_THROW, MAX_THROW = 3.0, 96.0  # range of the throw / median in which the weight is proportional to 1 / throw
-THROW_STEP = 1e-6  # step of the difference quotients of the throw, relative to the distance to the target
-THROW_STRIDE = 8  # every 8th control point is checked first, since few lenses have a large throw anywhere
+MAX_LOCAL_WEIGHT = 4.0  # largest local weight; the smallest is 1 / MAX_LOCAL_WEIGHT, before division by the leverage
+# Range of the leverage / median in which the weight is proportional to 1 / leverage.
+MIN_LEVERAGE, MAX_LEVERAGE = 3.0, 96.0
+LEVERAGE_STEP = 1e-6  # step of the difference quotients of the leverage, relative to the distance to the target
+LEVERAGE_STRIDE = 8  # every 8th control point is checked first, since few lenses have a large leverage anywhere
 
 
-def landing(rays: Landed, aim: Tensor) -> Tensor:
+def mean_square_miss(rays: Landed, aim: Tensor) -> Tensor:
     """Return the mean of |P_t - P|² (mm²) over rays that land at P with the aim P_t (Wang et al. 2023, Eq. 14: sum)."""
     lit = rays.alive & (rays.flux > 0)
     miss = (rays.position[0] - aim[0]) ** 2 + (rays.position[1] - aim[1]) ** 2
@@ -330,7 +331,7 @@ def local_weight(source: Emitter, lens: Lens, goal: Goal, number: int | None = N
     """Return the weight w = (E / mean E)^-1/2 at each control point (m, n), smoothed and clamped.
 
     E is the irradiance of the target where light from the control point lands; before smoothing, w = 1 for light that
-    misses the screen.  On the last net, if light leaves the glass there, the weight is divided by `_excess_throw`.
+    misses the screen.  On the last net, if light leaves the glass there, the weight is divided by `_excess_leverage`.
     number: index of the freeform interface in the lens; None: the back.
     """
     number, screen = lens.number_of("back") if number is None else number, goal.receiver
@@ -347,9 +348,9 @@ def local_weight(source: Emitter, lens: Lens, goal: Goal, number: int | None = N
     weight = np.exp(-0.5 * gaussian_filter(logarithm, WEIGHT_SMOOTHING)).clip(1 / MAX_LOCAL_WEIGHT, MAX_LOCAL_WEIGHT)
     if number == lens.freeform[-1] and onwards[0].law.eta > 1:
         plane = image_from_last_net(lens, screen.plane)
-        throw = _excess_throw(at_net, landed.position, plane, law=onwards[0].law, on_screen=on_screen)
-        if throw is not None:
-            weight = weight / np.exp(gaussian_filter(np.log(throw), WEIGHT_SMOOTHING))
+        leverage = _excess_leverage(at_net, landed.position, plane, law=onwards[0].law, on_screen=on_screen)
+        if leverage is not None:
+            weight = weight / np.exp(gaussian_filter(np.log(leverage), WEIGHT_SMOOTHING))
     return torch.from_numpy(weight)
 
 
@@ -359,18 +360,18 @@ def control_point_axes(net: BSplineSurface) -> tuple[Tensor, Tensor]:
     return x, y
 
 
-def _excess_throw(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, on_screen: np.ndarray) -> np.ndarray | None:
-    """Return the throw relative to MIN_THROW times its median (m, n), at least 1; None if it is 1 everywhere.
+def _excess_leverage(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, on_screen: np.ndarray) -> np.ndarray | None:
+    """Return the leverage relative to MIN_LEVERAGE times its median (m, n), at least 1; None if it is 1 everywhere.
 
-    The throw is the largest singular value of ∂t/∂p (mm), the inverse of the smallest one of ∂p/∂t; p(b, t) are the
+    The leverage is the largest singular value of ∂t/∂p (mm), the inverse of the smallest one of ∂p/∂t; p(b, t) are the
     slopes that send light from b to the target point t.
     """
-    for some in (slice(None, None, THROW_STRIDE), slice(None)):
+    for some in (slice(None, None, LEVERAGE_STRIDE), slice(None)):
         rays = replace(at_net, **{key: getattr(at_net, key)[..., some, some] for key in ("position", "direction")})
         t, lit = aim[..., some, some], on_screen[some, some]
         if not lit.any():
             return None
-        step = THROW_STEP * torch.sqrt((t**2).sum(0) + plane.per_radian(at_net.z) ** 2).max()
+        step = LEVERAGE_STEP * torch.sqrt((t**2).sum(0) + plane.per_radian(at_net.z) ** 2).max()
         centre, *shifted = (
             torch.stack(wanted_slopes(rays, t + step * torch.tensor(way).to(t).view(2, 1, 1), plane, law))
             for way in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
@@ -378,8 +379,9 @@ def _excess_throw(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, on_scree
         (a, b), (c, d) = ((p - centre) / step for p in shifted)
         square, det = a * a + b * b + c * c + d * d, a * d - b * c
         largest = (square + torch.sqrt((square * square - 4 * det * det).clamp(min=0))) / 2
-        throw = (largest.sqrt() / det.abs().clamp(min=1e-300)).cpu().double().numpy()
-        farther = np.where(lit, throw / (MIN_THROW * np.median(throw[lit])), 1.0).clip(1.0, MAX_THROW / MIN_THROW)
+        leverage = (largest.sqrt() / det.abs().clamp(min=1e-300)).cpu().double().numpy()
+        relative = np.where(lit, leverage / (MIN_LEVERAGE * np.median(leverage[lit])), 1.0)
+        farther = relative.clip(1.0, MAX_LEVERAGE / MIN_LEVERAGE)
         if not (farther > 1).any():
             return None
     return farther

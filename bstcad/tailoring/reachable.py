@@ -53,7 +53,7 @@ def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT
     screen, picture, small = goal.receiver, goal.picture, resample(goal)
     few, corners, solver = small.receiver, slope_map.pixel_corners(small.receiver), Solver(MAP_ITERATIONS)
     grid = slope_map.face_grid(source, lens, slope_map.lit_window(source, lens, FACE_CELLS), FACE_CELLS)
-    lit_x, lit_y = (corner[slope_map.corners_of(small.picture)] for corner in corners)
+    lit_x, lit_y = (corner[slope_map.lit_corners(small.picture)] for corner in corners)
     lit = lit_x, lit_y
     around = np.meshgrid(*(np.linspace(aims.min(), aims.max(), BOX_AIMS) for aims in lit), indexing="ij")
     plane, law = image_from_last_net(lens, screen.plane), lens.last_freeform.law
@@ -64,7 +64,7 @@ def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT
         return None
     found = _inside(reach_from_each(grid, corners, plane, law, grazing=grazing).amax(0), screen, few)
     slopes, lens = None, lens.refined(MAP_NET)
-    for turn in range(MAX_ROUNDS):
+    for number in range(MAX_ROUNDS):
         if not picture[found].sum() > 0:
             break
         window, part = slope_map.lit_window(source, lens), resample(goal.restricted(found))
@@ -73,7 +73,7 @@ def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT
         grid = slope_map.face_grid(source, lens, window, 2 * MAP_NET)
         aims, rays = torch.from_numpy(np.stack(corners)), slope_map.rays_at(grid, slopes.face_points)
         before, found = found, _inside(reach_margin(rays, aims, plane, law=law, grazing=grazing), screen, few)
-        if turn and picture[before ^ found].sum() <= SETTLED_FRACTION:
+        if number and picture[before ^ found].sum() <= SETTLED_FRACTION:
             break
         lens = slope_map.fit_to_map(lens, slopes, grid, COARSE_FIT)
     return found if (picture[~found] > 0).any() else None

@@ -176,7 +176,7 @@ def transport_slopes(
     sigma, frame = resample_picture(picture, (y_x, y_y), n)
     mapping = solve(light_density(rho, side), sigma, Frame((0.0, 0.0), side), frame, solver=solver)
     now = mapping.inverse(y_x, y_y)
-    lit = corners_of(picture)
+    lit = lit_corners(picture)
     x, y = ((after - before)[lit] for after, before in zip(now, points, strict=True))
     return SlopeMap(mapping, g, sign, now, moved=float(np.sqrt(np.mean(x * x + y * y))) / (side / 2))
 
@@ -282,7 +282,7 @@ def pixel_corners(screen: Screen) -> Points:
 
 def resample_picture(picture: np.ndarray, corners: Points, n: int) -> tuple[Density, Frame]:
     """Return the density of a picture on n x n cells of the smallest square around its lit corners, and the square."""
-    lit = corners_of(picture)
+    lit = lit_corners(picture)
     low, high = (np.array([f(c[lit]) for c in corners]) for f in (np.min, np.max))
     x_mean, y_mean = (low + high) / 2
     frame = Frame((x_mean, y_mean), float((high - low).max()))
@@ -303,7 +303,7 @@ def light_density(values: np.ndarray, side: float) -> Density:
     return Density.from_values(values)
 
 
-def corners_of(picture: np.ndarray) -> np.ndarray:
+def lit_corners(picture: np.ndarray) -> np.ndarray:
     """Return True at the corners of all pixels that are not black, (columns + 1, rows + 1), x first."""
     lit = np.pad(picture[::-1].T > 0, 1)  # row 0 is y max
     return lit[1:, 1:] | lit[1:, :-1] | lit[:-1, 1:] | lit[:-1, :-1]

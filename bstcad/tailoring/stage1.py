@@ -35,7 +35,7 @@ from bstcad.scene.quality import COARSEST_GRID
 from bstcad.scene.scene import SEARCH_RANGE
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.machinability import place_back
-from bstcad.tailoring.merit import landing
+from bstcad.tailoring.merit import mean_square_miss
 from bstcad.tailoring.reachable import resample
 from bstcad.tailoring.run import Parameters, StageStep, Steps, Task
 from bstcad.tailoring.slope_fit import Fit, tailor_to_aim
@@ -135,14 +135,14 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> St
     knobs, z = task.knobs, lens.back.z  # z: plane of the back in the blank (mm)
     slopes, done = (None, 0) if state is None else (state.slopes, state.round)
     lens = lens if state is None else state.lens.apply_to(lens)
-    turn = min(done, knobs.rounds - 1)
-    while turn < knobs.rounds:
-        if slopes is None or turn >= done:
-            lens, slopes = _round(task, lens, slopes, turn)
+    number = min(done, knobs.rounds - 1)
+    while number < knobs.rounds:
+        if slopes is None or number >= done:
+            lens, slopes = _round(task, lens, slopes, number)
             lens = place_back(lens, z, task.min_thickness, task.bounds)  # the next round starts from the shifted back
             task.tidy()
-        turn = next_round(turn, knobs.rounds, fine=FINE_ROUNDS, settled=slopes.moved <= SETTLED_CHANGE)
-        yield round_step(task, lens, SlopeRound(turn, Parameters.of(lens), slopes), slopes.face_points)
+        number = next_round(number, knobs.rounds, fine=FINE_ROUNDS, settled=slopes.moved <= SETTLED_CHANGE)
+        yield round_step(task, lens, SlopeRound(number, Parameters.of(lens), slopes), slopes.face_points)
 
 
 def next_round(number: int, rounds: int, fine: int, settled: bool) -> int:
@@ -156,14 +156,14 @@ def round_step(task: Task, lens: Lens, state: SlopeRound, face_points: Points) -
     return StageStep(make, state, mapping=state.slopes.mapping, face_points=face_points, progress=progress)
 
 
-def _round(task: Task, lens: Lens, previous: SlopeMap | None, turn: int) -> tuple[Lens, SlopeMap]:
-    """Run round number `turn`; return the lens and the map to which it is fitted."""
-    knobs, source, goal, left = task.knobs, task.heaviest.source, task.goals[0], task.knobs.rounds - turn
+def _round(task: Task, lens: Lens, previous: SlopeMap | None, number: int) -> tuple[Lens, SlopeMap]:
+    """Run the round of this number (from 0); return the lens and the map to which it is fitted."""
+    knobs, source, goal, left = task.knobs, task.heaviest.source, task.goals[0], task.knobs.rounds - number
     cells = max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left - 1, 2))
     m = knobs.levels[max(-left, -len(knobs.levels))] if left <= FINE_ROUNDS else knobs.levels[0]
 
     def progress(s: TransportStep) -> None:
-        task.progress("stage 1", turn, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
+        task.progress("stage 1", number, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
 
     lens = task.refined(lens, m)
     window = slope_map.lit_window(source, lens)
@@ -186,8 +186,8 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     strong lenses near the source, and in glass of low index.  The part of the map that is not a gradient is lost.
     """
     knobs, goal, z = task.knobs, task.goals[0], lens.back.z
-    for turn in range(AIM_ROUNDS):
-        n, m = (COARSEST_GRID, knobs.levels[0]) if turn < AIM_ROUNDS - 1 else (knobs.transport_grid, knobs.levels[-1])
+    for number in range(AIM_ROUNDS):
+        n, m = (COARSEST_GRID, knobs.levels[0]) if number < AIM_ROUNDS - 1 else (knobs.transport_grid, knobs.levels[-1])
         lens = task.refined(lens, m)
         side = min(3 * max(as_pair(m)), max(2 * max(as_pair(m)), knobs.rays))  # many rays may leave through the sides
         counts = {"n": n, "side": side, "iterations": knobs.transport_iterations}
@@ -220,7 +220,7 @@ def shaped_front(
 
     def miss(front: Lens) -> float:
         fitted = tailor_to_aim(front, rays, aims, plane=plane, repeats=effort.repeats)
-        return float(landing(trace(rays, fitted, plane), aims))
+        return float(mean_square_miss(trace(rays, fitted, plane), aims))
 
     return lens.with_front(best_front(miss, lens, free, rim_sags).front)
 

@@ -112,7 +112,7 @@ class TubeRound:
             return merit
         return merit.with_blur(self.source, lens, seed=None if task.preview else task.knobs.seed)
 
-    def search(
+    def run(
         self, problem: Problem, variables: NetVariables, position: SearchPosition, total: int, state: TubeSearch | None
     ) -> Iterator[tuple[Iterate, StageStep]]:
         """Yield (iterate, step) of one run of the minimiser from a lens or a saved state, until `goal_by_tubes`.
@@ -121,7 +121,7 @@ class TubeRound:
         """
         lens, evaluations = problem.lens, position.round_end - position.done
         work = 0.0  # unknown for the first step, which includes other work
-        for iterate in search(lens, problem, variables, evaluations=evaluations, state=state):
+        for iterate in minimise_merit(lens, problem, variables, evaluations=evaluations, state=state):
             best, reason = iterate.best, iterate.reason
             step = StageStep(partial(with_best_nets, lens, variables, best), work=work, skipped=iterate.skipped)
             if not iterate.skipped:
@@ -157,7 +157,7 @@ class TubeSearch:
 
     position: SearchPosition
     best: Best  # best point of this search
-    search: LbfgsState
+    lbfgs: LbfgsState
 
 
 def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Steps:
@@ -246,7 +246,7 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
                 task.tidy()
             bounds = active_bounds(start, task.bounds, task.min_thickness)
             problem = Problem(start, merit, bounds, bound_weight, grazing=grazing)
-            for iterate, step in this_round.search(problem, variables, position, total=total, state=state):
+            for iterate, step in this_round.run(problem, variables, position, total=total, state=state):
                 yield replace(step, part=part)
                 if iterate.reason:
                     break
@@ -344,7 +344,7 @@ def _geometric_mean(weights: Iterable[Tensor]) -> Tensor:
     return elementary(torch.exp, logarithm / (1 + len(others)))
 
 
-def search(
+def minimise_merit(
     lens: Lens, problem: Problem, variables: NetVariables, evaluations: int, state: TubeSearch | None = None
 ) -> Iterator[Iterate]:
     """Run L-BFGS on the heights of all nets, starting from `lens`, in the variables c, one block per net."""
@@ -355,7 +355,7 @@ def search(
         merit, gradients, rrmsd = problem(heights)
         return merit, variables.adjoint(gradients), rrmsd
 
-    method = lbfgs(variables.zeros(), evaluations, None if state is None else state.search)
+    method = lbfgs(variables.zeros(), evaluations, None if state is None else state.lbfgs)
     return minimise(in_c, method, evaluations, state.best if state else Best())
 
 
@@ -374,7 +374,7 @@ def _heights_at(start: Sequence[Tensor], variables: NetVariables, c: Sequence[Te
 class Stage3State:
     """State of stage 3 between two steps of a search."""
 
-    search: TubeSearch
+    tube_search: TubeSearch
 
 
 def with_stage3(before: Stage | None, task: Task, lens: Lens, state: Any = None) -> Steps:
@@ -391,7 +391,7 @@ def with_stage3(before: Stage | None, task: Task, lens: Lens, state: Any = None)
     rounds = stage3_rounds(task)
     if before is None:
         rounds = (*coarse_rounds(task, lens), *rounds)
-    for step in run_rounds(rounds, lens, state and state.search):
+    for step in run_rounds(rounds, lens, state and state.tube_search):
         yield replace(step, state=step.state and Stage3State(step.state))
 
 
@@ -470,6 +470,6 @@ def _tailor_briefly(task: Task, lens: Lens) -> tuple[float, Tensor, Lens]:
     merit = replace(merit, picture_error=task.merit)
     problem, variables = Problem(lens, merit), variables_of(task, lens)
     value, gradients, _ = problem([net.heights for net in lens.nets])
-    *_, last = search(lens, problem, variables, COMPARED_EVALUATIONS)
+    *_, last = minimise_merit(lens, problem, variables, COMPARED_EVALUATIONS)
     flat = torch.cat([g.reshape(-1).double().cpu() for g in gradients])
     return value, flat, with_best_nets(lens, variables, last.best).plain()

@@ -142,7 +142,7 @@ def front_map(
     between each four rays, row 0 = y max.  b: (3, c + 1, r + 1) points where these rays meet the back (mm).  q: points
     where they meet the front (mm) in the last round; None: by the inverse of r.  The result contains the new q.
     """
-    lit = slope_map.corners_of(picture)
+    lit = slope_map.lit_corners(picture)
     low, high = (np.array([f(p[lit]) for p in b[:2]]) for f in (np.min, np.max))
     stretch, shift = (high - low) / (window.width, window.height), (low + high) / 2
     if q is None:

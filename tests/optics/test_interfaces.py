@@ -114,7 +114,7 @@ def test_light_goes_through_a_mangin_mirror_as_snell_has_it():
     """Between flat faces t mm apart a ray of sine s is displaced by 2 t s / r, on a path of 2 t n / r, r² = n² - s²."""
     flat = [net(z, 0.0) for z in (0.0, 6.0)]
     lens = Lens(*flat, SQUARE, N, own_passes=MANGIN)
-    assert lens.passes.sense == 1 and lens.passes.turn == -1 and lens.number_of("back") == 1
+    assert lens.passes.sense == 1 and lens.passes.reversal == -1 and lens.number_of("back") == 1
     assert [interface.surface for interface in lens.interfaces] == [flat[0], flat[1], flat[0]]
     rays = rays_of(SOURCE, lens, size=10.0)
     landed = trace(rays, lens, LevelPlane(-20.0))

@@ -97,10 +97,11 @@ def test_cells_are_those_of_the_light_that_a_pixel_asks_for():
     lens = coarse_lens(PLATE)
     light = area_cells(PLATE, lens)
     arrives = float(tubes_picture(lens, PLATE.channels(), PLATE.target.screen, 257).sum())
-    assert arrives > 0.98 and light.a_pixel.sum() == pytest.approx(1e4 * arrives, rel=2e-3)  # what misses lights none
-    np.testing.assert_allclose(light.a_pixel, 1e4 * light.target, rtol=0.1, atol=1e-4)
+    assert arrives > 0.98
+    assert light.cells_per_pixel.sum() == pytest.approx(1e4 * arrives, rel=2e-3)  # light that misses lights no pixel
+    np.testing.assert_allclose(light.cells_per_pixel, 1e4 * light.target, rtol=0.1, atol=1e-4)
     point = bstcad.load("templates/portrait.toml").changed(FREE | {"target.image": np.ones((64, 64))})
-    area = area_cells(point, coarse_lens(point)).a_pixel
+    area = area_cells(point, coarse_lens(point)).cells_per_pixel
     middle, corner = area[240:272, 240:272].mean(), area[:32, :32].mean()
     assert corner > 3 * middle  # exp(-2 r² / w²): the rim of the lens has an eighth of the middle's flux density
 

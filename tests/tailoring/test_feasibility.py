@@ -7,7 +7,7 @@ import pytest
 from bstcad import pipeline
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
-from bstcad.tailoring.feasibility import MAX_GENTLE_TURN, find_demand, is_infeasible
+from bstcad.tailoring.feasibility import MAX_GENTLE_DEFLECTION, find_demand, is_infeasible
 from tests.two_faces import DISK, SMALL
 
 DISC, GAP = 3.5, 6.0  # mm: radius of the beam, thickness of the blank
@@ -48,8 +48,8 @@ def test_light_runs_straight_through_the_glass_from_rim_to_rim(radius):
     demand = demand_of(scene_of(24.0, [disc(radius)], wavefront=PLANE))
     assert demand.angle == pytest.approx(0.0, abs=1e-6) and demand.crossed < 1e-3 and demand.outside < 1e-3
     wanted = math.degrees(math.atan((radius - DISC) / GAP))
-    assert demand.turn == pytest.approx(wanted, abs=3.0)  # a pixel's diagonal and the dark around it
-    assert (demand.turn > demand.limit) is (radius == 10.0)
+    assert demand.deflection == pytest.approx(wanted, abs=3.0)  # a pixel's diagonal and the dark around it
+    assert (demand.deflection > demand.limit) is (radius == 10.0)
     said = tuple(demand.sentences(GAP))
     assert len(said) == (1 if radius == 5.0 else 2) and not is_infeasible(demand)
 
@@ -63,8 +63,8 @@ def test_light_that_would_leave_beside_the_lens_is_counted():
 def test_a_dark_picture_that_turns_light_too_far_is_lifted_until_it_does_not(z, lifted):
     """Letters behind a disc: the nearer they are to it, the further aside their light has to leave the lens."""
     demand = demand_of(scene_of(14.0, [disc(3.2, 100.0), letter("AB", z)]))
-    assert (demand.turn > MAX_GENTLE_TURN) is lifted
-    assert (demand.floor > 0) is lifted and demand.lifted_turn <= MAX_GENTLE_TURN
+    assert (demand.deflection > MAX_GENTLE_DEFLECTION) is lifted
+    assert (demand.floor > 0) is lifted and demand.lifted_deflection <= MAX_GENTLE_DEFLECTION
     (sentence,) = [each for each in demand.sentences(GAP) if "stage 1 raises" in each] or [None]
     assert (sentence is not None) is lifted
 

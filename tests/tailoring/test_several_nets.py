@@ -24,7 +24,7 @@ from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.machinability import active_bounds, enforce_bounds
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Parameters, Task
-from bstcad.tailoring.stage2 import Problem, search, steps, variables_of, with_best_nets
+from bstcad.tailoring.stage2 import Problem, minimise_merit, steps, variables_of, with_best_nets
 from tests import lenses
 
 N, M, HALF, EVALUATIONS = 1.5, 33, 10.0, 40
@@ -104,7 +104,7 @@ def test_the_merit_of_any_nets_falls_strongly(name):
     task, lens, problem = problem_of(name)
     begun, variables = problem([n.heights for n in lens.nets]), variables_of(task, lens)
     assert len(variables.blocks) == len(lens.freeform)
-    *_, last = search(lens, problem, variables, EVALUATIONS)
+    *_, last = minimise_merit(lens, problem, variables, EVALUATIONS)
     found = with_best_nets(lens, variables, last.best)
     assert last.best.merit < begun[0] / 50 and last.best.figure < begun[2] / 6
     for k, interface in enumerate(found.interfaces):  # what is not free stays

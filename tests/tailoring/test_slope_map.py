@@ -15,7 +15,7 @@ from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit
-from bstcad.tailoring.slope_map import corners_of, face_grid, fit_to_map, lit_window, slope_map, square_grid
+from bstcad.tailoring.slope_map import face_grid, fit_to_map, lit_corners, lit_window, slope_map, square_grid
 from bstcad.transport.mapping import Solver
 from tests.lenses import SQUARE, N, net
 from tests.tracing import simulated
@@ -99,4 +99,4 @@ def test_thecorners_of_what_is_lit():
     """x first and y upwards, though a picture has its rows first and y max on top."""
     picture = np.zeros((4, 4))
     picture[0, 2] = 1.0
-    assert np.argwhere(corners_of(picture)).tolist() == [[2, 3], [2, 4], [3, 3], [3, 4]]
+    assert np.argwhere(lit_corners(picture)).tolist() == [[2, 3], [2, 4], [3, 3], [3, 4]]
