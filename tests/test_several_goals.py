@@ -123,7 +123,7 @@ def test_another_program_traces_each_target(two, verified):
         ("target[0]", "judge_tracer"), ("target[1]", "judge_tracer_2"),
     ]  # fmt: skip
     checks = {check.name: check.passed for check in verified.report.checks if check.id.startswith("judge")}
-    assert checks["irradiance by tracer, difference from bstcad's relative to the noise, target[1]"] is False
+    assert checks["irradiance by tracer: difference from bstcad's, relative to the noise, target[1]"] is False
     assert sum(checks.values()) == len(checks) - 1 == 3
     assert {"judge_tracer", "judge_tracer_2"} <= verified.figures
     assert [number for name, number in verified.drawn if name == "draw_judges"] == [0, 1]

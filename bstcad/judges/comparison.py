@@ -155,8 +155,8 @@ def compare(
     limit = AGREEMENT_FACTOR * (1 + 3 / math.sqrt(_effective_pixels(first - second)))
     over_noise = difference / max(noise, MIN_NOISE)
     on_target, on_target_ours = float(traced.picture.sum()), ours.flux.get("on target", 0.0)
-    irradiance = f"irradiance by {name}, difference from bstcad's relative to the noise{goal.suffix}"
-    flux = f"light on the target by {name}, difference from the ledger's as a fraction of the source's{goal.suffix}"
+    irradiance = f"irradiance by {name}: difference from bstcad's, relative to the noise{goal.suffix}"
+    flux = f"light on the target by {name}: difference from bstcad's, as a fraction of the source's light{goal.suffix}"
     checks = (
         Check.at_most(irradiance, over_noise, limit, id="judge-irradiance"),
         Check.at_most(flux, abs(on_target - on_target_ours), FLUX_TOLERANCE, id="judge-flux"),

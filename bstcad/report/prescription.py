@@ -176,8 +176,8 @@ class Order:
 
     file: str  # name of the file with the geometry: part.step for a scene with a mount, else lens.step
     sha256: str  # SHA-256 of that file, hexadecimal
-    low: Point  # smallest x, y and z
-    high: Point  # largest x, y and z
+    low: Point  # smallest x, y and z of the part
+    high: Point  # largest x, y and z of the part
     volume: float | None  # mm³; None: some faces cannot be integrated
     material: str | None  # name of the material in words
     density: float | None  # g/cm³

@@ -181,7 +181,7 @@ class Contents:
     version: str | None = None  # version of bstcad that wrote the report
     rrmsd_whole: Rrmsd | None = None  # RRMSD against the whole picture; None: light reaches all of it
     # unreachable part of the target: area (fraction of the target), light (fraction of the picture), angle (degrees;
-    # largest deflection by a face of the index; None: a mirror); None: light reaches all of it
+    # largest deflection by one face of this index; None: a mirror); None: light reaches all of the target
     unreachable: Mapping[str, Size | None] | None = None
     leak: Fraction | None = None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
     contrast: Size | None = None  # mean irradiance of lit divided by dark pixels; None: no dark pixels, or no leak
@@ -194,12 +194,12 @@ class Contents:
     twins: PrecisionTest | None = None  # comparison of float32 with float64; None: not made
     rrmsd_asked: Size | None = None  # accept.rrmsd of the scene; None: no limit
     rays_traced: int | None = None  # number of all rays of the verification
-    shape: Mapping[str, float | None] | None = None  # analysis.shape.describe, volume (mm³)
+    shape: Mapping[str, float | None] | None = None  # dimensions (analysis.shape.describe) and volume (mm³)
     # margin to total reflection (deg), smallest divisor in Newton's method, largest curvature (1/mm), non-finite values
     stability: Mapping[str, float | int | None] | None = None
     blur: Blur | None = None  # blur by the source's size; None: a point source or parallel light
     finest_detail: FinestDetail | None = None  # width of a point of the picture on the target
-    lines: tuple[LineFigures, ...] = ()  # lines of the spectrum; empty: one line
+    lines: tuple[LineFigures, ...] = ()  # lines of the spectrum; empty: the source has one wavelength
     picture: tuple[str, ...] = ()  # sentences on how the picture was read: first of several, tones, transparency, fit
     given_up: tuple[str, ...] = ()  # text of the remarks
     remarks: tuple[str, ...] = ()  # ids of the remarks, in the order of given_up

@@ -12,7 +12,7 @@ globalThis.solidView = (() => {
   const STEP = Math.PI / 36, ZOOM_STEP = 1.25, MIN_ZOOM = 0.6, MAX_ZOOM = 8, MAX_HOME_ZOOM = 1.5, FILLED = 0.92;
   const MAX_TILT = 1.55, MAX_PIXEL_RATIO = 2; // largest elevation of the eye (radians); device pixels per CSS pixel
   const RAY_STEP = 2, RAY_REACH = 2; // close view: every second ray; length outside the lens, in diagonals of the lens
-  const VISIBLE_REACH = 0.5, LAMP_REACH = 1.5; // length of rays inside the view; largest distance of a lamp inside it
+  const VISIBLE_REACH = 0.5, LAMP_REACH = 1.5; // diagonals: length of rays, and distance of a lamp, that the view includes
   const EYE_DISTANCE = 2.4; // distance of the eye from the centre of the whole path, in diagonals of the path
   const MIN_OPACITY = 0.35, CLOSE_OPACITY = 0.75, PATH_OPACITY = 0.4; // rays without flux; close view; whole path
   const SCREEN_OPACITY = 0.8; // opacity of a wall in front of another one
