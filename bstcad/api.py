@@ -304,7 +304,8 @@ class Design:
         """
         wanted = self._made.goals
         if not 0 <= target < len(wanted):
-            raise SceneError(f"target: there is no target[{target}]; give a number from 0 to {len(wanted) - 1}")
+            possible = "0" if len(wanted) == 1 else f"a number from 0 to {len(wanted) - 1}"
+            raise SceneError(f"target: there is no target[{target}]; give {possible}")
         view = View.of(self.scene, target)
         seen = view.picture(view.tones(self._irradiance(target), wanted[target].picture))
         grey = np.ascontiguousarray(seen)

@@ -66,7 +66,7 @@ HELP = {  # help of main fields, instead of the description of the key
 SECTIONS = {  # labels, by key, of sections whose key would be unclear as a title
     "source": "light source", "before": "optics before the lens", "behind": "optics behind the lens",
     "accept": "limits of the checks", "output": "files and their accuracy", "part": "title block of the part",
-    "tailoring": "computation of the lens",
+    "tailoring": "computation of the lens (for experts)",
 }  # fmt: skip
 ADDITIONS = {  # labels of buttons that add a table, by key
     "before": "Add a window or mirror before the lens", "behind": "Add a window or mirror behind the lens",
