@@ -154,7 +154,7 @@ def measured(job: Mapping[str, Any], run_folder: Path, output: Path, resume: boo
     return State("finished", passed=part.get("passed"), rrmsd=part.get("rrmsd_predicted"), folder=output.name)
 
 
-JOBS = {work.__name__: work for work in (design, tolerance, tradeoff, measured)}  # by kind of run
+JOBS = {work.__name__: work for work in (design, tolerance, tradeoff, measured)}  # functions by kind of run
 
 
 # ---- the process -----------------------------------------------------------------------------------------------------

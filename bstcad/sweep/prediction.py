@@ -187,17 +187,17 @@ def predicted_seconds(scene: Scene, pilot: Pilot) -> float:
 # Sizes (per side, or iterations) for which the following times (s) and memory (GB) are stated, on two cores of pace 1.
 UNIT_TUBES, UNIT_POINTS, UNIT_PIXELS, UNIT_GRID, UNIT_ITERATIONS = 1024, 513, 512, 256, 40
 KERNEL_SECONDS = 0.115  # time of an evaluation of cold_run.calibration_kernel
-ROUND_SECONDS, TRANSPORT_SECONDS, FIT_SECONDS = 0.06, 0.2, 0.6  # times in stage 1 of a round, transport, slope fit
+ROUND_SECONDS, TRANSPORT_SECONDS, FIT_SECONDS = 0.06, 0.2, 0.6  # time of a round, transport, slope fit in stage 1
 TWO_FACE_TRANSPORT_SECONDS = 2.4  # time of a transport behind two freeform faces, between which light is traced
 TWO_FACE_SECONDS = 3.0  # time in stage 1 for two freeform faces of any size
 AIMING_SECONDS = 1.0  # time to find the rays from a point source through UNIT_TUBES² points
 FRONT_SECONDS = 1.7  # time of the search for a curved front
-EVALUATION_SECONDS, VARIABLE_SECONDS, BLUR_SECONDS = 0.11, 0.046, 0.30  # times in an evaluation: tubes, net, blur
+EVALUATION_SECONDS, VARIABLE_SECONDS, BLUR_SECONDS = 0.11, 0.046, 0.30  # time of the tubes, net, blur in an evaluation
 CALL_SECONDS = 0.01  # time in an evaluation that is independent of sizes
 IMAGE_SECONDS = 0.7  # time in a round for the images of an extended source
 ADAM_SECONDS = 0.1  # time of a step of the paper's procedure
 START_SECONDS = 2.8  # time of the imports and of the end of the process
-WRITE_SECONDS, NET_SECONDS, PICTURE_SECONDS = 1.5, 2.4, 1.1  # times of writing: constant part, net, pixels
+WRITE_SECONDS, NET_SECONDS, PICTURE_SECONDS = 1.5, 2.4, 1.1  # time of writing: constant part, net, pixels
 MOUNT_SECONDS = 2.5  # time of cutting and verifying the mounted part
 RAY_SECONDS, DRAFT_RAY_SECONDS = 1.6, 1.0  # time to verify with rays, per target and wavelength
 WITNESS_SECONDS, DRAFT_WITNESS_SECONDS = 6.0, 2.5  # time to verify two nets with flux tubes, per target
