@@ -7,7 +7,7 @@ evenly lit disc into a disc that is brighter on the right: L-BFGS in the cosine 
 coarse and fine waves count alike.
 
 Tubes are cut at the outline of the lens that they are launched for. As the back moves along the axis other light meets
-its rim, so that the tubes of the lens before the fit end at an RRMSD of 0.08 where rays find 0.125. A second round
+its rim, so that the tubes of the lens before the fit end at an RRMSD of 0.07 where rays find 0.11. A second round
 launches the tubes again, for the lens of the first round.
 """
 
