@@ -1,9 +1,9 @@
 """Feasibility of two freeform faces: a check on coarse grids, before the long stages, that both can meet all goals.
 
-The goals determine the rays behind the lens (light_behind.py).  These rays determine where the light meets the back,
-and by which angle the front has to deflect it.  A design is refused if, for much of the light, rays would have to cross
-between lens and target, or light would have to leave the back outside of the outline.  It is reported if the front
-would have to deflect light by more than refraction can.
+The wavefront, or the two pictures, determine the rays behind the lens (light_behind.py).  These rays determine where
+the light meets the back, and by which angle the front has to deflect it.  A design is refused if, for much of the
+light, rays would have to cross between lens and target, or light would have to leave the back outside of the outline.
+It is reported if the front would have to deflect light by more than refraction can.
 
 At an index of 1.49 a front can deflect light by up to 48 degrees.  A back that cancels this deflection is nearly
 vertical, and remains so in stage 2.  If the front would have to deflect light by more than MAX_GENTLE_DEFLECTION,

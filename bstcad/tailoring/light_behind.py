@@ -1,4 +1,4 @@
-"""The rays behind a lens with two freeform faces, computed from its goals: one ray through each point of a target.
+"""The rays behind a lens with two freeform faces, from a wavefront or two pictures: one through each target point.
 
 Behind a lens the rays of a point source or of collimated light are normal to wavefronts (theorem of Malus and Dupin;
 Born and Wolf, Principles of Optics, section 3.1.2).  So their direction cosines on a plane A are the gradient of
@@ -11,10 +11,10 @@ the centroid of the light on B.  The coordinate y in
 hardly depends on p for a fixed t, and p -> y is the gradient of a convex function: the optimal transport map from the
 picture on A to the picture on B in the coordinates y.  The remaining dependence on p enters through the p that the
 previous round assigned to each t, as in slope_map.py.  In the convex solution, σ = 1, no two rays cross between the
-planes; in the concave solution, σ = -1, all do.  A is the nearest target, or the furthest one if the picture of the
-nearest has clearly more contrast: then rays are followed backwards.  If one picture has clearly more contrast, such as
-letters on black, the rays pass through the corners of its pixels.  Its black pixels then get no light at all, whatever
-the map is in the gaps between letters.
+planes; in the concave solution, σ = -1, all do.  A is the nearest target and B the furthest.  If one picture has
+clearly more contrast, such as letters on black, B is its target, and the rays pass through the corners of its pixels:
+its black pixels then get no light, whatever the map is in the gaps between letters.  If this is the nearest target, A
+is the furthest one, and the rays are followed backwards.
 
 Between lens and nearest target the rays may cross, and then no lens can send them.  In the convex solution this happens
 where the light on A is much denser than on B (an eigenvalue of ∂t/∂p above 1 + |AB| / |lens A|).
@@ -227,8 +227,8 @@ def between_targets(
     t = in_space(behind.plane, *pixel_corners(behind))
     m = in_space(behind.plane, *(np.array(c) for c in centroid(target, behind))).reshape(3, 1, 1)
     p = in_space(screen.plane, *(np.full_like(t[0], sum(ends) / 2) for ends in (screen.x, screen.y)))
-    for turn in range(MAP_ROUNDS):
-        last = turn == MAP_ROUNDS - 1
+    for number in range(MAP_ROUNDS):
+        last = number == MAP_ROUNDS - 1
         cells = FINE_FACTOR * n if last else max(MIN_COARSE_CELLS, n // COARSE_DIVISOR)
         (c_x, c_y), (g_x, g_y) = cosines(p, t), cosines(p, m)
         y = sign * (c_x - g_x), sign * (c_y - g_y)

@@ -23,14 +23,15 @@ The light of an area dA_b of the face falls on the area dA_t = (e / E) dA_b of t
 
     ∫ δE² dA_t  =  ∫ (E L Δδz)² (e / E) dA_b  =  L² ∫ e E (Δδz)² dA_b.
 
-As a quadratic form in δz this is the operator Δ e E Δ.  In the variable c with δz = Δ^-1 E^-1/2 c it becomes e, the
-identity for a uniform beam.  Pixels average over finer detail, so that `SobolevVariable` converges faster with a
-smaller power, δz = Δ^-q E^-1/2 c with q = 0.5 by measurement (the best power is smaller for letters, larger for
-portraits).  The weight E^-1/2 halves the number of evaluations for pictures with dark parts.  Δ is diagonal in the
-cosine transform of the net.
+As a quadratic form in δz this is the operator Δ e E Δ.  In the variable c with δz = Δ^-1 E^-1/2 c it becomes e, a
+constant for a uniform beam.  Detail finer than a pixel does not change the merit, so the true Hessian grows more slowly
+with frequency.  `SobolevVariable` therefore has a smaller power, δz = Δ^-q E^-1/2 c, q = 0.5 by measurement (the best
+power is smaller for letters, larger for portraits).  The weight E^-1/2 halves the number of evaluations for pictures
+with dark parts.  Δ is diagonal in the cosine transform of the net.
 
 Near the critical angle L is not constant: dθ' = η cos θ / cos θ' dθ grows without bound, and some points of the face
-move their light many times further than most.  There the weight is divided by L / (3 median L).
+move their light many times further than most.  Where L is above three times its median, the weight of the last net is
+divided by L / (3 median L).
 """
 
 from __future__ import annotations
@@ -220,7 +221,7 @@ class Merit:
 
 def _from_source(lens: Lens, wave: Wave | None) -> Lens:
     """Return the lens, with its tubes launched from the source if a wavefront goal needs optical paths."""
-    if wave is None or not lens.freeform[0]:
+    if wave is None or lens.freeform[0] == 0:
         return lens
     return replace(lens, shaped=(0, *lens.freeform))
 

@@ -156,9 +156,10 @@ class LbfgsState:
 def lbfgs(start: list[Tensor], evaluations: int, state: LbfgsState | None = None) -> Method:
     """Run limited-memory BFGS with a strong Wolfe line search (Nocedal and Wright 2006, algorithms 7.5, 3.5, 3.6).
 
-    Returns "plateau" if PLATEAU_STEPS steps lowered the merit by less than the fraction PLATEAU_GAIN while more than
-    PLATEAU_STEPS of the `evaluations` are left, or if no step lowers the merit.  A run resumed from a state has the
-    result of an uninterrupted run.  (torch.optim's L-BFGS loads a compiler, which takes longer than a draft design.)
+    Returns "plateau" if no step lowers the merit.  Also returns it if PLATEAU_STEPS steps lowered the merit by less
+    than the fraction PLATEAU_GAIN while more than PLATEAU_STEPS of the `evaluations` are left.  A run resumed from a
+    state has the result of an uninterrupted run.  (torch.optim's L-BFGS loads a compiler, which takes longer than a
+    draft design.)
     """
     sizes, best, resumable = [p.numel() for p in start], Best(), state
 

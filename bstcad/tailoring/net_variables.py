@@ -1,4 +1,4 @@
-"""The variables of stage 2 for all nets of a lens together.
+"""The variables of stage 2 for all nets of a lens: coupled for two faces and several pictures, otherwise independent.
 
 For a point source or collimated light the slopes of both faces have nearly the same effect: light from the point q of
 the front meets the back at b(q), and a slope at q moves its landing point on a plane behind the lens nearly as far as

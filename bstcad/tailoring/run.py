@@ -115,7 +115,7 @@ class Task:
     rim_sags: tuple[float, float] = (-math.inf, math.inf)  # range of the front's sag at the rim (mm)
     progress: Progress = no_progress  # receives the progress within a step
     tidy: Callable[[], None] = lambda: None  # returns freed memory to the system between large allocations
-    sampled_sources: tuple[tuple[Channel, ...], ...] = ()  # light for each source size of stage 3; (): point source
+    sampled_sources: tuple[tuple[Channel, ...], ...] = ()  # source at each size of stage 3; (): no stage 3 follows
     bounds: Bounds | None = None  # bounds on the shape of the tailored faces; None: no bounds
     extended_sources: tuple[ExtendedSource, ...] = ()  # source at each size of stage 3, for its blur
     edge: Edge | None = None  # light at the edge of a target cut to its reachable part; None: not cut
@@ -170,7 +170,7 @@ class Task:
             pixels = max(goal.picture.size for goal in self.goals)
             rays = STAGE_EFFORT.rays * (pixels / STAGE_EFFORT_PIXELS**2) ** (1 / 3)
             effort = replace(STAGE_EFFORT, rays=round(rays))
-        sources = () if self.sampled_sources else self.extended_sources
+        sources = () if self.sampled_sources else self.extended_sources  # before stage 3 the light of the centre rates
         draw = sources[-1].draw if sources else None  # samples the source at full size
         lens = lens.plain()
         values = [rrmsd_by_rays(lens, self.channels, goal, effort, draw=draw) for goal in self.goals]
@@ -315,8 +315,8 @@ class Driver:
         """Run a stage until it ends or `why` returns a reason to end it; return its last step.
 
         pack: makes the state to save from the state of a step.  best: best lens before the stage.  Afterwards
-        `self.best` is the best lens at the start of the stage or the end of a part: a part that uses fewer pixels or a
-        smaller source may end with a worse lens.
+        `self.best`, from which the caller may choose, is the best lens at the start of the stage or the end of a part:
+        a part that uses fewer pixels or a smaller source may end with a worse lens.
         """
         self._last, self.best = self._clock(), best
         for step in stage:

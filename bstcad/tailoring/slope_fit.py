@@ -1,9 +1,9 @@
-"""The slope fit of stage 1: a linear least-squares fit of a surface to the slopes that send each ray to its aim.
+"""The slope fit of stage 1: a linear least-squares fit of a surface to given slopes.
 
-Wang et al. 2023 minimise Σ |P_t - P|², from landing point P to aim P_t, by Adam (baselines/paper.py).  For a ray that
-meets the face at a known point, the normal that sends the ray to its aim follows from Snell's law in closed form.  The
-spline is linear in its heights, so the best fit of the slopes is a linear least-squares problem: a few preconditioned
-conjugate-gradient steps.
+Wang et al. 2023 minimise Σ |P_t - P|², from landing point P to aim P_t, by Adam (baselines/paper.py).  The slopes
+here are those of the transport map (`slope_map.fit_to_map`), or those that send each ray to its aim (`tailor_to_aim`):
+at a known point of the face they follow from Snell's law in closed form.  The spline is linear in its heights, so the
+best fit is a linear least-squares problem, which takes a few preconditioned conjugate-gradient steps.
 """
 
 from __future__ import annotations

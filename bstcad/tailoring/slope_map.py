@@ -4,20 +4,21 @@ The map of Wang et al. 2023 leads from source points to target points.  It is a 
 off axis, a fit to it loses the part that no surface can follow.  Here the transport problem is solved between points of
 the face and slopes, where the map is the gradient of the surface.  A ray that meets the last freeform face at b and
 shall reach the target point t needs the slope p(b, t), which follows from Snell's law or the law of reflection in
-closed form.  With the centroid m of the light on the target, the coordinate
+closed form.  Let m be the centroid of the light on the target, and g a surface fitted to the slopes p(b, m), which
+nearly sends all light to m.  The coordinate
 
-    y = σ (p(b, t) - ∇g(b)),    ∇g(b) ≈ p(b, m)
+    y = σ (p(b, t) - ∇g(b))
 
-hardly depends on b for a fixed t; g is nearly the surface that sends all light to m.  The optimal transport map b ->
-y is ∇φ of a convex φ, so that σ y + ∇g are the slopes of a surface.  σ = 1 where light leaves the glass.  Mirrors, and
-faces where light enters the glass, deflect light against their slope: there σ = -1, so that rays of neighbouring points
-do not cross.  If there are surfaces behind the net, light is aimed at the image of the target through them
-(optics/unfolding.py).  y still depends on b a little, in proportion to t - m.  Therefore each round computes y(t) at
-the b(t) of the previous round, and the rounds are a fixed-point iteration.  At the fixed point the surface solves the
-Monge-Ampère problem of the system for any g, also off axis, in the near field and behind a curved front.
+hardly depends on b for a fixed t.  The optimal transport map b -> y is ∇φ of a convex φ, so that σ y + ∇g are the
+slopes of a surface.  σ = 1 where light leaves the glass.  Mirrors, and faces where light enters the glass, deflect
+light against their slope: there σ = -1, so that rays of neighbouring points do not cross.  If there are surfaces behind
+the net, light is aimed at the image of the target through them (optics/unfolding.py).  y still depends on b a little,
+in proportion to t - m.  Therefore each round computes y(t) at the b(t) of the previous round, and the rounds are a
+fixed-point iteration.  At the fixed point the surface solves the Monge-Ampère problem of the system, also off axis, in
+the near field and behind a curved front; g does not change it.
 
-`map_to_target` and `aim_points` give the map of the paper, from the vertex plane of the front to the target, and the
-aim of each ray.  Stage 1 falls back on this map, and the baselines use it.
+`map_to_target` and `aim_points` give the map of the paper, from the vertex plane of the first surface to the target,
+and the aim of each ray.  Stage 1 falls back on this map, and the baselines use it.
 """
 
 from __future__ import annotations
@@ -127,7 +128,7 @@ class SlopeMap:
     gathering: BSplineSurface  # surface g
     sign: float  # sign σ, 1 or -1
     face_points: Points  # b (mm) for the corners of the target's pixels, (columns + 1, rows + 1)
-    moved: float  # RMS change of b since the last round at corners of lit pixels / half window width; NaN: first round
+    moved: float  # RMS change of b since the last round at lit corners, in the unit of stage1.RETRY_CHANGE; NaN: none
 
     def slopes(self, x: Tensor, y: Tensor) -> Slopes:
         """Return the slopes (∂z/∂x, ∂z/∂y) needed at points x, y (n,) of the last freeform face (mm)."""
@@ -311,7 +312,7 @@ def lit_corners(picture: np.ndarray) -> np.ndarray:
 
 @torch.no_grad()
 def map_to_target(source: Emitter, lens: Lens, goal: Goal, n: int, solver: Solver) -> Mapping:
-    """Return the transport map of the paper, from the vertex plane of the front (mm) to the target (mm).
+    """Return the transport map of the paper, from the vertex plane of the first surface (mm) to the target (mm).
 
     The map is solved on n x n cells, for the light that passes all faces.  A tilted target is projected from the vertex
     of the front onto the plane z = const through its centre: in the coordinates of the target the map would not be

@@ -13,7 +13,7 @@ light lands nearest to t_n.  There δ and the flux are interpolated biquadratica
 at 2 IMAGE_PAIRS points.
 
 The error of this model is small and varies slowly during tailoring.  It is measured with rays from points of the source
-at the start of a round, and added as a constant picture: E = B E_0 + (E_rays - B E_0 at the start).
+at the start of a round, smoothed, and added as a constant picture: E = B E_0 + (E_rays - B E_0)_start.
 """
 
 from __future__ import annotations

@@ -88,8 +88,8 @@ PREVIEW_NET, PREVIEW_SEARCH = 17, FrontSearch(cells=32, iterations=40, repeats=1
 def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
     """Yield the steps of stage 1 from a blank, or from a saved state.
 
-    The rounds come first (`follow_slopes`), then `follow_aims` if their result is poor (`is_poor_result`).  Its lens
-    is used if its RRMSD is smaller and it keeps MIN_FLUX_RATIO of the flux on the target.
+    The rounds come first (`follow_slopes`), then `follow_aims` if their result is poor (`is_poor_result`).  The
+    lens of `follow_aims` is used if its RRMSD is smaller and it keeps MIN_FLUX_RATIO of the flux on the target.
     """
     lens = task.heaviest.through(lens)
     if state is None and task.free:

@@ -6,15 +6,16 @@ root mean square difference between the target irradiance E and the traced irrad
 
     RRMSD = sqrt(Σ_ij |E^s_ij - E_ij|² / Σ_ij E_ij²).
 
-The paper traces random rays.  Here each evaluation traces the corners of a fixed sheet of flux tubes and integrates
-their flux over the pixels exactly, so that the merit is smooth and without noise.  The variables are the heights of
+(In the merit E^s is divided by the transmitted flux; in a reported RRMSD it is scaled to the sum 1.)  The paper traces
+random rays.  Here each evaluation traces the corners of a fixed sheet of flux tubes and integrates their flux over the
+pixels exactly, so that the merit has no noise and is smooth while no tube is lost.  The variables are the heights of
 the control points of all nets, in a Sobolev variable (merit.py), so that L-BFGS needs 100 to 300 evaluations, while
-Adam on the heights needs thousands.  A stage consists of rounds with an increasing number of tubes.
+Adam on the heights needs thousands.  Most rounds of stage 2 have more tubes than the round before.
 
 For a source of finite size, stage 3 replaces stage 2 and also starts from the surface of stage 1.  It traces the light
-of the centre of the source and blurs the picture by the image of the source (source_image.py), in rounds of increasing
-source size; coarse rounds for the centre alone may precede.  The paper's procedure (baselines/paper.py) is an
-exception: it runs stage 2 for the centre of the source, and then stage 3.
+of the centre of the source and blurs the picture by the image of the source (source_image.py), in rounds that increase
+the size of the source to its full size; coarse rounds for the centre alone may precede.  The paper's procedure
+(baselines/paper.py) is an exception: it runs stage 2 for the centre of the source, and then stage 3.
 """
 
 from __future__ import annotations
@@ -59,16 +60,16 @@ WAVEFRONT_ROUNDS = ((2 / 3, 0.45), (1.0, 0.35), (4 / 3, 0.2))
 PICTURES_ROUNDS, PICTURES_SIDE = ((2 / 3, 1.4), (4 / 3, 0.7)), 513
 # Coarse rounds: (pixels along the longer side, tubes per side, evaluations).  They precede the fine rounds if light has
 # to move far: if the RRMSD exceeds FAR_OFF_RRMSD on LARGE_PIXELS pixels along the longer side.  Any net resolves so few
-# pixels, so such an error means that light is in the wrong place.  The last coarse round is repeated after the first
-# fine round, if other fine rounds follow.
+# pixels, so such an error means that light is in the wrong place.  In stage 2 the last coarse round is repeated after
+# the first fine round, if other fine rounds follow.
 COARSE_ROUNDS = ((32, 256, 60), (64, 384, 60))
 LARGE_PIXELS, FAR_OFF_RRMSD = 16, 0.04
-# Factor of the evaluations of the fine rounds after coarse rounds, and this factor if there is a single fine round,
+# Factor of the evaluations of the fine rounds of stage 2 after coarse rounds, and the factor of a single fine round,
 # since no coarse round can follow it: a stage must not end with few pixels.  (Draft of a plate with at most 2 mm of
 # glass: RRMSD 0.264 with a factor of 1.5, 0.236 with 3, but 0.408 if 60 evaluations on 64 pixels come last.)
 EVALUATION_FACTOR, SINGLE_ROUND_FACTOR = 1.5, 3.0
 IMAGE_POSITIONS, SECOND_MOMENT_POINTS = 16, 8  # rays per side and source points that give the source image's width
-MIN_EVALUATIONS = 30  # evaluations below which a stage has a single round: each round has to start anew
+MIN_EVALUATIONS = 30  # evaluations below which stage 2 has a single round and stage 3 gets twice as many
 COMPARED_NET = 65  # largest number of control points per side in `compare_precisions`, for speed
 COMPARED_TUBES = 128  # tubes per side in `compare_precisions`
 COMPARED_EVALUATIONS = 6  # evaluations in each precision in `compare_precisions`
@@ -82,17 +83,17 @@ TUBES_PER_CELL, TUBES_PER_PIXEL = 2.0, 1.1  # tubes per axis in a net cell and a
 class TubeRound:
     """Light, tubes and evaluations of one round of stage 2 or 3."""
 
-    task: Task  # task; its channels sample the whole source
+    task: Task  # task whose channels are the light by which the round is rated
     tubes: int  # tubes per side in the sheet of each channel
     evaluations: int  # largest number of evaluations
     stage: str = "stage 2"  # name of the stage
     pixels: int | None = None  # pixels along the longer side of a coarse target; None: the pixels of the target
-    source: ExtendedSource | None = None  # source of finite size; None: point source
+    source: ExtendedSource | None = None  # source that blurs the picture; None: no blur
     source_size: float = 1.0  # size of the source in this round, as a fraction of its full size
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """Channels that are traced; for a source of finite size, those of its centre."""
+        """Channels that the tubes carry; if a source blurs the picture, those of its centre."""
         return self.task.channels if self.source is None else self.source.centre
 
     @property
@@ -161,7 +162,7 @@ class TubeSearch:
 
 
 def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Steps:
-    """Yield the steps of stage 2: if the evaluations suffice, rounds with few tubes come first; the last has all tubes.
+    """Yield the steps of stage 2: if the evaluations suffice, rounds with few tubes come first.
 
     Few tubes resolve the large errors at first as well as many.  The last round corrects the finer errors.
     """
@@ -173,7 +174,7 @@ def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Steps:
 
 
 def coarse_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
-    """Return rounds with few pixels, tubes and control points; () if the light is nearly in place or for several goals.
+    """Return rounds with few pixels, tubes and variables; () if the light is nearly in place or for several goals.
 
     If the map has not settled, as for a lamp or a wall close to the lens, light has to move far.  This needs many
     evaluations, but each takes a thirtieth of the time of a full one, and the tubes need not resolve the cells of the
@@ -205,7 +206,7 @@ def round_shares(task: Task) -> RoundFractions | None:
 
 
 def sheet_sizes(knobs: ResolvedTailoring, shares: RoundFractions | None = None) -> Iterator[tuple[int, int]]:
-    """Yield (tubes per side, evaluations) of each round; a net needs at least as many tubes as control points."""
+    """Yield (tubes per side, evaluations) of each round: as many tubes as control points, or knobs.rays, at least."""
     shares = shares or (DENSE_ROUNDS if knobs.rays >= DENSE_TUBES * knobs.side else SPARSE_ROUNDS)
     if knobs.stage2_iterations < MIN_EVALUATIONS:
         shares = ((1.0, 1.0),)
@@ -253,7 +254,7 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
             lens, state, measured = step.lens, None, 0.0  # 0: not measured
             position, reason = replace(position, done=position.done + iterate.best.evaluations), iterate.reason
             if reason == "accuracy" and (measured := task.rrmsd(lens)) > accuracy:
-                # tubes slightly underestimate the RRMSD: lower the goal by tubes
+                # goal by tubes, lowered since tubes slightly underestimate the RRMSD
                 position = replace(position, goal_by_tubes=position.goal_by_tubes * accuracy / measured)
                 reason = "evaluations"  # final reason if no evaluations are left
             elif reason != "evaluations":
@@ -318,7 +319,7 @@ class Problem:
 
 
 def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariables:
-    """Return the variables of stage 2 for the nets of a lens, or for coarser nets of up to `pixels` cells per side."""
+    """Return the variables of stage 2 for all nets; with `pixels`, of changes by nets with so many cells per side."""
     nets = lens.nets
     if pixels is not None:
         lens = lens.with_nets(net.refined(coarser(net.shape, pixels + 1)) for net in nets)
@@ -396,7 +397,7 @@ def with_stage3(before: Stage | None, task: Task, lens: Lens, state: Any = None)
 
 
 def stage3_rounds(task: Task) -> tuple[TubeRound, ...]:
-    """Return the rounds of stage 3, one per source size in SOURCE_SIZES."""
+    """Return the rounds of stage 3, one per entry of SOURCE_SIZES."""
     lights = [
         replace(task, channels=channels, sampled_sources=(), extended_sources=(source,))
         for channels, source in zip(task.sampled_sources, task.extended_sources, strict=True)
@@ -418,7 +419,7 @@ def stage3_sheet_sizes(knobs: ResolvedTailoring, pixels: tuple[int, int]) -> Ite
     A sheet of n tubes per side has n √(m_x / m_y) along x and n √(m_y / m_x) along y over a net of m_x x m_y points.
     """
     few = knobs.stage2_iterations < MIN_EVALUATIONS
-    total = knobs.stage2_iterations * (2 if few else 1)  # each round has to start anew
+    total = knobs.stage2_iterations * (2 if few else 1)  # L-BFGS starts anew in each round
     (m_x, m_y), (columns, rows) = as_pair(knobs.levels[-1]), pixels
     oblong = math.sqrt(m_x / m_y)
     for_pixels = TUBES_PER_PIXEL * max(columns / oblong, rows * oblong)

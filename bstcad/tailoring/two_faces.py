@@ -8,12 +8,12 @@ slope_map.py, from points q of the front to the slopes p(q, b) that follow from 
 
     y = -(p(q, b) - ∇g(q)),    ∇g(q) ≈ p(q, r(q)) - r(q) ∂p/∂b,
 
-where r is the affine map from the light on the front to the light on the back, so that y hardly depends on q for a
-fixed b.  (The minus sign: light that enters glass is deflected against the slope of the face.)  Then the back is fitted
-to the slopes that deflect each ray into its direction behind the lens.  Such a face exists.  Let Φ and Φ' be the
-optical paths along the rays in the glass and behind the lens, with |∇Φ| = n and |∇Φ'| = 1.  By Snell's law a face with
-normals along ∇(Φ - Φ') deflects these rays as required, so each surface Φ - Φ' = const is a solution.  A new back
-changes b(t), and so there are several rounds, each from the faces and the points of the last round.
+where ∂p/∂b is a number and r the affine map from the light on the front to the light on the back, so that y hardly
+depends on q for a fixed b.  (The minus sign: light that enters glass is deflected against the slope of the face.)  Then
+the back is fitted to the slopes that deflect each ray into its direction behind the lens.  Such a face exists.  Let Φ
+and Φ' be the optical paths along the rays in the glass and behind the lens, with |∇Φ| = n and |∇Φ'| = 1.  By Snell's
+law a face with normals along ∇(Φ - Φ') deflects these rays as required, so each surface Φ - Φ' = const is a solution.
+A new back changes b(t), and so there are several rounds, each from the faces and the points of the last round.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ class FrontRound(stage1.SlopeRound):
 def steps(task: Task, lens: Lens, state: stage1.SlopeRound | None = None) -> Steps:
     """Yield the steps of stage 1 for a lens with a freeform front, from its start or from a saved state.
 
-    With one goal, or if light does not cross front and back in succession, stage 1 tailors only the last net
-    (stage1.py).
+    For a single picture without a wavefront, or if light does not cross front and back in succession, stage 1 tailors
+    only the last net (stage1.py).
     """
     lens = task.heaviest.through(lens)
     if not (lens.shapes_two_faces and task.several):
@@ -84,10 +84,10 @@ def follow_rays(task: Task, lens: Lens, state: FrontRound | None) -> Steps:
     light = without_crossings(light_for_task(task), near.receiver, lens.back, knobs.transport_grid)
     slopes, b, done = (None, None, 0) if state is None else (state.slopes, state.back, state.round)
     lens = lens if state is None else state.lens.apply_to(lens)
-    turn = min(done, knobs.rounds - 1)
-    while turn < knobs.rounds:
-        if slopes is None or b is None or turn >= done:
-            left = knobs.rounds - turn
+    number = min(done, knobs.rounds - 1)
+    while number < knobs.rounds:
+        if slopes is None or b is None or number >= done:
+            left = knobs.rounds - number
             fine = left <= FINE_PAIR_ROUNDS
             halvings = 0 if left == 1 else 1 if fine else 2
             cells = max(COARSEST_GRID, knobs.transport_grid // 2**halvings)
@@ -95,24 +95,24 @@ def follow_rays(task: Task, lens: Lens, state: FrontRound | None) -> Steps:
             lens = task.refined(lens, level)
             fit = stage1.FINE_FACE_FIT if fine else stage1.COARSE_FACE_FIT
             q = None if slopes is None else slopes.face_points
-            lens, slopes, b = _round(task, lens, light, q, turn=turn, cells=cells, fit=fit)
+            lens, slopes, b = _round(task, lens, light, q, number=number, cells=cells, fit=fit)
             lens = place_back(lens, z, task.min_thickness, task.bounds)
             task.tidy()
         settled = slopes.moved <= SETTLED_FRONT
-        turn = stage1.next_round(turn, knobs.rounds, fine=FINE_PAIR_ROUNDS, settled=settled)
-        yield stage1.round_step(task, lens, FrontRound(turn, Parameters.of(lens), slopes, b), b)
+        number = stage1.next_round(number, knobs.rounds, fine=FINE_PAIR_ROUNDS, settled=settled)
+        yield stage1.round_step(task, lens, FrontRound(number, Parameters.of(lens), slopes, b), b)
 
 
 def _round(
-    task: Task, lens: Lens, light: LightBehind, q: Points | None, *, turn: int, cells: int, fit: Fit
+    task: Task, lens: Lens, light: LightBehind, q: Points | None, *, number: int, cells: int, fit: Fit
 ) -> tuple[Lens, SlopeMap, Points]:
-    """Run round `turn`; return the lens, the map of its front, and b(t) for the pixel corners of the first target."""
+    """Run a round; return the lens, the map of its front, and b(t) for the pixel corners of the first target."""
     source, front = task.heaviest.source, lens.shaping("front")
     window, met = slope_map.lit_window(source, front), light.intersect(lens.back)
     b_x, b_y = light.sampled_at(task.goals[0].receiver, met[:2])
 
     def progress(s: TransportStep) -> None:
-        task.progress("stage 1", turn, task.knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
+        task.progress("stage 1", number, task.knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
 
     grid = slope_map.square_grid(source, front, window, cells)
     solver = Solver(task.knobs.transport_iterations, progress=progress)
