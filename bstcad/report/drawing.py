@@ -45,7 +45,7 @@ STYLE: dict[str, Any] = {
 DPI = 144
 MARGIN = 0.06  # margin around a picture (inches)
 MAX_PNG_BYTES = 300_000  # size above which a PNG is encoded again with fewer pixels (bytes)
-MAX_PALETTE_COLOURS = 600  # number of colours up to which a palette of 256 shows no difference
+MAX_PALETTE_COLOURS = 600  # largest number of colours that a palette of 256 shows without a visible difference
 
 
 def styled(draw: Callable[..., Any]) -> Callable[..., Any]:
@@ -77,7 +77,7 @@ def footnote(figure: Figure, text: str) -> None:
 
 @styled
 def png(figure: Figure, ground: str = "#ffffff") -> bytes:
-    """Return the figure as PNG bytes, cropped to MARGIN; with fewer pixels if it would exceed MAX_PNG_BYTES."""
+    """Return the figure as PNG on the colour `ground`, cropped to MARGIN; above MAX_PNG_BYTES with fewer pixels."""
     picture = _encode(figure, DPI, ground)
     if len(picture) > MAX_PNG_BYTES:
         picture = _encode(figure, DPI * 0.95 * (MAX_PNG_BYTES / len(picture)) ** 0.5, ground)
@@ -118,7 +118,7 @@ def _encode(figure: Figure, dpi: float, ground: str) -> bytes:
 
 
 def steps(name: str, count: int) -> Any:
-    """Return a colour map in `count` equal steps: no visible loss, and PNG files a third as large."""
+    """Return a colour map of matplotlib in `count` equal steps: no visible loss, and PNG files a third as large."""
     import matplotlib
 
     return matplotlib.colormaps[name].resampled(count)

@@ -32,8 +32,8 @@ from bstcad.scene.mount import Mount
 SIDECAR = ".txt"  # suffix of a text file that states how far interpolation of a table moves the light
 SHEET = "datasheet"  # kind of export that `export` omits: the caller draws it from the report in the design's folder
 
-OUTLINE, RIM, FLANGE, SCREWS, HOLES = "OUTLINE", "RIM", "FLANGE", "SCREW_HOLES", "HOLES"
-CENTRES, TEXT = "CENTRES", "TEXT"
+OUTLINE, RIM, FLANGE, SCREWS, HOLES = "OUTLINE", "RIM", "FLANGE", "SCREW_HOLES", "HOLES"  # layers of edges
+CENTRES, TEXT = "CENTRES", "TEXT"  # layers of centre marks and of text
 MARK_OVERSHOOT = 1.5  # length by which a centre mark extends beyond the edge of a hole or rim (mm)
 SVG_MARGIN = 3.0  # margin around the drawing in the SVG (mm)
 EDGE_WIDTH, CENTRE_WIDTH = 0.25, 0.13  # line widths of edges and of centre marks (mm, ISO 128)
@@ -74,10 +74,10 @@ def export(
 ) -> Exported:  # fmt: skip
     """Write the files of `kinds` (files.EXPORTS; nothing for SHEET) to the folder, each completely or not at all.
 
-    points: number of points along the wider side of a grid; None: that of the back's control points (OpticStudio: at
-    the knots).  label: name of a mesh or part.  mount: mount in drawings; None: drawings show the outline of the lens.
-    light: light that is traced to compute the error of grids and tables; None: the error is not computed.
-    ValueError: a kind is unknown, or points is out of range.
+    points: number of points along the wider side of a grid; None: as many as the back has control points along its
+    longer side (OpticStudio: at the knots).  label: name of a mesh or part.  mount: mount in drawings; None: drawings
+    show the outline of the lens.  light: light that is traced to compute the error of grids and tables; None: the error
+    is not computed.  ValueError: a kind is unknown, or points is out of range.
     """
     for kind in kinds:
         if kind not in files.EXPORTS:

@@ -1,6 +1,6 @@
 """Jobs that draw the pictures of a report in a second process, and the figures of the lens, its rays and its design.
 
-Each figure has a function that returns it as a matplotlib Figure.  Maps have row 0 at y min; axes are in mm.
+Each figure has a function that returns it as a matplotlib Figure.  Maps of a face have row 0 at y min and axes in mm.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Pictures:
             self.begin(draw_transport, source, lens, screen, number=k)
 
     def sheet(self, sheet: DataSheet) -> None:
-        """Start the job that draws the data sheet of a part."""
+        """Start the job that draws the data sheet."""
         self._sheet = self._submit(data_sheet.draw, sheet)
 
     def result(self) -> dict[str, bytes | None]:
@@ -130,7 +130,7 @@ class NoPictures(Pictures):
 
 
 def draw_lens(source: Emitter, lens: Lens, screens: Sequence[Screen], view: View) -> Pngs:
-    """Return the pictures of the lens except the 3-D one: maps of each tailored face, and the rays to the screens."""
+    """Return the pictures of the lens except the 3-D one: maps of each tailored face, and a side view with rays."""
     farthest = max(screens, key=lambda screen: screen.plane.throw(0.0))
     of_front = {}
     if lens.shapes("front"):
@@ -239,7 +239,7 @@ def _sample(lens: Lens, face: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarr
 def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> Figure:
     """Draw the section of the lens at y = 0 with rays projected on x-z: the lens close up, and the whole path.
 
-    rays: (n_rays, n_points, 3) in mm.  Screens are projected too if there are several, or one that is tilted.
+    rays: (n_rays, n_points, 3) in mm.  Screens are projected too if there are several, or one not in a plane z = const.
     """
     figure = new_figure(11.0, 3.4)
     close, whole = figure.subplots(1, 2, width_ratios=(1, 1.9))
@@ -292,7 +292,7 @@ def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
 
 @styled
 def convergence(history: Sequence[CurvePoint], stages: Sequence[StageRecord], noise: float) -> Figure:
-    """Draw the RRMSD against time (s): a curve per stage, rings for the values after stages, and a line at `noise`."""
+    """Draw the RRMSD against time (s): a curve per stage, rings after stages, a line at `noise`, the standard error."""
     seconds, values = np.array([(point.seconds, point.rrmsd) for point in history], dtype=float).T
     ends = np.cumsum([0.0, *(stage.seconds for stage in stages)])
     after = np.isin(values, [stage.rrmsd for stage in stages if stage.rrmsd is not None])

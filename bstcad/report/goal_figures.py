@@ -32,7 +32,7 @@ class GoalFigures:
     rrmsd_standard_error: Annotated[float, Field(ge=0, le=1e3)]  # standard error, from independent sets of rays
     rrmsd_tent: Rrmsd | None  # RRMSD with each ray divided among four pixels
     light_on_target: Fraction  # fraction of the source's flux on the target
-    efficiency: Fraction  # flux on the target, as a fraction of the flux that leaves the back face
+    efficiency: Fraction  # flux on the target, as a fraction of the flux that leaves the last face
     leak: Fraction | None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
     contrast: Size | None  # mean irradiance of lit divided by dark pixels; None: no dark pixels, or no leak
     unit: str = "mm"  # unit of x and y on the receiver

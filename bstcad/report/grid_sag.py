@@ -29,10 +29,10 @@ from bstcad.optics.surfaces import Surface, sag
 from bstcad.optics.trace import launch_strips, trace
 from bstcad.report.units import number
 
-MIN_POINTS, MAX_POINTS = 3, 4097  # points per side of a table
-MIN_ZEMAX_POINTS = 5  # points per side: "the nx and ny values must be no smaller than 5" (OpticStudio, Grid Sag)
-MAX_SHIFT = 0.1  # shift of the light (target pixels) up to which a grid or table is fine enough
-CELLS_PER_SPAN = (1, 2, 4, 8, 16)  # grid cells per knot span, tried in this order
+MIN_POINTS, MAX_POINTS = 3, 4097  # smallest and largest number of points along the wider side of a table
+MIN_ZEMAX_POINTS = 5  # minimum per side: "the nx and ny values must be no smaller than 5" (OpticStudio, Grid Sag)
+MAX_SHIFT = 0.1  # largest shift of the light (target pixels) by a grid or table that is fine enough
+CELLS_PER_SPAN = (1, 2, 4, 8, 16)  # grid cells per knot span; tried in this order until the grid is fine enough
 MAX_FLUSH_POINTS = 1_050_000  # number of points up to which a grid that ends at the rim is preferred to a coarser one
 SHIFT_RAYS = 192  # rays per side of the bundle that measures the shift
 RIM_ROUNDING = 1e-9  # distance from the rim that counts as zero (in pitches of the net, or steps of the grid)

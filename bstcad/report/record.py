@@ -117,14 +117,14 @@ class LineFigures:
 class DesignCourse:
     """Course of a design; None: unknown, since the earlier report of the design is missing."""
 
-    seconds_total: Seconds = 0.0  # time from the command to the verified lens
+    seconds_total: Seconds = 0.0  # time from the command to the verified lens and the pictures of its report
     stages: tuple[StageRecord, ...] = ()
     history: tuple[CurvePoint, ...] = ()
     machine: Mapping[str, Scalar] | None = None
     versions: Mapping[str, str] | None = None  # versions of the libraries
     # record of the transport solver: grid, iterations, mass error, reason to stop; steepness (analysis.steepness)
     transport: Mapping[str, Scalar] | None = None
-    skipped_steps: int | None = None  # number of steps skipped because their gradient was not finite
+    skipped_steps: int | None = None  # number of steps skipped because merit or gradient was not finite
     stopped: str | None = None  # reason why tailoring ended
     twins: PrecisionTest | None = None  # comparison of float32 with float64
 
@@ -167,10 +167,10 @@ class Contents:
     rrmsd_tent: Rrmsd | None  # RRMSD with each ray divided among four pixels
     rrmsd_noise: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd
     light_on_target: Fraction  # fraction of the source's flux on the target
-    efficiency: Fraction  # flux on the target relative to the flux that leaves the back face
+    efficiency: Fraction  # flux on the target, as a fraction of the flux that leaves the last face
     flux: Mapping[str, Fraction]  # flux ledger: fractions of the source's flux, with sum 1
     prescription: Mapping[str, Any]  # every surface as it was designed
-    seconds_total: Seconds  # time from the command to the verified lens
+    seconds_total: Seconds  # time from the command to the verified lens and the pictures of its report
     stages: Annotated[tuple[StageRecord, ...], Field(max_length=100), FailFast()]  # stages in their order
     history: Annotated[tuple[CurvePoint, ...], Field(max_length=1_000_000), FailFast()]  # convergence curve
     checks: Annotated[tuple[Check, ...], Field(max_length=1000), FailFast()]  # checks in their order in the report
@@ -193,14 +193,14 @@ class Contents:
     stopped: str | None = None  # reason why tailoring ended
     twins: PrecisionTest | None = None  # comparison of float32 with float64; None: not made
     rrmsd_asked: Size | None = None  # accept.rrmsd of the scene; None: no limit
-    rays_traced: int | None = None  # number of all rays of the verification
+    rays_traced: int | None = None  # number of rays that measured the light on the target with the largest RRMSD
     shape: Mapping[str, float | None] | None = None  # dimensions (analysis.shape.describe) and volume (mm³)
     # margin to total reflection (deg), smallest divisor in Newton's method, largest curvature (1/mm), non-finite values
     stability: Mapping[str, float | int | None] | None = None
     blur: Blur | None = None  # blur by the source's size; None: a point source or parallel light
     finest_detail: FinestDetail | None = None  # width of a point of the picture on the target
     lines: tuple[LineFigures, ...] = ()  # lines of the spectrum; empty: the source has one wavelength
-    picture: tuple[str, ...] = ()  # sentences on how the picture was read: first of several, tones, transparency, fit
+    picture: tuple[str, ...] = ()  # sentences on how a file was read: first of its pictures, transparency, tones, fit
     given_up: tuple[str, ...] = ()  # text of the remarks
     remarks: tuple[str, ...] = ()  # ids of the remarks, in the order of given_up
     estimates: tuple[LeftOut, ...] = ()  # changes by effects that are not simulated, the largest first
@@ -210,7 +210,7 @@ class Contents:
     # pixels), octaves [{frequency (cycles per pixel), period (in the target's unit), error}], outside (fraction of the
     # light beside the target)
     remaining_error: Mapping[str, Any] | None = None
-    # bounds on the tailored faces: asked {key of [lens]: value}, at {key: fraction of the faces at the bound; None: a
+    # bounds on the tailored faces: asked {key of [lens]: value}, at {key: fraction of the area at the bound; None: a
     # thickness at the bound}, tightest {key: position, in words}, both (true: both faces are tailored) or front (true:
     # only the front is); None: the scene has no bounds
     bounds: Mapping[str, Any] | None = None
@@ -345,7 +345,7 @@ def _with_remarks(contents: Contents, *more: Remark) -> Contents:
 
 
 def _finest_detail(scene: Scene, proof: Proof, screen: Screen, estimates: tuple[LeftOut, ...]) -> FinestDetail | None:
-    """Return the finest detail, for the size of the source in the scene or else the assumed size; None: no size."""
+    """Return the finest detail, by the source's size in the scene or else in `estimates`; None: neither has a size."""
     if proof.blur:
         of = ", ".join(f"source.{key} = {size}" for key, size in extent(scene.source))
         return finest_detail(proof.blur.pixels, proof.lens, screen, of)
@@ -409,7 +409,7 @@ def making(path: Path) -> DesignCourse:
 
 
 def read_as(kind: type[Record], path: Path, remedy: str) -> Record:
-    """Read a record of this kind from a JSON file; ValueError (one sentence) if it is not valid."""
+    """Read a record of this kind from a JSON file; ValueError, which ends with `remedy`, if it is not valid."""
     try:
         return of_json(files.contents(path, MAX_REPORT_BYTES), kind)
     except ValueError as error:
@@ -523,7 +523,7 @@ class Report:
     """
 
     contents: Contents
-    irradiances: tuple[np.ndarray, ...]  # irradiance on each target (rows, columns), row 0 = y max, the target's sum
+    irradiances: tuple[np.ndarray, ...]  # irradiance (rows, columns) on each target, row 0 = y max, with its sum
     # made part of this verification: facts, outliers (n, 3), predicted irradiances, and the deviation map with x, y and
     # form (rows y, columns x; mm, + out of the glass, NaN outside); None: no part was measured
     measured: Any = None

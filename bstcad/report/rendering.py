@@ -227,7 +227,7 @@ def _add_text(plotter: Any, words: str, place: tuple[float, float], size: int, c
 
 
 def _close_rays(path: LightPath) -> np.ndarray:
-    """Return every RAY_STEP-th ray, cut at the distance RAY_REACH from the lens."""
+    """Return every RAY_STEP-th ray, cut to RAY_REACH diagonals of the lens on either side of it."""
     reach = RAY_REACH * np.linalg.norm(np.ptp(path.vertices, axis=0))
     rays = path.rays[::RAY_STEP].copy()
     for end, before in ((0, 1), (-1, -2)):

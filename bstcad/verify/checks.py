@@ -47,7 +47,7 @@ DEFAULT_RRMSD_LIMIT = 0.25  # limit of the RRMSD in remarks, plans and tolerance
 LINE_TUBES = 1031  # smallest number of tubes per side for the picture of one line of a spectrum
 CLEAR_APERTURE_TOLERANCE = 1e-3  # largest distance (mm) between the rims of measured and designed apertures
 MIN_MOUNT_LOSS = 1e-3  # fraction of the light that a mount must cut away to be given as the reason for a failure
-MAX_FLANGE_LIGHT = 1e-3  # largest fraction of the light through the lens that may meet the flange
+MAX_FLANGE_LIGHT = 1e-3  # largest fraction of the light through the clear apertures that may meet the flange
 WAVEFRONT = "wavefront error, RMS in waves, piston and tilt removed"
 DRAFT_ACCURACY = 0.01  # relative standard error of the RRMSD of a draft at which ray tracing ends
 MAX_FLOOR = 0.1  # largest ratio of the wavefront error's rounding error to accept.wavefront, for a certain verdict
@@ -247,7 +247,7 @@ def _mounted_lens(read: Future[Lens], bare: Lens, nominal: Nominal, path: Path) 
     checks.append(Check.at_most(name, losses.cut, None, id="mount-cut"))
     if flange is not None:
         where = "a wall of its opening stands in the way; make the flange thinner, or put it where it meets the lens"
-        name = "part.step: light that meets the flange, as a fraction of the light through the uncut lens"
+        name = "part.step: light that meets the flange, as a fraction of the light through the clear apertures"
         checks.append(Check.at_most(name, losses.on_flange, MAX_FLANGE_LIGHT, where=where, id="flange-light"))
     why = f"the mount leaves {lens.apertures[1].words} of the back and cuts away {100 * losses.cut:.3g} % of the light"
     return lens, checks, why if losses.cut > MIN_MOUNT_LOSS else ""
