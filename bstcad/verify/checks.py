@@ -162,7 +162,7 @@ def verify(
     shape = describe(cut, effort.places) | {"volume": whole.volume} | _ripple_rrmsd(made_lens, nominal)
     stability, of_stability = _stability(made_lens, nominal, lights, shape)
     of_shape, at_bounds = bound_checks(cut, nominal.scene.lens, shape)
-    meets, accept = f"{'enters' if lens.passes.enters else 'meets'} the {lens.passes.optic}", nominal.scene.accept
+    optic, accept = lens.passes.optic, nominal.scene.accept
     lit_goals = list(zip(nominal.goals, lights, strict=True))
     checks = (
         *text_checks.lens_checks(text, nominal.lens),
@@ -175,7 +175,7 @@ def verify(
         closed,
         *_mesh_checks(mesh, lens, whole.volume, nominal),
         *map(_target_check, nominal.goals, nominal.stored or [goal.picture for goal in nominal.goals]),
-        *(c for goal, light in lit_goals for c in _light_checks(light, accept, meets, of=goal.suffix, why=why)),
+        *(c for goal, light in lit_goals for c in _light_checks(light, accept, optic, of=goal.suffix, why=why)),
         *of_wavefront,
         *of_stability,
     )
@@ -404,16 +404,14 @@ def _mesh_checks(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal)
     ]
 
 
-def _light_checks(
-    light: Light, accept: Accept, meets: str = "enters the lens", of: str = "", why: str = ""
-) -> list[Check]:
+def _light_checks(light: Light, accept: Accept, optic: str = "lens", of: str = "", why: str = "") -> list[Check]:
     """Check the irradiance of the re-read lens, computed with rays and with flux tubes, which share only the trace.
 
     of: suffix of the checks' names, for one of several targets (Goal.suffix).  why: reason why a limit is not met.
     """
     closure, tubes = abs(sum(light.flux.values()) - 1), light.witness
     off, error = RESOLVED * light.standard_error, f"standard error of the RRMSD, times five{of}"
-    on_target, limit = f"light on the target, as a fraction of the light that {meets}{of}", accept.light_on_target
+    on_target = f"light on the target, as a fraction of the light that meets the {optic}{of}"
     aimed = f"efficiency: light on the target, as a fraction of all light behind the last face{of}"
     rrmsd = f"RRMSD of the light, traced through the STEP file{of}"
     # the figure is resolved if the noise is below the RRMSD; the verdict is certain if it is below the distance to the
@@ -422,7 +420,7 @@ def _light_checks(
     checks = [
         Check.at_most(rrmsd, light.rrmsd, accept.rrmsd, where=why, id="rrmsd"),
         Check.at_most(error, off, noise, id="noise"),
-        Check.at_least(on_target, light.used, limit, where=why, id="light-on-target"),
+        Check.at_least(on_target, light.used, accept.light_on_target, where=why, id="light-on-target"),
         Check.at_least(aimed, light.efficiency, accept.efficiency, where=why, id="efficiency"),
         Check.at_most(f"flux ledger: difference of its sum from 1{of}", closure, 1e-12, id="ledger"),
     ]

@@ -43,7 +43,7 @@ def test_a_bare_lens_is_lens_step_with_what_the_scene_states(tmp_path):
     assert rows["Profile tolerance, front"] == "profile 0.01 mm (ISO 1101)"
     assert rows["Roughness of optical faces"] == "P, Ra ≤ 5 nm" and rows["Coating of optical faces"] == "AR <450> nm"
     assert rows["Tolerance of the centre thickness"] == "± 0.05 mm"
-    assert f"up to {said.tool_radius:.3g} mm" in rows["Radius of the tool's tip"]
+    assert f"below {said.tool_radius:.3g} mm" in rows["Radius of the tool's tip"]
     assert of_json(json.dumps(replace(CONTENTS, order=said).facts())).order == said
 
 
