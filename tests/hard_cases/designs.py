@@ -125,17 +125,17 @@ DESIGNS: dict[str, Hard] = {
     "thin ring": Hard("disk", _PICTURE, ring, rrmsd=0.06, says=(MISSES, SIDES, LIFTED), bench=True),
     "two islands": Hard("disk", _PICTURE, islands, rrmsd=0.15, efficiency=0.98,
                         says=(MOVED, MISSED, MISSES, SIDES, OUTSIDE, CLOSE, LIFTED), bench=True),
-    "target 40 mm behind": Hard("disk", _size(20.0, **{"target.z": 60.0}), rrmsd=0.03, says=(MOVED, MISSES, SIDES),
-                                bench=True),
-    "target 50 m behind": Hard("disk", _size(20_000.0, **{"target.z": 50_020.0}), bench=True),
+    "target 40 mm behind the lens": Hard(
+        "disk", _size(20.0, **{"target.z": 60.0}), rrmsd=0.03, says=(MOVED, MISSES, SIDES), bench=True),
+    "target 50 m behind the lens": Hard("disk", _size(20_000.0, **{"target.z": 50_020.0}), bench=True),
     "deflection of 33 to 38 degrees": Hard("thu", _aside(600.0), rrmsd=0.2, says=(MISSED, CLOSE, LIFTED)),
     "deflection that no face can make": Hard(
         "thu", _aside(1500.0),
         refused="target: no light reaches the target, as a face of index 1.488 deflects light by at most 47.8",
     ),
-    "source 5 mm before": Hard("disk", {"source.position": [0.0, 0.0, 10.0]}, rrmsd=0.12, says=(MOVED, SIDES, LIFTED),
-                               bench=True),
-    "source 500 mm before": Hard("disk", {"source.position": [0.0, 0.0, -485.0]}, rrmsd=0.02, bench=True),
+    "source 5 mm before the lens": Hard(
+        "disk", {"source.position": [0.0, 0.0, 10.0]}, rrmsd=0.12, says=(MOVED, SIDES, LIFTED), bench=True),
+    "source 500 mm before the lens": Hard("disk", {"source.position": [0.0, 0.0, -485.0]}, rrmsd=0.02, bench=True),
     "index 1.05": Hard(  # more rounds come nearer to the picture, with less of the light
         "disk", {**_PICTURE, "lens.index": 1.05}, rrmsd=0.19, efficiency=0.95, rough={"tailoring.rounds": 3},
         says=(CHANGED, MISSED, MISSES, SIDES), perhaps=(OUTSIDE, "would need a face steeper"),
