@@ -45,7 +45,7 @@ from bstcad.tailoring.merit import PictureError
 from bstcad.tailoring.run import Hooks
 from bstcad.transport.mapping import TransportMap
 
-RELATIVE_TOLERANCE = 1e-9  # largest relative difference of indices that count as equal; for ends of nets, in net widths
+RELATIVE_TOLERANCE = 1e-9  # largest difference that is ignored: of indices, relative; of nets' ends, in net widths
 PREVIEW_TUBES = 521  # flux tubes per side of the light, for the picture of a design that is not verified yet
 AnyPath = str | os.PathLike[str]  # path of a file or of a folder
 
@@ -56,8 +56,8 @@ def design(
     """Design the lens for a scene or a scene file.  SceneError states the fault of an invalid scene.
 
     progress: show a progress bar in a terminal or notebook.  device: "auto", "cpu" or "cuda" (pipeline.device_for).
-    merit: function of picture and target, tensors (rows, columns) of flux; stages 2 and 3 minimise it, not RRMSD².
-    It must be differentiable and of the magnitude of RRMSD².  The verification still reports the RRMSD.
+    merit: function of (picture, target), tensors (rows, columns) of flux, that stages 2 and 3 minimise instead of
+    RRMSD².  It must be differentiable and of the magnitude of RRMSD².  The verification still reports the RRMSD.
 
     On Linux the process keeps up to 2 GB of freed memory for its next design (bstcad.runs.processes.keep_freed).
     """
@@ -88,7 +88,7 @@ def open(folder: AnyPath) -> Design:
 class Design:
     """A lens, its scene, and the report of its verification.
 
-    `verify` reads the files of the folder to which the design was last written.
+    `verify` reads the files of the folder to which the design was last written, or from which it was opened.
     """
 
     def __init__(self, made: Made, report: Report | None = None, folder: Path | None = None) -> None:
@@ -125,7 +125,7 @@ class Design:
 
         lens: must have the outline and the index (at the main wavelength) of the scene, be a mirror if the scene has a
         mirror, and have a net as wide as the net of the scene; it is converted to float64 on the CPU.  A different
-        front or number of control points is stored in the scene of the new design; losses are those of its [[effects]].
+        front or number of control points is stored in the new design's scene, whose [[effects]] determine the losses.
         The new design has no stages, history or transport map, and its report states "changed by hand".  SceneError
         names the property of a lens that does not fit.
         """
@@ -259,7 +259,7 @@ class Design:
         measured: file of points of a made part (CSV, PLY or STL; mm), which is also verified, see Report.measured.
         folder: folder for report, figures and deviation map of the made part; the design's folder is not changed.
         against: independent programs that also trace the design, "batoid" and "mitsuba", or your own judge
-        (bstcad.judges.comparison.OwnJudge).  All need a written design.  effort, checks, sections: see `write`.
+        (bstcad.judges.comparison.OwnJudge).  These three need a written design.  effort, checks, sections: see `write`.
         """
         options = ProofOptions(effort, checks=checks, sections=sections)
         cloud, place = (Path(path).expanduser() if path else None for path in (measured, folder))
@@ -283,7 +283,7 @@ class Design:
 
         grade: "moulded", "diamond-turned" or "precise", for errors that no [[tolerance]] names; None: as in the scene.
         wanted: yield (0 to 1) for which the loosest tolerances are computed.  workers: number of processes for the
-        traces, with which a script needs `if __name__ == "__main__":`.  scheduler: address of a dask scheduler instead.
+        traces (a script then needs `if __name__ == "__main__":`); scheduler: address of a dask scheduler instead.
         """
         from bstcad.tolerance.study import StudySettings  # loaded late, as in commands.tolerance
 
@@ -359,7 +359,7 @@ class Design:
         return f"RRMSD {number(values[-1])} as tailored; not verified yet" if values else "not verified yet"
 
     def _irradiance(self, number: int = 0) -> np.ndarray:
-        """Return the flux per pixel (rows, columns) on target[number], with the target's sum, verified or a preview."""
+        """Return the flux per pixel (rows, columns; sum 1) on target[number], as verified or else a preview."""
         if self.report is not None:
             return self.report.irradiances[number]
         goal = self._made.goals[number]

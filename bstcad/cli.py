@@ -1,6 +1,6 @@
-"""The command line; each command calls a function of bstcad.commands, bstcad.sweep or bstcad.scene.
+"""The command line: options and output of the commands, whose work other modules of bstcad do.
 
-Exit codes: 0 every check passed, 1 lens written but a check failed, 2 wrong input, 70 fault of bstcad, 130 Ctrl-C.
+Exit codes: 0 passed, 1 a check failed or no lens, 2 wrong input, 70 fault of bstcad, 130 Ctrl-C, 128 + n signal n.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def design_folder(path: str | Path) -> Path:
     """Return the path of an existing folder or file, with ~ expanded; SceneError if there is none."""
     path = user_path(path)
     if not path.exists():
-        raise SceneError(f"{path}: no such folder; give a design's folder, such as outputs/thu")
+        raise SceneError(f"{path}: no such folder or file; give a design's folder, such as outputs/thu")
     return path
 
 
@@ -233,11 +233,11 @@ AsJson = option(bool, None, "Print the result as JSON, for programs.", "--json")
 Name = argument(str | None, "NAME", "Name of the scene; NAME.toml is written.")
 Picture = option(Path | None, "FILE", "Picture that the plate projects on a wall.")
 Light = option(str | None, "L", "Light source of the plate: sun, laser, lamp or led (default: laser).")
-Size = option(str | None, "MM", "Size of the plate: 80, 80x60 (width x height) or 120xphoto (shape of the photo).")
+Size = option(str | None, "MM", "Size: 80 (default), 80x60 (width x height) or 120xphoto (the photo's proportions).")
 Distance = option(str | None, "MM", "Distance of the wall (default: 5 times the size; for the sun 2.5 times).")
 Template = option(str | None, "T", "Copy this template instead; see --list.")
 Listed = option(bool, None, "List the templates.", "--list")
-Opened = argument(Path | None, "SCENE|DIR", "Scene file, design's folder, or folder of both.", parser=user_path)
+Opened = argument(Path | None, "SCENE|DIR", "Scene, design, or folder of scenes and designs.", parser=user_path)
 Port = option(int, "N", "Port on this machine (0: any free port).", min=0, max=65535)
 Browser = option(bool, None, "Open the page in the browser.", "--browser/--no-browser")
 Written = argument(Path, "DIR|STEP", "Folder of a design, or a single STEP file.", parser=design_folder)

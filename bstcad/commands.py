@@ -173,7 +173,7 @@ def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), prog
 
 
 def prove(made: Made, options: ProofOptions = ProofOptions(), progress: Progress = no_progress) -> Report:
-    """Verify a design from temporary files."""
+    """Write a design to a temporary folder, verify these files, and return the report."""
     processes.begin()
     with tempfile.TemporaryDirectory(prefix="bstcad-") as folder, _second_process_ended():
         drawn = NoPictures(made.scene, processes.submit)
@@ -278,7 +278,7 @@ def verify(
     functions of a judge.
     measured: file of measured points of a made part, which is also verified.  With `place` its report is written there
     and the design's folder does not change.  Without `place` it is written to the design's folder and to its subfolder
-    measured/CLOUD, which only a verification of the same file rewrites.
+    measured/CLOUD, which only a verification of the same points rewrites.
     """
     against = comparison.choose_judges(against)
     if path.is_file():
@@ -497,7 +497,7 @@ def show(folder: Path, png: Path | None) -> None:
 
 
 def light_path_in(folder: Path) -> LightPath:
-    """Return the lens in a folder, rays through it, and the pictures of the targets.  SceneError: no light arrives."""
+    """Return the lens in a folder, rays through it, and the pictures of the targets.  SceneError without light."""
     scene, nominal = folders.read_nominal(folder)
     wanted, irradiances = (goal.picture for goal in nominal.goals), folders.read_irradiances(folder, scene)
     path = light_path_of(scene, nominal.lens, [*zip(wanted, irradiances, strict=True)])

@@ -44,7 +44,7 @@ from bstcad.transport.mapping import TransportMap, nodes
 from bstcad.verify import jobs
 from bstcad.verify.checks import Nominal
 
-SCENE, DESIGN, PART = "scene.toml", "design.npz", "part.step"
+SCENE, DESIGN, PART = "scene.toml", "design.npz", "part.step"  # names of files in a design's folder
 FRONT_KNOTS = ("front_knots_x", "front_knots_y")  # names in design.npz of the knots of a tailored front
 PROVEN = (SCENE, DESIGN, "lens.step", "lens.stl", PART, NET_FILE)  # files that a verification reads
 REMEDY = "generate the design again"

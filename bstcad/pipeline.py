@@ -83,7 +83,7 @@ class Stage1Result:
 
     lens: Parameters  # parameters of the lens after stage 1
     mapping: Mapping  # transport map of stage 1
-    transport: TransportMap  # inverse map, from the pixels of the target
+    transport: TransportMap  # inverse map, from corners of the target's pixels to the lens
     precision: PrecisionComparison | None  # comparison of float32 with float64; None: not made
     rrmsd: float  # RRMSD of the lens for the centre of the source, without a mount
 
@@ -166,7 +166,7 @@ def design(
 
 
 def within_reach(scene: Scene, progress: Progress) -> tuple[tuple[Goal, ...], Edge | None]:
-    """Return (goals, edge): the goals of a scene restricted to their reachable parts, and the light at their edge.
+    """Return (goals, edge): goals of a scene restricted to their reachable parts, and the first `Edge` of these parts.
 
     `progress` reports each target that light cannot reach completely.  SceneError as in `reachable_part`.
     """
@@ -196,7 +196,7 @@ def task_of(scene: Scene, goals: Sequence[Goal], knobs: ResolvedTailoring, edge:
 
 
 def with_solution(scene: Scene, task: Task) -> Task:
-    """Return the task of two freeform faces with the stated solution, or else the better one (`find_demand`).
+    """Return the task, for two freeform faces and several goals with the stated or better solution (`find_demand`).
 
     `task.progress` reports the angles and limits of the faces.  SceneError if the faces cannot make the pictures.
     """
@@ -224,8 +224,8 @@ def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tu
 def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | None]:
     """Return (part, edge) of a goal: True in the pixels (rows, columns) that light can reach, and light at their edge.
 
-    scene: has no other goal.  (None, None): light can reach the whole picture.  edge is None for a mirror, whose reach
-    only slope limits.  SceneError if light can reach no part, or not all of a target with unreachable = "refuse".
+    scene: has no other goal.  (None, None): light can reach the whole picture, or the front is tailored.  edge is None
+    for a mirror.  SceneError if light reaches no part, or not the whole of a target with unreachable = "refuse".
     """
     if scene.lens.front.is_tailored:  # with two tailored faces `with_solution` finds the limits
         return None, None

@@ -39,7 +39,7 @@ MIN_RECESS_GAP = 1e-2  # mm; smallest distance between the outlines of the front
 CONIC_CONSTANTS = (-1e3, 1e3)  # range of conic constants
 CURVATURES = (-1e3, 1e3)  # range of curvatures, 1/mm
 INDICES = (1.01, 5.0)  # range of the refractive index
-BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # keys of LensBlank that bound tailored faces
+BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # optional bounds on tailored faces
 
 NET_FILE = "front.npz"  # file in a design's folder with the net that was read from lens.front.file
 NET_REMEDY = "give the folder of a design, its design.npz or its lens.step"
@@ -51,7 +51,7 @@ NET_SIZES = (MIN_SIDE, MAX_CONTROL_POINTS)  # range of the control points per si
 FIT_TOLERANCE = 1e-6  # mm; largest distance between a fitted net and its surface (a toroid, or a user's class)
 FIT_SIZES = (33, 65, 129, 257, 513, 1025)  # control points per side of a fitted net, tried in this order
 MAX_CELL_RATIO = 1.5  # ratio of length and width of a cell of the net above which a warning proposes another net
-MIN_ROUND_POINTS = 6  # control points per side for a round lens, whose net extends two spans past the rim
+MIN_ROUND_POINTS = 6  # fewest control points per side for a round lens, whose net extends two spans past the rim
 
 Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 
@@ -395,7 +395,7 @@ FRONTS: dict[str, tuple[type[Any], Callable[..., Any]]] = {
 def as_front(value: Any, outline: Outline | None = None) -> Any:
     """Return the front of a scene for a surface of optics; return any other value as it is.
 
-    outline: outline of the lens, for a net fitted to a surface of a kind that FRONTS does not have; None: ValueError.
+    outline: outline of the lens, inside which a net is fitted to a surface of a kind not in FRONTS; None: ValueError.
     """
     if not hasattr(value, "relative_sag_and_slope"):
         return value
@@ -434,7 +434,7 @@ def net_extent(outline: Outline, net: Sides) -> tuple[float, float]:
     """Return half the width of a net in x and y (mm), so that it extends two spans past the rim of the lens.
 
     Then x is linear in the spline parameter t inside the rim.  In the end spans x(t) is quadratic; d/dx of the slope
-    z'(t) / x'(t) grows eightfold inwards across 1.5 control points, for any heights.  With light there, the edge of the
+    z'(t) / x'(t) grows eightfold inwards across 1.5 net spacings, for any heights.  With light there, the edge of the
     picture would be too bright, with a dark line beside it.  A net of 5 control points per side ends at the rim.
     """
     reach = ((m - 1) / (m - 5) if m > 5 else 1.0 for m in as_pair(net))
@@ -541,7 +541,7 @@ class LensBlank(Record):
 
     @property
     def bounded_by(self) -> tuple[str, ...]:
-        """Keys of the scene that bound the tailored faces."""
+        """Keys of BOUNDS that the scene states."""
         return tuple(key for key in BOUNDS if getattr(self, key) is not None)
 
     @property

@@ -29,7 +29,7 @@ NOT_BUILT = {  # unknown word for a feature that bstcad does not have yet: begin
 THE_TARGET, ONE_TARGET = re.compile(r"^target(?=[.:])|(?<=\s)target(?=\.[a-z])"), re.compile(r"target\[\d+\]")
 SIMILARITY = 0.7  # smallest ratio of difflib at which a known word is proposed; for "ies" and "pixels" it is 0.67
 
-UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
+UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")  # pydantic's errors for an unknown key
 SENTENCES = {  # sentence for each type of error of pydantic; {shown} is the value
     ("float_type", "float_parsing", "finite_number"): "{shown} is not a number; write one, without quotes",
     ("int_type", "int_parsing", "int_from_float", "int_parsing_size"): (

@@ -24,9 +24,9 @@ MAX_DRAFT = 30.0  # degrees; largest draft angle of the walls of a lens
 MIN_WEB = 0.1  # mm; smallest width of material between a hole and any other edge
 LAND = 0.1  # height of the upright wall below the back's rim, mm; for walls below 1 mm, fraction of their height
 ITERATIONS = 60  # iterations for the end of a bevel or wall; on a front of slope 0.5 each at least halves the error
-MIN_CLOSING = 0.25  # smallest approach of a wall with draft to the front (mm per mm of height)
+MIN_CLOSING = 0.25  # smallest rate at which a bevel or a wall with draft nears the front (mm per mm)
 MIN_CLEAR_APERTURE = 1e-3  # smallest clear aperture of the front after draft and bevel, as a fraction of the rim
-LENS_COLOUR, MIRROR_COLOUR = "#9ed3f580", "#c8ccd0"
+LENS_COLOUR, MIRROR_COLOUR = "#9ed3f580", "#c8ccd0"  # default colours of a part
 MAX_TEXT = 200  # largest number of characters of a text of the title block
 COLOUR = re.compile(r"#(?:[0-9a-fA-F]{6}|[0-9a-fA-F]{8})")
 
@@ -144,8 +144,8 @@ class Flange(Record):
         tuple[tuple[float, float, float], ...],
         Key("Further holes [x, y, diameter].", "mm", *COORDINATES, example=[[14.0, 0.0, 3.2]]),
     ] = ()
-    draft: Annotated[float, Key("Draft angle of the outer walls, which narrow upwards.", "degrees", 0.0, 45.0)] = 0.0
-    bevel: Annotated[float, Key("Height of the bevels, at 45 degrees, of the outer walls.", "mm", 0.0, 1e5)] = 0.0
+    draft: Annotated[float, Key("Draft of the outer walls; the plate narrows upwards.", "degrees", 0.0, 45.0)] = 0.0
+    bevel: Annotated[float, Key("Height of both bevels (45 degrees) of the outer walls.", "mm", 0.0, 1e5)] = 0.0
 
     def all_holes(self) -> list[tuple[float, float, float]]:
         """Return (x, y, diameter) of the screw holes and of the further holes, mm."""
@@ -160,8 +160,8 @@ class Mount(Record):
         Key("Origin z = 0 of part.step: the origin of the scene, the vertex of the front or the flange's lower face."),
     ] = "source"
     rim: Annotated[Shape | None, Key("Rim of the lens after cutting; lens.outline if absent.")] = None
-    draft: Annotated[float, Key("Draft angle of the walls, which narrow downwards.", "degrees", 0.0, MAX_DRAFT)] = 0.0
-    bevel: Annotated[float, Key("Height of the bevel, at 45 degrees, from walls to front.", "mm", 0.0, 1e5)] = 0.0
+    draft: Annotated[float, Key("Draft of the walls; the lens narrows downwards.", "degrees", 0.0, MAX_DRAFT)] = 0.0
+    bevel: Annotated[float, Key("Height of the bevel (45 degrees) between walls and front.", "mm", 0.0, 1e5)] = 0.0
     flange: Annotated[Flange | None, Key("A plate around the lens, one piece with it.")] = None
 
     def origin(self, front: float) -> float:
@@ -300,7 +300,7 @@ def _steepest_descent(front: Surface, rim: Outline) -> float:
 
 
 def _corner_complaints(key: str, shape: Round | Box, taken: float) -> Iterator[str]:
-    """Yield complaints about a corner radius of at most the depth (mm) that draft and bevel remove from the walls."""
+    """Yield complaints about a corner radius not above `taken`, the depth (mm) that draft and bevel remove."""
     if 0 < shape.corner_radius <= taken:
         size = f"{shape.corner_radius:g} mm is too small, as draft and bevel remove {taken:.3g} mm"
         yield f"{key}.corner_radius: {size}; make it larger, or 0"

@@ -99,7 +99,7 @@ class Plate:
         return self.magnification * self.side / self.light.pixels
 
     def source_image(self, distance: float) -> float:
-        """Return the size (mm) of the source's image at distance L (mm): lamp s L / before, parallel 2 L tan(s / 2)."""
+        """Return the image size (mm) of a source of size s at distance L (mm): lamp s L / before, sun 2 L tan(s/2)."""
         if self.before:
             return self.light.size * distance / self.before
         return 2 * distance * math.tan(math.radians(self.light.size / 2))

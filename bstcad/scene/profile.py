@@ -46,7 +46,7 @@ class DiscProfile(_Profile):
 
     @property
     def half_extent(self) -> tuple[float, float]:
-        """Radius (R, R) of the disc."""
+        """Radius (R, R) of the disc (mm)."""
         return self.radius, self.radius
 
     def light(self, pixels: Pixels, size: Size) -> np.ndarray:
@@ -68,7 +68,7 @@ class RectangleProfile(_Profile):
 
     @property
     def half_extent(self) -> tuple[float, float]:
-        """Half the width and height."""
+        """Half the width and height (mm)."""
         return self.width / 2, self.height / 2
 
     def light(self, pixels: Pixels, size: Size) -> np.ndarray:
@@ -86,7 +86,7 @@ class GaussianProfile(_Profile):
 
     @property
     def half_extent(self) -> tuple[float, float]:
-        """Radius (w, w) at 1/e² of the irradiance at the centre."""
+        """Radius (w, w), mm, at 1/e² of the irradiance at the centre."""
         return self.radius_1e2, self.radius_1e2
 
     def light(self, pixels: Pixels, size: Size) -> np.ndarray:
@@ -108,7 +108,7 @@ class SuperGaussianProfile(_Profile):
 
     @property
     def half_extent(self) -> tuple[float, float]:
-        """Radius (w, w) at 1/e² of the irradiance at the centre."""
+        """Radius (w, w), mm, at 1/e² of the irradiance at the centre."""
         return self.radius_1e2, self.radius_1e2
 
     def light(self, pixels: Pixels, size: Size) -> np.ndarray:
@@ -149,7 +149,7 @@ def cell(pixels: Pixels, size: Size) -> float:
 
 
 def corner_area(x: np.ndarray, y: np.ndarray, radius: float) -> np.ndarray:
-    """Return the area (mm²) of the disc r < R between (0, 0) and (x, y), with the sign of x y.
+    """Return the area (mm²) of the disc r < R inside the rectangle from (0, 0) to (x, y), with the sign of x y.
 
     For x, y >= 0 it is ∫_0^x min(y, sqrt(R² - t²)) dt: x y for x <= c = sqrt(R² - y²), and c y + G(x) - G(c) for
     x > c, with G(t) = (t sqrt(R² - t²) + R² asin(t / R)) / 2.
@@ -181,7 +181,7 @@ def _lit_pixels(at: np.ndarray, reach: float) -> tuple[np.ndarray, slice]:
 
 
 def _nodes(at: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes (pixels, nodes) and weights (nodes,) for means over pixels, in cells of at most `width` (mm)."""
+    """Return nodes (pixels, nodes) and weights (nodes,) for means between edges `at`, in cells up to `width` (mm)."""
     pitch = abs(float(at[1] - at[0]))
     node, weight = np.polynomial.legendre.leggauss(FEWER_NODES if 4 * pitch < width else NODES)
     cells = max(math.ceil(pitch / width), 1)

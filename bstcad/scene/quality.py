@@ -48,13 +48,15 @@ class Tailoring(Record):
         Key("Control points per side of the nets, from coarse to fine.", "", *NET_SIZES, example=[129, 257]),
     ] = None
     transport_grid: Annotated[int | None, Key("Cells per side of the transport map.", "", 16, 2049, example=512)] = None
-    transport_iterations: Annotated[int | None, Key("Transport map iterations.", "", 1, 100_000, example=100)] = None
+    transport_iterations: Annotated[
+        int | None, Key("Maximum number of iterations of the transport map.", "", 1, 100_000, example=100)
+    ] = None
     rays: Annotated[int | None, Key("Rays or flux tubes along each side of the light.", "", 16, 16_384)] = None
-    stage1_iterations: Annotated[int | None, Key("Iterations per net with adam.", "", 0, 1_000_000, example=300)] = None
+    stage1_iterations: Annotated[int | None, Key("Adam steps per net (stage 1).", "", 0, 1_000_000, example=300)] = None
     rounds: Annotated[
         int | None, Key("Maximum number of rounds of transport map and slope fit in stage 1.", "", 1, 100, example=10)
     ] = None
-    stage2_iterations: Annotated[int | None, Key("Iterations of stage 2.", "", 0, 1_000_000, example=120)] = None
+    stage2_iterations: Annotated[int | None, Key("Evaluations in stage 2 or 3.", "", 0, 1_000_000, example=120)] = None
     overshoot: Annotated[
         float | None, Key("Weight of light beside the target, per pixel² of distance.", "", 0.0, 1e3, example=0.03)
     ] = None
@@ -85,7 +87,7 @@ class Tailoring(Record):
         """Return the settings with all values set; net: control points per side of the back, or along x and along y.
 
         Levels of an oblong net are pairs, with cells in the same proportions.  Defaults: at least two rays per cell of
-        the net along x and along y (a draft: two in all per cell); at most twice as many cells per side in the map.
+        the net along x and along y (a draft: two in all per cell); a map of at most twice the net's cells per side.
         """
         levels = tuple(level if isinstance(level, tuple) else coarser(net, level) for level in self.levels or ())
         preset = dict(PRESETS[self.quality], levels=levels or coarse_to_fine(net))
@@ -166,7 +168,7 @@ Name = Literal[
 ]  # fmt: skip
 FORM, RIPPLE = ("back.form", "front.form"), ("back.ripple",)
 FACE_ERRORS = {"correlation_length": FORM, "period": RIPPLE, "pattern": RIPPLE}  # key -> errors that can have this key
-TWO_FACE_ERRORS = ("front.", "lens.wedge")  # errors of lenses with two refracting faces; zero if no table names them
+TWO_FACE_ERRORS = ("front.", "lens.wedge")  # prefixes of errors of one face; zero unless named in a table
 NONE = "none"  # grade of an error that is always zero
 
 
@@ -181,7 +183,7 @@ class Tolerance(Record):
     distribution: Annotated[
         Literal["normal", "uniform"] | None, Key("Distribution; normal is truncated at the limit, which is 2 σ.")
     ] = None
-    cost: Annotated[float | None, Key("Cost of the limit, relative to the other errors.", "", 1e-6, 1e6)] = None
+    cost: Annotated[float | None, Key("Relative cost of keeping the limit; 1 if absent.", "", 1e-6, 1e6)] = None
     correlation_length: Annotated[float | None, Key("Correlation length of a form error.", "mm", 1e-3, 1e4)] = None
     period: Annotated[float | None, Key("Period of a ripple.", "mm", 1e-3, 1e4, example=0.02)] = None
     pattern: Annotated[Literal["raster", "spiral"] | None, Key("Pattern of the tool marks.", example="spiral")] = None

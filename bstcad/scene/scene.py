@@ -67,7 +67,7 @@ class Accept(Record):
         ),
     ] = None
     light_on_target: Annotated[
-        float | None, Key("Minimum fraction of flux at the lens that is on the target.", "", 0.0, 1.0, of_light=True)
+        float | None, Key("Minimum fraction of flux into the lens that is on the target.", "", 0.0, 1.0, of_light=True)
     ] = None
     leak: Annotated[
         float | None, Key("Maximum fraction of flux on the target that is on dark pixels.", "", 0.0, 1.0, of_light=True)
@@ -199,7 +199,7 @@ class Scene(Record):
         return tuple(Goal(key, target.screen, target.irradiance(), target.weight) for key, target in pairs)
 
     def single_target_scenes(self) -> tuple[Self, ...]:
-        """Return one scene per target, each with that target alone and no wavefront."""
+        """Return one scene per target, with only this target and no wavefront; for one target, the scene itself."""
         if len(self.targets) == 1:
             return (self,)
         without_wave = {"wavefront": None, "accept": self.accept.model_copy(update={"wavefront": None})}
@@ -265,7 +265,7 @@ class Scene(Record):
         return before, elements.interfaces(self.behind, 1, wavelength)
 
     def clearance(self, highest: float) -> tuple[float, str]:
-        """Return (gap, key) of the nearest element or target behind a lens up to z = highest; mm, negative: crossed."""
+        """Return (gap, key) of the next element or target behind a lens up to z = highest; gap (mm) < 0: they cross."""
         room = [(elements.lowest(self.behind) - highest, "behind[0].z")] if self.behind else []
         if not self.light_path.is_folded:
             for target, key in zip(self.targets, self.target_keys, strict=True):
@@ -301,7 +301,7 @@ class Scene(Record):
         """Return the light as a weighted sum of channels; a point source of one wavelength is one channel.
 
         points: number of points of an extended source, divided among its lines (default: tailoring.source_points).
-        draw: number of the set of these points.
+        draw: number of the point set; other numbers give other points.
         """
         if points is None:
             points = self.tailoring.points_of_source

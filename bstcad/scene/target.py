@@ -48,8 +48,6 @@ PictureFile = Annotated[
 ]
 Crop: TypeAlias = tuple[float, float, float, float]  # left, top, right, bottom as fractions of width and height
 Tilt = Annotated[tuple[float, float] | None, AfterValidator(lambda tilt: tilt if tilt and any(tilt) else None)]
-
-
 # Remedy for a wall that is nearly parallel to the axis.
 AIM = (
     "to light a wall beside the lamp, turn the lamp towards the centre of the picture; then target.z is the distance "
@@ -87,7 +85,7 @@ class Target(Record):
         Key("Part to show: [left, top, right, bottom] as fractions.", "", 0.0, 1.0, example=[0.1, 0.0, 0.9, 1.0]),
     ] = None
     outline: Annotated[Outlined | None, Key("Outline of the picture, centred; dark outside.")] = None
-    unreachable: Annotated[Literal["dark", "refuse"], Key("Parts without light: dark, or refuse the scene.")] = "dark"
+    unreachable: Annotated[Literal["dark", "refuse"], Key("Unreachable parts: dark, or refuse the scene.")] = "dark"
     weight: Annotated[float, Key("Weight of the target's squared error.", "", 1e-6, 1e6, example=2.0)] = 1.0
 
     written = leaving_out(weight=1.0)
@@ -266,7 +264,7 @@ class Target(Record):
 
 
 def is_faced(plane: PlaneReceiver, vertex: Vector) -> bool:
-    """Return True if a point sees the front of a plane, at an angle above EDGE_ON to the plane."""
+    """Return True if a point (mm) sees the front of a plane more than a degree (EDGE_ON) from edge-on."""
     return -plane.height(vertex) > EDGE_ON * math.dist(plane.middle, vertex)
 
 
@@ -483,7 +481,7 @@ def average(light: Callable[[PixelBox], np.ndarray], size: Pixels, window: Windo
 
 
 def overlap(size: int, pixels: int, start: float = 0.0, stop: float | None = None) -> csr_array:
-    """Return the matrix (pixels, size) of means over equal pixels from start to stop of `size` inputs of width 1."""
+    """Return the matrix (pixels, size) that averages `size` inputs of width 1 over equal pixels from start to stop."""
     stop = size if stop is None else stop
     edges = start + np.arange(pixels + 1) * (stop - start) / pixels
     edges[-1] = stop
