@@ -212,7 +212,7 @@ class Margins:
 
 @torch.no_grad()
 def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, n: int = MARGIN_RAYS) -> Margins:
-    """Return the margins over n x n stratified rays per channel; the points of an extended source share n x n rays.
+    """Return the margins over n x n stratified rays per spectral line, shared among the points of an extended source.
 
     cos θ = (d_z - d_x z_x - d_y z_y) / sqrt(1 + z_x² + z_y²) where light leaves the glass; total internal reflection at
     sin θ = 1 / index.  At faces from the first net on F(t) = z - sag(x, y) at path t, F' = d_z - d_x z_x - d_y z_y.

@@ -155,7 +155,7 @@ def slope_octaves(face: BSplineSurface) -> np.ndarray:
     """Return the slope energy of the control net by octaves of frequency, coarse to fine (mm², squared differences).
 
     It is Σ λ |ĥ|² over the cosine transform ĥ of the net minus its best cubic polynomial (the even continuation of a
-    tilt has kinks), λ the eigenvalue of the Laplacian.  Octave k has the frequencies whose larger index is in
+    tilt has kinks), λ the eigenvalue of the negative Laplacian.  Octave k has the frequencies whose larger index is in
     (m / 2^(k+1), m / 2^k], m the number of control points along the longer side; the other indices are scaled to m.
     """
     energy, octave = _energy(face, scipy.fft.dctn(_without_cubic(face), norm="ortho")), _octave(face)

@@ -1,7 +1,7 @@
 """The penalty on the thickness of the glass between two freeform faces, everywhere inside the outline.
 
 If the front is tailored, a lens that is too thin cannot be corrected by a shift of the back along z: each face shapes
-the light, and a shift changes where the light from the front meets the back.  So the heights of both are penalised.
+the light, and a shift changes where the light from the front meets the back.  So the penalty changes both faces.
 
 In a cell of a grid no coarser than either net, each face depends on at most 4 x 4 control points, and lies between
 the lowest and the highest of them.  This bound often shows for whole tiles of cells that the thickness is nowhere near
@@ -26,7 +26,7 @@ from bstcad.optics.outlines import inside
 from bstcad.optics.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 
-PENALTY_MARGIN = 0.01  # distance from a bound at which the penalty begins, relative to it (thickness: to `unit`)
+PENALTY_MARGIN = 0.01  # distance from a bound at which the penalty begins / the bound (of thickness: / `unit`)
 QUARTER_RIM_POINTS = 1025  # number of points along a quarter of the rim
 CELL_POINTS = 4  # control points per axis on which a cell may depend: it lies in at most two knot spans
 TILE_CELLS = 16  # number of cells per axis in a tile
@@ -46,8 +46,8 @@ def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], flo
 
     The excess is e = max(thinnest - t, t - thickest) / unit, along the rim with max(thinnest, edge) as thinnest.  With
     m = PENALTY_MARGIN the penalty is the mean of max(e + m, 0)² over the grid, plus the mean along the rim if `edge` is
-    given.  If every e < -m, the largest excess is -m and the gradients are {}.  The gradients in the heights of a net
-    have the number of its face as key.  Sums have fixed parts, so that no bit depends on the number of threads.
+    given.  If every e < -m, the largest excess is -m and the gradients are {}.  The key of a gradient is the number
+    of the face in whose heights it is.  Sums have fixed parts, so that no bit depends on the number of threads.
     """
     length, square, worst = unit(lens, bounds), 0.0, -PENALTY_MARGIN
     front, back = lens.number_of("front"), lens.number_of("back")

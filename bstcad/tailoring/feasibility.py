@@ -1,15 +1,15 @@
-"""Feasibility of two freeform faces: a check on coarse grids, before the long stages, that both can meet all goals.
+"""Feasibility of two freeform faces: a check on coarse grids, before the long stages, that a lens can meet all goals.
 
 The wavefront, or the two pictures, determine the rays behind the lens (light_behind.py).  These rays determine where
 the light meets the back, and by which angle the front has to deflect it.  A design is refused if, for much of the
-light, rays would have to cross between lens and target, or light would have to leave the back outside of the outline.
-It is reported if the front would have to deflect light by more than refraction can.
+light, rays would have to cross between lens and target, or to leave the back outside of its clear aperture.  It is
+reported if the front would have to deflect light by more than refraction can.
 
-At an index of 1.49 a front can deflect light by up to 48 degrees.  A back that cancels this deflection is nearly
-vertical, and remains so in stage 2.  If the front would have to deflect light by more than MAX_GENTLE_DEFLECTION,
-stage 1 therefore raises the dark parts of the furthest picture, which cause the largest deflections, to a floor;
-stage 2 uses the unchanged picture.  (Example: two faces 6 mm apart that have to deflect light by 38 degrees, for a
-square and letters.  RRMSD 0.34 and 0.63 after 100 evaluations per round without this floor, 0.37 and 0.48 with it.)
+At an index of 1.49 a front can deflect light by up to 43 degrees (incidence at 85 degrees).  A back that cancels this
+is nearly vertical, and remains so in stage 2.  If the deflection would exceed MAX_GENTLE_DEFLECTION, stage 1 raises the
+dark parts of the furthest picture, which cause the largest deflections, to a floor; stage 2 uses the unchanged picture.
+(Example: two faces 6 mm apart that have to deflect light by 38 degrees, for a square and letters.  RRMSD 0.34 and 0.63
+after 100 evaluations per round without this floor, 0.37 and 0.48 with it.)
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from bstcad.transport.mapping import Solver
 
 TRIAL_CELLS, TRIAL_PIXELS = 64, 128  # cells per side of the coarse maps, pixels along the longer side of their pictures
 TRIAL_ITERATIONS = 100  # iterations of the coarse maps
-MAX_UNSERVED = 0.5  # largest fraction of the light whose rays may miss the outline or cross each other
-REPORTED_FRACTION = 1e-3  # smallest such fraction that is reported
+MAX_UNSERVED = 0.5  # largest fraction of the light whose rays may miss the back's aperture or cross each other
+REPORTED_FRACTION = 1e-3  # smallest fraction of the light with such rays that is reported
 MAX_GENTLE_DEFLECTION = 30.0  # largest deflection at the front for which the furthest picture needs no floor (degrees)
 TRIED_FLOORS = (0.1, 0.2, 0.4, 1.0)  # floors, relative to the mean of the furthest picture, tried in this order
 SOLUTION_NAMES = {1.0: "convex", -1.0: "concave"}  # names of the solutions with the sign σ of light_behind.py
@@ -48,7 +48,7 @@ class Demand:
     angle: float  # largest angle to the axis at which light leaves the lens (degrees)
     rms_angle: float  # RMS angle to the axis over the rays (degrees)
     crossed: float  # fraction of the light whose rays would cross between lens and target
-    outside: float  # fraction of the light that would leave the back outside of the outline
+    outside: float  # fraction of the light that would leave the back outside of its clear aperture
     deflection: float  # largest angle by which the front deflects light (degrees); NaN: not computed
     limit: float  # largest angle by which a front can deflect light (degrees)
     floor: float = 0.0  # irradiance, relative to the mean, to which stage 1 raises dark parts of the furthest picture
@@ -108,7 +108,7 @@ def find_demand(task: Task, lens: Lens) -> Demand:
 
 
 def _demand(task: Task, solution: float, lens: Lens) -> tuple[Demand, LightBehind]:
-    """Return the demand of a solution on coarse grids (deflection: NaN), and its rays behind it, made not to cross."""
+    """Return the demand of a solution on coarse grids (deflection: NaN), and rays behind the lens that do not cross."""
     knobs = task.knobs.model_copy(update={"transport_grid": TRIAL_CELLS, "transport_iterations": TRIAL_ITERATIONS})
     task = replace(with_pixels(task, TRIAL_PIXELS), knobs=knobs, solution=solution, progress=no_progress)
     light = light_behind.light_for_task(task)
@@ -137,5 +137,5 @@ def _largest_deflection(task: Task, lens: Lens, light: LightBehind) -> float:
 
 
 def is_infeasible(demand: Demand) -> bool:
-    """Return True if the rays of more than MAX_UNSERVED of the light would miss the outline or cross each other."""
+    """Return True if rays of more than MAX_UNSERVED of the light would miss the back's aperture or cross each other."""
     return demand.outside + demand.crossed > MAX_UNSERVED

@@ -42,8 +42,8 @@ class Grazing:
     """Penalty at the ends and centres of the knot spans of the last net, as a function of its heights."""
 
     net: BSplineSurface  # net whose knots are used; its heights are ignored
-    at_face: Rays  # (3, m, n) rays at these points before refraction, traced through the lens given to `of`
-    weight: Tensor  # (m, n) fraction of the light at each point, sum 1
+    at_face: Rays  # (3, j, k) rays at these points before refraction, interpolated from the lens given to `of`
+    weight: Tensor  # (j, k) fraction of the light at each point, sum 1
     eta: float  # index before the face / index behind it
     angle: float  # θ'_max (rad)
 

@@ -12,9 +12,9 @@ hardly depends on p for a fixed t, and p -> y is the gradient of a convex functi
 picture on A to the picture on B in the coordinates y.  The remaining dependence on p enters through the p that the
 previous round assigned to each t, as in slope_map.py.  In the convex solution, σ = 1, no two rays cross between the
 planes; in the concave solution, σ = -1, all do.  A is the nearest target and B the furthest.  If one picture has
-clearly more contrast, such as letters on black, B is its target, and the rays pass through the corners of its pixels:
-its black pixels then get no light, whatever the map is in the gaps between letters.  If this is the nearest target, A
-is the furthest one, and the rays are followed backwards.
+clearly more contrast, such as letters on black, the rays pass through the corners of its pixels: its black pixels then
+get no light, whatever the map is in the gaps between letters.  If it is the nearest picture, A and B are exchanged, and
+the rays are followed backwards.
 
 Between lens and nearest target the rays may cross, and then no lens can send them.  In the convex solution this happens
 where the light on A is much denser than on B (an eigenvalue of ∂t/∂p above 1 + |AB| / |lens A|).
@@ -46,7 +46,7 @@ from bstcad.tailoring.slope_map import centroid, pixel_corners, resample_picture
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Points, Solver, grid_coordinates, solve
 
-MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds; in all but the last max(n / 4, 64) cells per side
+MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # number of rounds; all but the last: max(n / 4, 64) cells
 MAX_WAVE_ITERATIONS = 40  # largest number of iterations for the point of a wave that sends a ray to a given point
 WAVE_TOLERANCE = 1e-9  # change of this point at which the iterations have converged (mm)
 SOURCE_FLOOR = 0.02  # smallest irradiance of the map's source picture, relative to its mean: black would leave holes
@@ -67,7 +67,7 @@ Picture = tuple[Screen, np.ndarray]  # (screen, flux in its pixels (rows, column
 class LightBehind:
     """Rays behind the lens, through the corners of the pixels of a target or of equal parts of these pixels."""
 
-    position: np.ndarray  # (3, c + 1, r + 1) points of the rays in space (mm), x first
+    position: np.ndarray  # (3, c + 1, r + 1) points of the rays in space (mm), for c columns and r rows of pixels
     direction: np.ndarray  # (3, c + 1, r + 1) unit vectors along the rays
     picture: np.ndarray  # (r, c) flux of the tube between each four rays, row 0 = y max
 
@@ -84,7 +84,7 @@ class LightBehind:
         return _dot(e_x, off) + x, _dot(e_y, off) + y
 
     def sampled_at(self, screen: Screen, values: np.ndarray) -> np.ndarray:
-        """Interpolate values (k, c + 1, r + 1) at the rays to the corners of a screen, (k, columns + 1, rows + 1)."""
+        """Interpolate values (k, c + 1, r + 1) at the rays to pixel corners of a screen, (k, columns + 1, rows + 1)."""
         x, y = self.positions_on(screen.plane)
         if float((x[1:] - x[:-1]).mean()) < 0:
             x, y, values = x[::-1, ::-1], y[::-1, ::-1], values[:, ::-1, ::-1]
@@ -206,12 +206,12 @@ def light_of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength
 def between_targets(
     near: Picture, far: Picture, n: int, sign: float = 1.0, solver: Solver = TARGETS_SOLVER
 ) -> LightBehind:
-    """Return the rays through two pictures by transport on n x n cells.
+    """Return the rays through two pictures by transport on FINE_FACTOR n cells per side, at first on fewer.
 
     sign: σ, 1 for the convex and -1 for the concave solution.
     The map leads from the near to the far picture, or in reverse if the near one has clearly more contrast: a map to a
-    picture with black parts converges more safely than a map from it.  The rays are about as far apart as the cells;
-    for a picture of high contrast they are closer, since few bright pixels have to resolve the other picture.
+    picture with black parts converges more safely than a map from it.  About n rays per side are returned; for a
+    picture of high contrast more, since few bright pixels have to resolve the other picture.
     """
     contrasts = [float((p**2).mean() / p.mean() ** 2) for _, p in (near, far)]
     against = contrasts[0] > CONTRAST_RATIO * contrasts[1]  # True: rays are followed backwards, from far to near

@@ -47,7 +47,7 @@ HALVINGS = 10  # number of bisection steps between a lens that exceeds the bound
 
 @torch.no_grad()
 def place_back(lens: Lens, z: float, least: float, bounds: Bounds | None = None) -> Lens:
-    """Return the lens with the plane of its back at `z` (mm), or as far behind as a thickness of `least` mm requires.
+    """Return the lens with the plane of its back at `z` (mm), or as far above as a thickness of `least` mm requires.
 
     With bounds, the minimum thickness at the rim and the maximum thickness are met too.  If these are incompatible, the
     thickness violates the minimum and the maximum by equal lengths.

@@ -13,8 +13,8 @@ tubes that do not reach the receiver (total internal reflection).  Light outside
 no gradient; the penalty is `overshoot` (1 / pixel²) times the mean over all light of the squared distance outside the
 border (in pixels; for a source of finite size, the border of the picture with its margin).  Pictures and both terms are
 sums over the channels of the light.  For a source of finite size the picture is that of its centre, blurred
-(source_image.py).  The wavefront error of a ray is its optical path S to the plane of the wave minus the phase W of the
-wave there (wavefront_error.py), without piston.
+(source_image.py).  The wavefront error of a ray is its optical path to the plane of the wave minus the path required
+there (`Wave.path`), without piston.
 
 The Hessian: let e be the flux density on the last face, and E the irradiance of the target where its light lands.  A
 change δz of the face moves this light by L ∇δz, where L = |∂t/∂p| (mm) is the leverage, the change of the landing
@@ -74,7 +74,7 @@ WEIGHT_SMOOTHING = 1.5  # standard deviation of the smoothing of the weight's lo
 MAX_LOCAL_WEIGHT = 4.0  # largest local weight; the smallest is 1 / MAX_LOCAL_WEIGHT, before division by the leverage
 # Range of the leverage / median in which the weight is proportional to 1 / leverage.
 MIN_LEVERAGE, MAX_LEVERAGE = 3.0, 96.0
-LEVERAGE_STEP = 1e-6  # step of the difference quotients of the leverage, relative to the distance to the target
+LEVERAGE_STEP = 1e-6  # shift of t for the difference quotients of p(b, t), relative to the distance to the target
 LEVERAGE_STRIDE = 8  # every 8th control point is checked first, since few lenses have a large leverage anywhere
 
 
@@ -135,7 +135,7 @@ class Merit:
 
     @property
     def tubes(self) -> int:
-        """Number of tubes that an evaluation traces."""
+        """Number of tubes of an evaluation; each counts once per target."""
         return len(self.goals) * sum(sheet.flux.numel() for sheet in self.light.sheets)
 
     @cached_property
@@ -260,8 +260,8 @@ def _corner_flux(flux: Tensor) -> Tensor:
 class SobolevVariable:
     """Sobolev variable: heights h (m, n) in mm as a function of c (m, n), h = p C^T (λ^-q · C (w c) C^T) C.
 
-    C is the orthonormal cosine transform, p the mean spacing of control points (mm), and q the exponent.
-    λ_ij = 4 - 2 cos(π i / m) - 2 cos(π j / n) are the eigenvalues of the Laplacian; λ^-q = 0 for the piston.
+    C is the orthonormal cosine transform, p the geometric mean spacing of control points (mm), and q the exponent.
+    λ_ij = 4 - 2 cos(π i / m) - 2 cos(π j / n) are the eigenvalues of the negative Laplacian; 0 is used for λ_00^-q.
     """
 
     weight: Tensor  # local weight w, (m, n)
@@ -294,7 +294,7 @@ class SobolevVariable:
 class CoarseVariable:
     """Heights h (m, n) in mm of a net as a function of the variable c of a coarser net: h = P h'(c) Q^T.
 
-    P (m, m') and Q (n, n') insert knots, so that h is the same spline as the heights h' (m', n') of the coarser net.
+    P (m, m') and Q (n, n') fit the finer net to the spline of h' (m', n') by least squares (bspline.resample).
     (A cosine has zero slope at the rim.  With the cosines of the finer net, a slope of the surface there needs many of
     them, which ripple all over the net; the few cosines of the coarser net ripple less.)
     """
@@ -413,7 +413,7 @@ class Spectrum:
 
 
 def laplacian(m: int) -> Tensor:
-    """Return 2 - 2 cos(π i / m), (m,): the eigenvalues of the second difference along one axis."""
+    """Return 2 - 2 cos(π i / m), (m,): the eigenvalues of the negative second difference along one axis."""
     return 2 - 2 * elementary(torch.cos, math.pi * torch.arange(m, dtype=torch.float64) / m)
 
 

@@ -47,7 +47,7 @@ INTERPOLATION_POINTS = 4  # front control points per axis from which R interpola
 
 @dataclass(frozen=True)
 class NetVariables:
-    """Heights (mm) of the nets of a lens as a function of one block of variables c per net."""
+    """Changes of the heights (mm) of the nets of a lens, as a function of one block of variables c per net."""
 
     blocks: tuple[SobolevVariable | CoarseVariable, ...]
     along: csr_array | None = None  # matrix R, (points of the back, points of the front); None: independent blocks

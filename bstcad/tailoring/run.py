@@ -83,7 +83,7 @@ RRMSD_SECONDS = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
 # error of the product of two pictures of n² stratified rays varies as (p / n)³ / p, so a target of p pixels per side
 # needs (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays per side.
 STAGE_EFFORT, STAGE_EFFORT_PIXELS = Effort(rays=724, accuracy=0, witness=False), 512
-FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays for scenes with tailoring.accuracy or bounds
+FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays if an accuracy or bounds are given, or to compare
 FLUX_EFFORT = Effort(rays=128, accuracy=1.0, witness=False)  # rays for the flux on the target alone
 
 Progress = Callable[[str, int, int, str], None]  # called with stage, units done, units in total, text
@@ -130,7 +130,7 @@ class Task:
 
     @property
     def heaviest(self) -> Channel:
-        """Channel with most of the light; stage 1 uses only this channel."""
+        """Channel with the largest part of the light, the only one that stage 1 uses."""
         return max(self.channels, key=lambda channel: channel.weight)
 
     @property

@@ -128,7 +128,7 @@ class SlopeMap:
     gathering: BSplineSurface  # surface g
     sign: float  # sign σ, 1 or -1
     face_points: Points  # b (mm) for the corners of the target's pixels, (columns + 1, rows + 1)
-    moved: float  # RMS change of b since the last round at lit corners, in the unit of stage1.RETRY_CHANGE; NaN: none
+    moved: float  # RMS change of b in the last round at lit corners / half a side of the `square_grid`; NaN: none
 
     def slopes(self, x: Tensor, y: Tensor) -> Slopes:
         """Return the slopes (∂z/∂x, ∂z/∂y) needed at points x, y (n,) of the last freeform face (mm)."""

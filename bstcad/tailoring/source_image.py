@@ -40,7 +40,7 @@ from bstcad.optics.sampling import point_pairs
 
 IMAGE_NODES = 5  # nodes per side, from border to border of the screen
 IMAGE_GRID = 32  # points per side on the back through which the images of the source are traced
-POINT_DISTANCE = 0.7  # distance of the 3 x 3 points of the source from its centre, in half widths
+POINT_DISTANCE = 0.7  # spacing of the 3 x 3 points of the source along each axis, in half widths of the source
 IMAGE_PAIRS = 256  # pairs of source points that represent an image
 PIXEL_PARTS = 5  # parts of a pixel per axis in the images; odd
 ERROR_RAYS = 1448  # square root of the number of rays in each of the two sets that measure the error of the blur

@@ -179,7 +179,7 @@ def _round(task: Task, lens: Lens, previous: SlopeMap | None, number: int) -> tu
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
-    """Return the lens fitted to the map of the paper, from the front to target points, and this map.
+    """Return the lens fitted to the map of the paper, from the front's vertex plane to the target, and this map.
 
     The face is fitted to slopes, while the paper minimises |P_i^t - P_i|².  A ray keeps its aim while the sag changes.
     So these slope fits converge even if the slopes needed at fixed points of the back depend strongly on the sag: in

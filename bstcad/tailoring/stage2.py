@@ -206,7 +206,7 @@ def round_shares(task: Task) -> RoundFractions | None:
 
 
 def sheet_sizes(knobs: ResolvedTailoring, shares: RoundFractions | None = None) -> Iterator[tuple[int, int]]:
-    """Yield (tubes per side, evaluations) of each round: as many tubes as control points, or knobs.rays, at least."""
+    """Yield (tubes per side, evaluations) of each round; tubes: as many as control points or knobs.rays, at least."""
     shares = shares or (DENSE_ROUNDS if knobs.rays >= DENSE_TUBES * knobs.side else SPARSE_ROUNDS)
     if knobs.stage2_iterations < MIN_EVALUATIONS:
         shares = ((1.0, 1.0),)
@@ -319,7 +319,7 @@ class Problem:
 
 
 def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariables:
-    """Return the variables of stage 2 for all nets; with `pixels`, of changes by nets with so many cells per side."""
+    """Return the variables of stage 2 for all nets; with `pixels`, of coarser nets with so many cells per side."""
     nets = lens.nets
     if pixels is not None:
         lens = lens.with_nets(net.refined(coarser(net.shape, pixels + 1)) for net in nets)

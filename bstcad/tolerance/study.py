@@ -249,7 +249,7 @@ def principal_axes(symmetric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 MODEL_TRIALS = 10_000  # default number of trials by the model
 WORST_SHOWN = 5  # number of reported worst trials
 SCREEN_ADJUSTMENTS = {f"screen.{motion}" for motion, *_ in MOTIONS}  # motions by which a user adjusts the screen
-ADJUSTMENT_RANGE = 8.0  # range of adjustments of the screen, in standard deviations
+ADJUSTMENT_RANGE = 8.0  # largest adjustment (±) of each motion of the screen, in standard deviations
 ADJUSTMENT_FACTOR = 10.0  # limit, relative to the default grade, of an adjustment that is not an error of the study
 QUOTIENT_STEP = 1e-4  # step of the difference quotients, in standard deviations
 INDEPENDENT_SEED = 7919  # offset of the seed of independent trials

@@ -21,7 +21,7 @@ series along the second axis, -Δ is the tridiagonal matrix D + s_k, where D is 
 first axis and s_k = 4 sin²(πk/2n).  The transforms run along contiguous lines of n cells, and the elimination treats
 neighbouring columns together, so that memory is never read across lines.
 
-All quantities are in cell units: cell centres at i + 1/2, i = 0 … n-1, and potentials in squared cell sides.
+All quantities except `Transport` are in cell units: cell centres at i + 1/2, i = 0 … n-1, potentials in squared cells.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from numba import njit, prange
 from bstcad.transport.density import BLOCKS, Density, inner, pushforward, threads, threads_for
 
 LINES_PER_BLOCK = 8  # lines transformed together: eight doubles fill a cache line of the transposed output
-MIN_CELLS = 32  # cells per side of the coarsest grid
+MIN_CELLS = 32  # number of cells per side above which a coarser grid is solved first (`ladder`)
 FIRST_STEP = 1.0  # step length sigma on the coarsest grid; for uniform densities 1 is Newton's step
-MIN_FIRST_STEP = 0.25  # smallest initial sigma on a finer grid: noise lowers sigma at the end of a coarse grid
-STEP_INCREASE, STEP_DECREASE, REFUSED_STEP_FACTOR = 1.25, 0.8, 0.5  # factors of sigma after short, long, rejected steps
+MIN_FIRST_STEP = 0.25  # smallest initial sigma on a finer grid: noise lowers sigma at the end of a solve
+STEP_INCREASE, STEP_DECREASE, REFUSED_STEP_FACTOR = 1.25, 0.8, 0.5  # factors of sigma if short, long, rejected
 MIN_GAIN_RATIO, MAX_GAIN_RATIO = 0.25, 0.75  # Armijo-Goldstein bounds of (gain of J) / (sigma |∇J|²)
 PLATEAU_TOLERANCE = 0.005  # relative decrease of the mass error below which the solve is on a plateau
 PLATEAU_ITERATIONS = 5  # number of iterations over which the decrease of the mass error is measured
@@ -122,10 +122,10 @@ class Poisson:
 
 
 class PoissonWithoutCheckerboard(Poisson):
-    """Operator (-Δ)^-1 (1 - D_x D_y / 16); it maps the checkerboard, for which D_x and D_y are 4, to zero.
+    """Operator (-Δ)^-1 (1 - D_x D_y / 16), with the negative second differences D_x and D_y along the two axes.
 
-    D_x and D_y are negative second differences.  For D_y = s_y this is ((1 + s_y²/16) / (D_x + s_y)) - s_y/16, again
-    one elimination.
+    It removes the checkerboard, for which D_x and D_y are nearly 4.  For a cosine along y, D_y is a number s_y and the
+    operator (1 + s_y²/16) / (D_x + s_y) - s_y/16, again one elimination.
     """
 
     def __init__(self, n: int):
@@ -137,7 +137,7 @@ def _pivots(s: np.ndarray) -> np.ndarray:
     """Return the inverse pivots (n, n) of D + s_k: row i for the i-th cell of the line, column k for the k-th term.
 
     A pivot is 1 + e with e_i = s + e_(i-1) / (1 + e_(i-1)), without cancellation; the last pivot, at the boundary, is
-    e. For k = 0 it is zero: the end of the line is set to zero, and the mean is subtracted afterwards.
+    e.  For k = 0 this e is 0; 0 in place of its inverse makes the solution 0 there, and its mean is subtracted later.
     """
     n = s.size
     pivots, e = np.empty((n, n)), s.copy()
@@ -174,7 +174,7 @@ class TransportStep:
     grid: int  # cells per side of the current grid
     iteration: int  # number of the iteration on this grid, from 1
     mass_error: float  # mean |pushforward - target| of densities of mean 1
-    stage: str  # method: "back-and-forth" | "tubes"
+    stage: str  # method: "back-and-forth", or "tubes" for Newton's method on flux tubes
 
 
 Listener = Callable[[TransportStep], None] | None  # called after each iteration of a solve
@@ -190,9 +190,9 @@ class Transport:
     phi: np.ndarray  # potential on the target side, (n, n)
     psi: np.ndarray  # potential on the source side, phi^c, (n, n)
     mass_error: tuple[float, ...]  # mean |pushforward - target| before each iteration on the finest grid and at the end
-    dual: tuple[float, ...]  # Kantorovich dual J after each iteration on the finest grid; it rises to W2²/2
+    dual: tuple[float, ...]  # dual value J after each iteration on the finest grid; from `mapping.solve`: at the end
     iterations: int  # number of iterations on the finest grid
-    reason: str  # reason of the end of the solve: "converged" | "plateau" | "iterations"
+    reason: str  # reason why the solve ended: "converged" | "plateau" | "iterations"
 
 
 def back_and_forth(
@@ -228,7 +228,7 @@ def prolong(phi: np.ndarray) -> np.ndarray:
 
 
 def ladder(source: Density, target: Density, coarsest: int) -> list[tuple[Density, Density]]:
-    """Return the pair on a sequence of grids, coarsest first; n is halved while it is even and above `coarsest`."""
+    """Return both densities on grids, coarsest first; the cells per side are halved while even and above `coarsest`."""
     rungs = [(source, target)]
     while rungs[0][0].n % 2 == 0 and rungs[0][0].n > coarsest:
         rungs.insert(0, (rungs[0][0].halved(), rungs[0][1].halved()))

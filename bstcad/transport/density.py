@@ -39,7 +39,7 @@ class Density:
     def from_function(
         cls, function: Callable[[np.ndarray, np.ndarray], np.ndarray], n: int, *, samples: int = 4, floor: float = 0.0
     ) -> Density:
-        """Return the density of function(x, y) on [0, 1]², averaged over samples x samples points per cell."""
+        """Return the density of function(x, y) on [0, 1]², the mean of samples² points in a cell; see `from_values`."""
         q = (np.arange(n * samples) + 0.5) / (n * samples)
         fine = np.broadcast_to(function(q[:, None], q[None, :]), (q.size, q.size)).astype(float)
         return cls.from_values(fine.reshape(n, samples, n, samples).mean(axis=(1, 3)), floor=floor)
@@ -107,7 +107,7 @@ def _check_values(values: np.ndarray, name: str) -> None:
 
 
 def pushforward(density: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return (∇u)_# density on its n x n grid; u: (n, n), cell units.  The sum is conserved to rounding.
+    """Return the density (n, n) after the map ∇u has moved it; u: (n, n), cell units.  Its sum is conserved.
 
     The map is evaluated at the corners of each cell and is bilinear inside.  The image of a cell is divided into pieces
     of at most half a cell along each axis, and each piece is added as a box of its own extent, by exact overlap areas.
@@ -140,8 +140,8 @@ def gradient_at_corners(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def resample_flux(flux: np.ndarray, x: np.ndarray, y: np.ndarray, n: int, parts: tuple[int, int]) -> np.ndarray:
     """Return the flux (n, n) in the cells of a square from pixels with corners x, y (k + 1, l + 1), in cells.
 
-    The flux (k, l) of each pixel is divided into parts[0] x parts[1] equal parts at bilinear points; each part is
-    divided among the four cells with the nearest centres.  Flux outside the square is added to the cell at the rim.
+    The flux (k, l) of each pixel is divided into parts[0] x parts[1] equal parts, evenly spaced in the pixel; each part
+    is divided among the four cells with the nearest centres.  Flux outside the square is added to the cell at the rim.
     """
     out = np.zeros((n, n))
     _resample(flux, x, y, *parts, out)

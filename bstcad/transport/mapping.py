@@ -16,8 +16,8 @@ from bstcad.transport.monge_ampere import ROUGH_MASS_ERROR, MongeAmpere, corners
 
 FLOOR = 1e-3  # smallest density of a target, relative to its mean: maps of tubes need a positive target
 FALLING_FLOORS = (0.03, 0.01, 0.003)  # floors, relative to the mean, solved before FLOOR if Newton's method needs them
-BACK_AND_FORTH_CELLS = 64  # cells per side of the largest grid of the back-and-forth method, before Newton's method
-STEPS_PER_GRID = 8  # largest number of steps of Newton's method on each grid
+BACK_AND_FORTH_CELLS = 64  # cells per side to which the grid is halved, while even, for the back-and-forth method
+STEPS_PER_GRID = 8  # largest number of Newton steps on each grid; MAX_STEPS_FACTOR times as many on a rough map
 MAX_MAP_NODES = 257  # largest number of points per side of a TransportMap: 0.5 MB
 INVERTED_TOGETHER = 4096  # number of points that a thread inverts at a time
 
@@ -44,13 +44,13 @@ class Frame:
 class Mapping:
     """The optimal map T and its inverse S = ∇v, stored as S at the pixel corners of the target.
 
-    S is bilinear inside a pixel; T(x), the y with S(y) = x, is found by Newton's method.  So T sends exactly the flux
-    of each tube into its pixel, and T and S are inverse to each other to rounding.  Points outside a frame are clipped.
+    S is bilinear inside a pixel; T(x), the y with S(y) = x, is found by iteration (`solve_point`).  T sends exactly the
+    flux of each tube into its pixel; T and S are inverse to rounding.  Points outside a frame are moved to its border.
     """
 
     x: np.ndarray  # (n + 1, n + 1), x of S at pixel corners, cell units of the source frame
     y: np.ndarray  # (n + 1, n + 1), y of S at pixel corners, cell units of the source frame
-    guess_x: np.ndarray  # (n + 1, n + 1), x of T at source cell corners to about a cell, cell units of the target frame
+    guess_x: np.ndarray  # (n + 1, n + 1), x of T at source cell corners, ± a cell, in cell units of the target frame
     guess_y: np.ndarray  # (n + 1, n + 1), y of T at source cell corners
     source: Density
     target: Density  # target, raised to the floor
@@ -124,8 +124,8 @@ def solve(
     """Return the optimal map: back-and-forth on a coarse grid, then Newton's method on flux tubes up to the finest.
 
     If the grid does not allow the tolerance, `transport.reason` is "plateau".  `mapping.target` is the target raised to
-    FLOOR times its mean.  If the mass error stays above ROUGH_MASS_ERROR, as for a bright rim beside black, the target
-    is also solved with the first of the solver's floors on all grids, then with the others and FLOOR on the last grid.
+    FLOOR times its mean.  If the mass error exceeds ROUGH_MASS_ERROR, as for a bright rim beside black, a second
+    solution, kept if better, has the solver's first floor on all grids, then its others and FLOOR on the last grid.
     sharper: sources of increasing detail, with which Newton's method continues on the last grid as long as the mass
     error stays below ROUGH_MASS_ERROR; `mapping.source` is the last of them that succeeded.
     """

@@ -30,7 +30,7 @@ MIN_STEP = 0.05  # smallest fraction of Newton's step in the line search
 MAX_ERROR_RATIO = 0.9  # ratio of mass errors, after to before a step, above which the solve stops
 ROUGH_MASS_ERROR = 0.005  # mass error above which a map is rough, so that the next two constants apply
 MAX_ROUGH_ERROR_RATIO = 0.98  # value of MAX_ERROR_RATIO while the map is rough
-MAX_STEPS_FACTOR = 3  # factor of the largest number of steps while the map is rough
+MAX_STEPS_FACTOR = 3  # factor by which the largest number of steps grows while the map is rough
 
 Grids = Sequence[tuple[Density, Density]]  # (source, target) for each of a sequence of grids
 
@@ -169,7 +169,7 @@ def _corners(phi, x, y):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
 def _flux(rho, x, y, out):
-    """Integrate rho |dS| over each bilinear tube by midpoints at most half a source cell apart, up to 400 per side."""
+    """Integrate rho over the signed area of each bilinear tube: up to 400² midpoints, at most half a cell apart."""
     n = out.shape[0]
     last = np.nextafter(n - 1.0, 0.0)
     for i in prange(n):
