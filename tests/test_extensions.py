@@ -79,7 +79,7 @@ def design(scene, tmp_path_factory):
 def test_a_surface_that_no_net_stands_for_is_refused_by_its_kind(scene, ask):
     """Nothing takes it for a sphere of its curvature."""
     back = scene.flat_lens(33).back
-    with pytest.raises(ValueError, match="the asphere has no conic constant; pass the surface to scene.changed"):
+    with pytest.raises(ValueError, match="the asphere is no plane, sphere or conic; pass it to scene.changed"):
         ask(bstcad.Lens(Asphere(15.0, 0.01, 1e-6, 0.0), back, OUTLINE, 1.5))
 
 

@@ -1,8 +1,8 @@
 """B-spline surface of Wang et al. 2023: order 3, uniform clamped knots, control points uniform in x and y.
 
-Only the heights z of the control points are free.  Because these are uniform in x and y, x(t) is the identity shifted
-by 1/2 in the inner spans and quadratic in the two end spans.  So t(x) has a closed form, no search for the parameter of
-a point is needed, and a height is the sum of nine products.
+Only the heights z of the control points are free.  Because the points are uniform in x and y, x(t), in spacings of the
+points, is t + 1/2 in the inner spans and quadratic in the two end spans.  So t(x) has a closed form, no search for the
+parameter of a point is needed, and a height is the sum of nine products.
 Source: Wang et al. 2023, "B-spline freeform surface tailoring for prescribed irradiance", Eqs. 2 and 6-13.
 
 A net has m control points along x and n along y.  The basis is written in u = (m - 1) (x - x_min) / (x_max - x_min),
@@ -107,7 +107,7 @@ def evaluate_plain(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tenso
 
 
 def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return `evaluate_plain`, by the fused kernel if it supports these tensors (same values to rounding)."""
+    """Return the values of `evaluate_plain`, from the fused kernel if it supports these tensors (equal to rounding)."""
     if fast := ops.kernel("bspline.evaluate", heights, u, v):
         return fast(heights, *torch.broadcast_tensors(u, v))
     return evaluate_plain(heights, u, v)
@@ -139,8 +139,8 @@ def basis_matrix(u: np.ndarray, m: int, derivative: int = 0) -> scipy.sparse.csr
 def resample(values: np.ndarray, fine: int) -> np.ndarray:
     """Resample the coefficients (m, …) of a spline to `fine` control points, (fine, …), by least squares.
 
-    The knot vectors are not nested, so the spline is fitted at eight points per span of the finer net; in two
-    dimensions apply it along each axis.  The matrices are banded: the work grows in proportion to the net.
+    The knot vectors are not nested, so the spline is fitted at eight points per span of the new net; in two dimensions
+    apply the function along each axis.  The matrices are banded: the work grows in proportion to the net.
     """
     coarse, u = len(values), np.linspace(0.0, 1.0, 8 * (fine - 2) + 1)
     on_fine, on_coarse = basis_matrix(u * (fine - 1), fine), basis_matrix(u * (coarse - 1), coarse)

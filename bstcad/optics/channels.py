@@ -115,6 +115,6 @@ def _lines(channels: Sequence[Channel]) -> list[list[int]]:
 
 
 def weighted_sum(channels: Sequence[Channel], values: Iterable[Any]) -> Any:
-    """Return Σ_k w_k v_k of values v_k (tensors or numbers), one per channel; one of weight 1 keeps its bits."""
+    """Return Σ_k w_k v_k of values v_k (tensors or numbers), one per channel; exactly v_1 for one of weight 1."""
     first, *others = (channel.weight * value for channel, value in zip(channels, values, strict=True))
     return sum(others, first)

@@ -25,7 +25,7 @@ MAX_INCLINATION = 89.0  # degrees, largest angle of parallel light to the axis o
 
 @dataclass(frozen=True)
 class Collimated(Emitter):
-    """Parallel rays through an aperture in a plane z: E = const there, or exp(-2 r² / w²) with w = radius_1e2.
+    """Parallel rays through an aperture in a plane z: E constant there, or ∝ exp(-2 r² / w²), w: radius_1e2.
 
     With a tilt the rays go along n = (n_x, n_y, n_z) (rays.axes).  On another plane the light is shifted by
     (n_x, n_y) / n_z times the distance, and its irradiance on planes z = const is unchanged.  With a divergence the

@@ -49,7 +49,7 @@ class Emitter(ABC):
     lumens: float | None = None  # total flux, lm; None: not stated, so that fluxes are relative
     tilt: tuple[float, float] | None = None  # rotation of the axis about x, then y (degrees); None: not tilted
     profile: str = "own"  # name of the distribution of the light
-    size_key: str | None = None  # scene key of the size; with the prefix real_, of the real lamp's size; None: no size
+    size_key: str | None = None  # scene key of the size; the real lamp's has the prefix real_; None: no size
     kind: str = "own"  # name of the kind of source
     parallel: bool = False  # True if the light of each point of the extent is parallel
     simple_name: str = "a source without size"  # name of the source without its extent

@@ -274,7 +274,7 @@ def _select(vectors: Tensor, index: tuple[Tensor, ...]) -> Tensor:
 def _newton(
     net: BSplineSurface, start: Tensor, direction: Tensor, s: Tensor, searched: Tensor, tolerance: float, first: int = 0
 ) -> tuple[Tensor, Tensor]:
-    """Return (s*, meets) of `searched` rays by Newton steps from s to |F| <= tolerance (mm); first: steps made."""
+    """Return (path s* with |F| <= tolerance (mm), meets) by Newton steps from s; first: number of steps made before."""
     dx, dy, dz = direction
     meets = torch.zeros_like(searched)
     for step in range(first, NEWTON_STEPS):

@@ -20,7 +20,7 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.rays import Landed, Status, axes, clocked, clocking_of, tilt_of
 from bstcad.optics.receivers import LevelPlane, Receiver, TiltedPlane
 
-LEAK_ROUNDING = 1e-12  # largest fraction of the light on a target that counts as rounding
+LEAK_ROUNDING = 1e-12  # largest `Leak.share` that counts as rounding
 MAX_DARK_VALUE = 1e-6  # largest value of a dark pixel of a target, as a fraction of its brightest pixel
 
 
@@ -195,7 +195,7 @@ LEDGER = {  # status of lost rays, by line of the ledger
 
 
 def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
-    """Return the flux of rays by fate; the lines sum to the total flux except that of Status.BLOCKED."""
+    """Return the flux of rays by fate; the lines sum to the flux of all rays except Status.BLOCKED."""
     flux = rays.flux.double()
     on_screen = screen.contains(rays.position[0], rays.position[1])
     lines = {

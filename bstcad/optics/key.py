@@ -13,7 +13,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Key:
-    """Meaning, unit and range of a field; the range applies to all numbers of a list, or the first of inner lists."""
+    """Meaning, unit and range of a field; the range applies to all numbers of a list, to the first of an inner list."""
 
     meaning: str  # meaning, one sentence
     unit: str = ""  # unit; "": a pure number or a word
@@ -21,7 +21,7 @@ class Key:
     maximum: float | None = None
     example: Any = None  # example value, for a key that every scene must state
     remedy: str = ""  # advice for a number out of range; "": "choose a value in between"
-    of_light: bool = False  # True for a limit on the light; a verdict on the light requires at least one
+    of_light: bool = False  # True for a limit on the light; a verdict on the light requires at least one such limit
 
     def in_range(self, value: Any) -> Any:
         """Return the value of a field if all its numbers are in range; otherwise raise ValueError with a sentence."""

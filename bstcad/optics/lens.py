@@ -43,7 +43,7 @@ class Lens:
     index: float  # refractive index at the design wavelength; unused for a first-surface mirror
     reflects: bool = False  # True if a face reflects; if `own_passes` is None, True: MIRROR, False: LENS
     losses: LensLosses | None = None  # losses at its faces and in its glass; None: no losses
-    clear: tuple[Outline, Outline] | None = None  # clear apertures (front, back); None: the outline, or a front's own
+    clear: tuple[Outline, Outline] | None = None  # clear apertures (front, back); None: front.outline or outline
     before: tuple[Interface, ...] = ()  # interfaces before the solid, such as a window
     behind: tuple[Interface, ...] = ()  # interfaces behind the solid, such as a fold mirror
     shaped: tuple[int, ...] | None = None  # numbers of the interfaces that tailoring shapes; None: the back alone
@@ -89,7 +89,7 @@ class Lens:
 
     @property
     def optical_faces(self) -> dict[str, Surface]:
-        """Faces of the solid that light meets, by name, in the order of the light: for a mirror the back alone."""
+        """Faces of the solid that light meets, by name, in the order of the light; a plain mirror has only the back."""
         return {face: self.front if face == "front" else self.back for face in self.passes.faces}
 
     @property

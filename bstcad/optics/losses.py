@@ -166,7 +166,7 @@ class FresnelLoss:
         """Return the loss at an interface; index: refractive index of the medium before it."""
         law = interface.law
         if isinstance(law, Reflect):
-            assert self.metal is not None  # a mirror states it
+            assert self.metal is not None  # FresnelLoss of a mirror states it
             return MetalReflection(self.metal / index, self.polarisation)
         return Transmission(law.n_in, law.n_out, self.wavelength, polarisation=self.polarisation, coating=self.coating)
 
@@ -187,7 +187,7 @@ class Losses:
     def _at(self, k: int, interface: Interface, index: float) -> tuple[Loss, ...]:
         inside = (self.absorption,) if self.absorption and k > 0 else ()  # glass lies behind the first interface
         own = (loss for loss in self.own if k > 0 or not loss.in_glass)
-        return (*inside, *own, *((self.fresnel.of(interface, index),) if self.fresnel else ()))  # trace needs it last
+        return (*inside, *own, *((self.fresnel.of(interface, index),) if self.fresnel else ()))  # trace needs this last
 
 
 def _amplitudes(n_in: float, n_out: float, cos_in: Tensor, cos_out: Tensor) -> tuple[Tensor, Tensor]:

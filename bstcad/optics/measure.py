@@ -55,9 +55,9 @@ SIDE_EXPONENT = 0.5
 RAYS_PER_POINT = 1 << 13  # rays of each set per point of an extended source
 MIN_SOURCE_POINTS, MAX_SOURCE_POINTS = 8, 1024  # limits of the number of source points of each set
 MIN_TUBES = 513  # minimum tubes per side of the witness: fewer do not resolve pixels
-COARSE_SHEET = 64  # tubes per side of the coarse sheet (tubes.picture: few) with over_the_back; error 1e-6
+COARSE_SHEET = 64  # tubes per side of the coarse sheet (`few` of tubes.picture) if over_the_back; its error is 1e-6
 PASS_SEEDS = 1 << 20  # difference between the seeds of successive passes of rays from an extended source
-GHOST_DIVISOR = 4  # rays per side divided by those of the ghost, which is a hundredth of the light
+GHOST_DIVISOR = 4  # rays per side divided by those of the ghost, which is about a thousandth of the light
 IMAGE_POINTS_PER_SIDE = 48  # points per side of the back face through which the image of the source is computed
 # Largest distance of an image from the centre of the screen, relative to the screen's width plus the median distance.
 # Light farther out grazes a tilted plane and does not belong to the image.
@@ -420,7 +420,7 @@ def _compare(
 
 
 def tubes_of(lens: Lens, pixels: int = 0) -> int:
-    """Return the number of tubes per side for a lens: two per control point, at least MIN_TUBES; pixels: per side.
+    """Return the tubes per side for a lens: two per control point, at least MIN_TUBES; pixels: of the screen, per side.
 
     A lens with two nets gets twice as many, since light deflected by the first net varies within the cells of the
     second.  If a cell of the net lights several pixels, two tubes per pixel are used, at most four per cell.  Five more

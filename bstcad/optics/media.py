@@ -4,7 +4,7 @@ A material is one of MEDIA, any page of refractiveindex.info as "shelf/book/page
 catalogue, "N-LAK33A".  n is relative to air, near room temperature.  n and k are known in the wavelength ranges of
 their pages, which may differ, and are not extrapolated outside.
 
-    k is the extinction coefficient: over a path s, flux decreases by exp(-a s), a = 4 π k / λ   (Beer-Lambert)
+    k is the extinction coefficient: over a path s, flux falls to the fraction exp(-a s), a = 4 π k / λ   (Beer-Lambert)
 
 Densities are those of the pages, else the makers' nominal values near 20 °C; grades of one polymer differ by 1 %.
 

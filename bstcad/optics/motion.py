@@ -1,7 +1,7 @@
 """Rigid motions of the sources and screens around a lens.
 
-A lens is traced in its own frame.  A motion T of the lens has the same effect as the inverse of T on source and screen,
-so that motions act on sources and screens only.
+A lens is traced in its own frame.  A motion T of the lens has the same effect as the inverse of T on source and screen.
+Therefore motions are applied to sources and screens only.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ class _Box(ABC):
         return x, y
 
     def inset_direction(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the shift (mm) of rim points for an inset of 1 mm: along the normal, at corners along the mitre."""
+        """Return the shift (mm) of rim points for an inset of 1 mm: along the normal; (-x/a, -y/b) on a rectangle."""
         a, b, r2 = self.limits
         if r2 == 0:
             return -x / a, -y / b

@@ -33,7 +33,7 @@ class Point(Emitter):
     gaussian: irradiance on z = const ∝ exp(-2 r² / w²), w = distance · tan(half_angle_1e2); lambertian: radiant
     intensity ∝ cos θ, up to half_angle if there is one; uniform: constant radiant intensity up to half_angle.
     A tilt rotates the whole distribution, with its half space, about the point (`_tilted_irradiance`); light that then
-    leads away from the lens misses it.  A disc or rectangle of such points is perpendicular to the axis.
+    leads away from the lens misses it.  A disc or rectangle of points is perpendicular to the axis of the source.
     """
 
     position: Annotated[
@@ -200,7 +200,7 @@ class Point(Emitter):
         return sense * n[0], sense * n[1], n[2]
 
     def _tilted_irradiance(self, x: Tensor, y: Tensor, distance: float, axis: Vector) -> Tensor:
-        """Return E of a tilted source at (x, y) from its projection onto a plane at distance D.
+        """Return E of a tilted source with axis n at (x, y) from its projection onto a plane at distance D.
 
         E = I(θ) D / d³, and zero where c = n · (x, y, D) = d cos θ <= 0.  lambertian: I = cos θ / (π sin² θ_max),
         E = D c / (π sin² θ_max d⁴); uniform: I is constant; both are zero where cos θ < cos θ_max.  gaussian: on planes

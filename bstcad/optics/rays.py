@@ -55,7 +55,7 @@ class Rays:
         return self.position[2] + (self.z - z)
 
     def lose(self, where: Tensor, reason: Status) -> Tensor:
-        """Return the status after rays where `where` is True are lost for `reason`; a ray keeps its first reason."""
+        """Return the status with the rays marked by `where` lost for `reason`; a ray keeps its first reason."""
         return torch.where(self.alive & where, torch.full_like(self.status, int(reason)), self.status)
 
 

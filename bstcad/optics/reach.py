@@ -27,7 +27,7 @@ from bstcad.optics.receivers import Receiver, dot
 from bstcad.optics.tubes import rays_to
 
 MAX_EXIT_ANGLE = math.radians(85)  # largest angle of refraction in air (rad); in PMMA 0.2° below the critical angle
-MAX_SLOPE = math.tan(math.radians(70))  # largest slope: a steeper face cannot be machined; its lens is as thick as wide
+MAX_SLOPE = math.tan(math.radians(70))  # largest slope: a steeper face cannot be machined and makes the lens thick
 
 
 def largest_deflection(index: float, grazing: float = MAX_EXIT_ANGLE) -> float:
@@ -124,8 +124,8 @@ def _at_angle(d: Tensor, towards: Tensor, along: Tensor, angle: float) -> Tensor
 def reach_margin(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing: float = MAX_EXIT_ANGLE) -> Tensor:
     """Return the margin of each ray (a cosine) to the limits of the face; negative: the aim is out of reach.
 
-    It is the minimum of three: d · d' minus the cosine of the largest deflection; n_z - |(n_x, n_y)| / MAX_SLOPE of the
-    normal n = η d - d'; and the cosine between the light and the receiver's normal that points away from the lens.
+    Minimum of three: d · d' minus the cosine of the largest deflection (not for a mirror); n_z - |(n_x, n_y)| /
+    MAX_SLOPE of `normal_towards`; and the cosine between the light and the receiver's normal away from the lens.
     """
     _, out, along = directions(at_face, aim, plane)
     normal = normal_towards(at_face, out, law)

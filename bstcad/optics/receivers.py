@@ -85,7 +85,7 @@ class Receiver(ABC):
         return MovedReceiver(self, motion)
 
     def land(self, rays: Rays) -> Landed:
-        """Return rays behind the last interface where they meet the receiver.
+        """Trace rays from the last interface to the receiver.
 
         Each component is traced separately, since the gradient of a part of a stacked tensor is as large as the whole.
         """
@@ -106,7 +106,7 @@ class Receiver(ABC):
         return torch.stack([x - rays.position[0], y - rays.position[1], z - rays.above(0.0)])
 
     def clearance(self, outline: Outline, z: float) -> float:
-        """Return the smallest path (mm) along +z from an outline on the plane z to the receiver; -inf: part misses."""
+        """Return the least path (mm) along +z from an outline on the plane z to the receiver; -inf if a part misses."""
         x, y = (torch.as_tensor(p, dtype=torch.float64) for p in outline.rim_points())
         along = torch.stack([torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)])
         start = torch.stack([x, y, torch.zeros_like(x)])
@@ -155,7 +155,7 @@ class MovedReceiver(Receiver):
     motion: Motion  # rigid motion
 
     def __post_init__(self) -> None:
-        for name in ("unit", "light", "names", "position_text", "per_radian", "areas"):  # as at rest
+        for name in ("unit", "light", "names", "position_text", "per_radian", "areas"):  # copied from `rest`
             object.__setattr__(self, name, getattr(self.rest, name))
 
     @property

@@ -27,9 +27,9 @@ class Surface(ABC):
     z: float  # z of the vertex (mm); for a net, z of the plane from which its heights are measured
     kind: str  # kind of surface, such as "sphere"; the names of scenes
     is_net = False  # True for a B-spline net, which has `heights`
-    curvature: float | Tensor  # curvature at the vertex of a surface of revolution (1/mm), > 0 towards +z
+    curvature: float | Tensor  # curvature at the vertex of a surface of revolution (1/mm), > 0: concave towards +z
     conic_constant: float | Tensor  # conic constant of a surface of revolution
-    outline: Circle | None = None  # outline of the optical part, which a plane surrounds; None: all is optical
+    outline: Circle | None = None  # outline of an optical part that a plane surrounds; None: all is optical
 
     @property
     def level(self) -> bool:
@@ -99,7 +99,7 @@ class Surface(ABC):
     @property
     def unknown(self) -> ValueError:
         """Error for a surface that is not a net, a plane, a sphere or a conic."""
-        return ValueError(f"the {self.kind} has no conic constant; pass the surface to scene.changed, which fits a net")
+        return ValueError(f"the {self.kind} is no plane, sphere or conic; pass it to scene.changed, which fits a net")
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Self:
         """Return the surface with its tensors in another precision or on another device; numbers stay numbers."""
@@ -126,7 +126,7 @@ def sag(surface: Surface, x: Any, y: Any) -> np.ndarray:
 
 
 class _Revolved(Surface):
-    """Surface of revolution; c is its `curvature`, k its `conic_constant`."""
+    """Surface of revolution; c is its `curvature`, k its `conic_constant`, z0 its `z`."""
 
     @property
     def level(self) -> bool:
@@ -287,7 +287,7 @@ class Toroid(Surface):
         return (cos2 > MIN_COS2) & (g > MIN_COS2) & (left > 0)
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Return the lowest and the highest sag (mm) at the rim of the outline, and zero."""
+        """Return the minimum and the maximum (mm) of zero and the sags at the rim of the outline."""
         h = self.plain().relative_sag_and_slope(*map(torch.from_numpy, outline.rim_points()))[0]
         return min(float(h.min()), 0.0), max(float(h.max()), 0.0)
 
@@ -317,7 +317,7 @@ class Recess(Surface):
         return self.face
 
     def __post_init__(self) -> None:
-        for name in ("z", "kind", "curvature", "conic_constant", "conic", "parameters"):  # those of the optical part
+        for name in ("z", "kind", "curvature", "conic_constant", "conic", "parameters"):  # copied from the optical part
             object.__setattr__(self, name, getattr(self.face, name))
 
     @property
@@ -327,7 +327,7 @@ class Recess(Surface):
         return Plane(float(self.z) + low + high)  # one of the two is zero
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm."""
+        """Return (height over the plane z in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm."""
         inside, zero = self.outline.contains(x, y), torch.zeros_like(x)
         h, z_x, z_y = self.face.relative_sag_and_slope(x, y)
         rim = torch.full_like(h, sum(self.face.sags(self.outline)))

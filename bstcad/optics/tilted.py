@@ -1,8 +1,8 @@
 """A plane or a sphere in any position: c |p - V|² = 2 N · (p - V), V its vertex, N the unit normal there, N_z > 0.
 
 Windows and mirrors around a lens have such faces.  With u = (x, y) - (V_x, V_y) the height h over the plane z = V_z is
-the smaller root of c h² - 2 N_z h + f = 0, f = c u² - 2 (N_x u_x + N_y u_y), written as f / (N_z + sqrt(N_z² - c f)),
-which keeps its digits for c = 0, a plane.
+the root nearer to 0 of c h² - 2 N_z h + f = 0, f = c u² - 2 (N_x u_x + N_y u_y).  It is computed as f / (N_z +
+sqrt(N_z² - c f)), which keeps its digits for c = 0, a plane.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class TiltedSurface(Surface):
         return s, ok & (self.face_curvature * s * dz < n_z)
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Return the lowest and the highest height (mm) over the plane z inside the outline, from points of its rim."""
+        """Return minimum and maximum (mm) of zero and the heights over the plane z, on axis and on an outline's rim."""
         x, y = (torch.from_numpy(np.append(p, 0.0)) for p in outline.rim_points())
         h = self.relative_sag_and_slope(x, y)[0]
         return min(float(h.min()), 0.0), max(float(h.max()), 0.0)

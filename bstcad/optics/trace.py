@@ -42,7 +42,7 @@ BLOCKED = "stopped beside a window or mirror"  # line of the ledger: light outsi
 UNDERSIDE_CELLS = 256  # cells per side of the grid on which light that meets the underside is summed
 WINDOW_CELLS = 96  # cells per side of the grid that finds the light which reaches the lens through windows and mirrors
 MIN_RAYS_FOR_TABLE = 256  # minimum rays per side for which a table of the source's light is worth its cost
-GHOST_RAYS = 1024  # maximum rays per side of a ghost; 3 % noise per pixel on 1 % of the light adds 0.0003 to RRMSD
+GHOST_RAYS = 1024  # maximum rays per side of a ghost; if it has 1 % of the light, its noise adds 0.0003 to RRMSD
 # Lines of the ledger that a ghost changes, besides losses.REFLECTED.
 GHOST_ON, GHOST_OFF, TOTAL_REFLECTION = "ghost on target", "ghost off target", "total internal reflection"
 

@@ -51,7 +51,7 @@ class Tubes:
     flux: Tensor  # flux launched in each tube (rows, columns), as a fraction of the source's
 
     def landing(self, lens: Lens, plane: Receiver) -> Landed:
-        """Trace the corners to the receiver, without outlines: `flux` already excludes the light that they stop."""
+        """Trace the corners to the receiver, without the solid's apertures, whose losses `flux` already excludes."""
         return from_first_net(self.rays, lens.unbounded(), plane)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
@@ -355,7 +355,7 @@ def _broyden_update(inverse: list[Tensor], step: tuple[Tensor, Tensor], shift: t
 
 def _interpolate(lines: Sequence[Tensor], shape: Sequence[int], t: Tensor) -> Tensor:
     """Interpolate t linearly along the two axes to (rows, columns); lines: rows and columns at which t is given."""
-    for known, n in zip(lines, shape, strict=True):  # each iteration takes one axis and transposes t
+    for known, n in zip(lines, shape, strict=True):  # each iteration interpolates along one axis and transposes t
         index = torch.arange(n)
         right = torch.searchsorted(known, index, right=True).clamp(1, len(known) - 1)
         fraction = ((index - known[right - 1]).double() / (known[right] - known[right - 1])).to(t)

@@ -151,7 +151,7 @@ def image_from_last_net(lens: Lens, plane: Receiver) -> Receiver:
 
 
 def image_screen(lens: Lens, screen: Screen) -> Screen:
-    """Return the screen with the image of its receiver by the interfaces behind the last net of a lens as receiver."""
+    """Return the screen on the image of its receiver by the interfaces behind the last net of a lens."""
     plane = screen.plane
     view = image_from_last_net(lens, plane)
     return screen if view is plane else replace(screen, surface=view)

@@ -1,7 +1,7 @@
 """Goal wavefronts behind a lens: plane, spherical, or stated by Zernike coefficients.
 
 A wave is stated by its eikonal W (mm) on a level plane z, up to a constant: the optical path from the source to each
-point (x, y) of the plane.  Light behind the lens is in air, so that by the eikonal equation |∇W| = 1 W_x and W_y are
+point (x, y) of the plane.  Light behind the lens is in air, so that by the eikonal equation |∇W| = 1, W_x and W_y are
 two of the direction cosines of the rays, and d = (W_x, W_y, sqrt(1 - W_x² - W_y²)) points along +z (Born and Wolf,
 Principles of Optics, section 3.1).
 
@@ -33,7 +33,7 @@ Place = tuple[float, float]
 Z = Key("Plane behind the lens on which the wavefront is stated and measured.", "mm", -1e8, 1e8, example=40.0)
 WEIGHT = Key("Weight of the wavefront relative to the pictures.", "", 0.0, 1e9, example=2.0)
 LIGHT_DIRECTION = "Vector along the light, of any length."
-FOCUS = "Centre of the sphere. Behind z, light converges to the focus; before z, light diverges from it."
+FOCUS = "Centre of the sphere. Light converges to a focus behind the plane z, and diverges from one before it."
 COEFFICIENTS = "Coefficients in waves (main wavelength), in Noll's order from j = 1."
 
 
@@ -49,7 +49,7 @@ class _Wave:
     def complaints(self, back: float) -> Iterator[str]:
         """Yield reasons, as "key: sentence", why the wave does not suit a lens whose back is at z = `back` (mm)."""
         if not self.z > back:
-            yield f"z: the plane at z = {self.z:g} is not behind the back at z = {back:g}; move it further along +z"
+            yield f"z: the plane at z = {self.z:g} mm is not behind the back at {back:g} mm; move it further along +z"
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class SphericalWave(_Wave):
         """Yield the common reasons, and a sentence if the focus is in the plane, where a sphere has no wavefront."""
         yield from super().complaints(back)
         if not abs(self.centre[2]) >= MIN_FOCUS_DISTANCE:
-            yield f"focus: the point lies in the plane at z = {self.z:g}; move the point or the plane along z"
+            yield f"focus: the point lies in the plane at z = {self.z:g} mm; move the point or the plane along z"
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ class ZernikeWave(_Wave):
         return torch.stack([w_x, w_y, cos])
 
     def steepest(self, wavelength: float) -> float:
-        """Return the largest |∇W| on the circle, for a wavelength (nm): the sine of the largest ray angle."""
+        """Return the largest |∇W| inside the circle, for a wavelength (nm): the sine of the largest ray angle."""
         line = torch.linspace(-self.radius, self.radius, SAMPLES_PER_SIDE, dtype=torch.float64)
         x, y = torch.meshgrid(self.centre[0] + line, self.centre[1] + line, indexing="ij")
         _, w_x, w_y = self._eikonal(x, y, wavelength)

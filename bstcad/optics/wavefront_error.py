@@ -1,8 +1,8 @@
 """The wavefront error of a lens: optical path by ray tracing, in float64, minus the goal wavefront.
 
 The optical path of a ray to the plane z of the goal wave is S = Σ_k n_k l_k, summed over the segments between the
-interfaces; the first segment begins at the source point, or at a plane perpendicular to parallel light.  By the theorem
-of Malus and Dupin S is the eikonal of the light on that plane, as W (wavefront.py) is that of the goal wave, so that
+interfaces; the first segment begins at a wavefront of the source (see `optical_path`).  By the theorem of Malus and
+Dupin S is the eikonal of the light on that plane, as W (wavefront.py) is that of the goal wave, so that
 
     OPD = S - W,   ∇OPD = (d_x, d_y) - (w_x, w_y),
 

@@ -1,1 +1,1 @@
-"""Compiled CPU kernels (numba).  Each is a faster form of a function of optics in plain torch and is tested with it."""
+"""Compiled CPU kernels (numba).  Each is a faster form of a plain torch function of optics and is tested against it."""

@@ -32,7 +32,7 @@ from torch import Tensor
 from bstcad.optics.kernels import reductions
 from bstcad.optics.kernels.compiling import compiled
 
-MAX_DISTANCE = 1e15  # largest coordinate of a corner (pixels); farther away, rounding exceeds a pixel
+MAX_DISTANCE = 1e15  # largest |x| + |y| of a corner (pixels); farther away, rounding approaches a pixel
 NO_BORDER = 1e300  # s of the next border of an edge that crosses no more borders along an axis
 MAX_WIDTH = 1e6  # width of a row of tubes (pixels) above which rounding may reach any column
 ROWS_PER_STRIP = 16  # rows of tubes whose gradient one thread computes at a time
@@ -494,10 +494,10 @@ def _add_rest_of_row(g, corner, flux, k, flags, g_far, d_corner, d_flux):
 
 @compiled(parallel=True)
 def clip_adjoint(corner, flux, thinnest, g, below_g, g_far, d_corner, d_flux):
-    """Add the gradient in the corners to d_corner; store that in the flux in d_flux (n, m), unless it is (0, 0).
+    """Add the gradient in the corners to d_corner; store the gradient in the flux in d_flux, (n, m) or empty.
 
-    g (columns, rows), below_g (columns, rows + 1).  The even strips of rows of tubes are computed first, then the odd
-    ones, so that no two threads write one corner.
+    g (columns, rows), g_far: gradients in image and far.  below_g (columns, rows + 1): see `along_edge`.  The even
+    strips of rows of tubes are computed first, then the odd ones, so that no two threads write one corner.
     """
     n, m = flux.shape
     strips = (n + ROWS_PER_STRIP - 1) // ROWS_PER_STRIP

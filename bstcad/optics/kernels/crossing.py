@@ -31,8 +31,8 @@ from bstcad.optics.kernels.spline import curved, net_of, scatter
 from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.receivers import Receiver
 
-# Further offsets in `work` for the adjoint: ∂L/∂ of landing or hit and direction, of path and cosine of incidence, and
-# second derivatives of the sag.
+# Further offsets in `work` for the adjoint: ∂L/∂(landing, or hit and direction), ∂L/∂(path, cosine of incidence), and
+# second derivatives of the sag; L: merit.
 G_X, G_Y, G_PATH, G_COSINE, H_XX, H_XY, H_YY, G_Z, G_DX, G_DY, G_DZ = (WORK + BLOCK * k for k in range(11))
 ADJOINT_WORK = WORK + 11 * BLOCK  # length of `work` for the adjoint
 
@@ -136,7 +136,8 @@ def _at_level(faces, at, e, h, gx, gy):
 def _at_tilted(faces, tilted, at, e, h, gx, gy):
     """Return the gradients of `_at_level` for a tilted screen.
 
-    The landing moves by u · (dP - e (n · dP) / (n · e)) along each axis u of the screen, dP = dp + far de.
+    The landing moves by u · (dP - e (n · dP) / (n · e)) along each axis u of the screen, dP = dX + far de (far: path
+    to the screen).
     """
     ex, ey, ez = e
     n_x, n_y, n_z = tilted.n_x, tilted.n_y, tilted.n_z
@@ -185,7 +186,7 @@ def _chain(faces, tilted, lands, count, work, path, d_rays, first):
         else:
             (g_ex, g_ey, g_ez), g_hit, g_t = _at_tilted(faces, tilted, at, e, h, work[G_X + r], work[G_Y + r])
         g_s = g_ez - p * g_ex - q * g_ey
-        # ds/dp with N = norm: d cos_in = -N dx - p N² cos_in, d cos_out = η² cos_in / cos_out · d cos_in
+        # ∂s/∂p with N = norm: ∂cos_in/∂p = -N dx - p N² cos_in, ∂cos_out/∂p = η² cos_in / cos_out ∂cos_in/∂p
         in_p, in_q = norm * dx + p * norm2 * cos_in, norm * dy + q * norm2 * cos_in
         if faces.reflects:  # s = -2 (d · N) N_z does not depend on cos_out
             turn, s_p, s_q, fall = 0.0, 0.0, 0.0, 2.0 * norm2

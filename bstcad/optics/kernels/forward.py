@@ -1,4 +1,4 @@
-"""Fused CPU kernel (numba) behind `trace.simulate`: stratified rays from the source to pixels, without storing them.
+"""Fused CPU kernels (numba) behind `trace.simulate` and `trace.land`: rays from the source to pixels or receiver.
 
 Each part (see reductions.py) traces rows of cells in blocks through the steps of the plain torch form, which is the
 reference: launch, front face, back face, screen, pixel.  A block stays in the first-level cache (`work` contains BLOCK
@@ -218,7 +218,7 @@ def to_screen(faces, tilted, count, work):
 # Length of the ledger: flux by Status (alive: on the screen), flux outside the screen, number of rays, and flux lost at
 # faces and in glass.
 LINES = 9
-BESIDE, COUNT, BY_FACES, BY_GLASS = 5, 6, 7, 8  # indices in the ledger, after those of Status (no ray is BLOCKED)
+BESIDE, COUNT, BY_FACES, BY_GLASS = 5, 6, 7, 8  # indices in the ledger; 5 is free, since no ray is BLOCKED
 RAY_PARTS = 8  # number of partial sums of the rays; each has its own pictures, which take time to clear and to add
 
 

@@ -26,10 +26,10 @@ from bstcad.optics.receivers import Receiver
 
 TRANSMISSION_NODES = 4097  # nodes of a table of a face's transmission
 TABLE_SIDES = 65, 129, 257, 513  # control points per side of a table of light, tried in this order
-IRRADIANCE_TOLERANCE = 1e-5  # largest RMS of a table's relative error in the irradiance, far below those of pictures
+IRRADIANCE_TOLERANCE = 1e-5  # largest RMS of a table's relative error in the irradiance, far below errors of pictures
 MIN_IRRADIANCE = 1e-4  # irradiance relative to its maximum, below which the error counts relative to this value
 SLOPE_TOLERANCE = 1e-8  # largest RMS of a table's error in the slopes of rays
-PEAK_TO_RMS = 100.0  # largest error at a point of a table / RMS tolerance: the outermost spans are least exact
+PEAK_TO_RMS = 100.0  # largest error at a point of a table divided by the RMS tolerance: the outermost spans are worst
 MAX_LIGHT_TABLES = 16  # tables of light in the cache
 MAX_TABLE_ERROR_RATIO = 0.5  # largest ratio of a table's error to the coarser table's; larger: the light has an edge
 
@@ -44,10 +44,10 @@ def rules() -> Rules:
 def faces(
     interface: Interface, plane: Receiver | None, sense: int, start: float, front: Interface | None = None
 ) -> tuple[Faces, records.TiltedScreen | None]:
-    """Return the numbers of a net, of the front before it and the screen behind it, if any, and of the screen's tilt.
+    """Return (numbers of a net, and of front and screen if any; TiltedScreen, None for a level screen or none).
 
     The kernels trace light along +z.  If light comes along -z (sense -1), all numbers describe the scene reflected by
-    z -> -z, as the heights and the rays must (crossing.reflect_z).  start: `Rays.z` (mm).
+    z -> -z, as the heights and the rays must (crossing.reflect_z).  start: `Rays.z`, or z of the first vertex (mm).
     """
     surface, law = interface.net, interface.law
     conic = (front.surface.curvature, front.surface.conic_constant) if front else (0.0, 0.0)

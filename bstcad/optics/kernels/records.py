@@ -37,10 +37,10 @@ NO_TABLE = LightTable(0, 0, 0.0, 0.0, 0.0, 0.0, *3 * (np.zeros(0),))
 
 
 class Beam(NamedTuple):
-    """E = peak exp(-fall r²) / d^power on the plane of the front's vertex; r: distance from (x, y), d: from the source.
+    """E = peak exp(-fall r²) / d^power on the plane of the first vertex; r: distance from (x, y), d: from the source.
 
-    The irradiance of a tilted point source is `Point._tilted_irradiance`: peak times c / d^4, 1 / d³ or
-    exp(-fall (d² - c²) / c²) / c³ for the powers 4, 3 and 0.  With a table E is peak times the table's irradiance.
+    The irradiance of a tilted point source is `Point._tilted_irradiance`: peak times c / d^4, 1 / d³ or exp(-fall (d² -
+    c²) / c²) / c³, c = d cos θ, for the powers 4, 3 and 0.  With a table E is peak times the table's irradiance.
     """
 
     x: float = 0.0  # position of the source, or of the beam's centre (mm)
@@ -49,7 +49,7 @@ class Beam(NamedTuple):
     limit_y: float = 0.0
     limit_r2: float = math.inf
     peak: float = 1.0  # factor of the irradiance
-    fall: float = 0.0  # coefficient of the exponent (1/mm²); without unit for a tilted source
+    fall: float = 0.0  # coefficient of the exponent (1/mm²); without unit for a tilted point source
     power: int = 0  # power of the distance d of a point source: 0, 3 or 4
     distance: float = 0.0  # distance of a point source from the plane (mm); 0: collimated, or a table
     start: float = 0.0  # distance from the plane at which rays start (mm)
@@ -57,7 +57,7 @@ class Beam(NamedTuple):
     n_x: float = 0.0  # axis n of the source, in the frame in which light starts along +z
     n_y: float = 0.0
     n_z: float = 1.0
-    least: float = 0.0  # smallest cosine to the axis at which there is light
+    least: float = 0.0  # smallest cosine of the angle to the axis at which there is light
     table: LightTable = NO_TABLE  # table of the light
 
 
@@ -86,7 +86,7 @@ class Fates(NamedTuple):
 class TiltedScreen(NamedTuple):
     """Tilted plane as numbers, in the frame in which light starts along +z; z of C over the net is `Faces.throw`."""
 
-    x: float  # position of the centre C of the rotation (mm), the origin of x and y on the plane
+    x: float  # position of the centre C of the rotation (mm), also the coordinates of C on the plane
     y: float
     n_x: float  # normal, along the light that the plane receives
     n_y: float
@@ -112,7 +112,7 @@ class Faces(NamedTuple):
     limit_x: float  # outlines.Limits of the net's clear aperture (mm, mm, mm²)
     limit_y: float
     limit_r2: float
-    gap: float  # distance from the plane where the rays start to the plane of the net's heights (mm)
+    gap: float  # distance from the plane of `Rays.z`, or of the first vertex, to the plane of the net's heights (mm)
     m: int  # control points along x
     n: int  # control points along y
     x: float  # position of the net's corner (mm)
