@@ -19,7 +19,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from bstcad.scene.errors import SceneError
 
 SHUTDOWN_TIMEOUT = 1  # time (s) in which open requests have to finish when the server ends
-HEADERS_TIMEOUT = 10.0  # time (s) from the start of a connection, or of its next request, to the headers' end
+HEADERS_TIMEOUT = 10.0  # time (s) from the start of a connection, or of a later request, to the end of the headers
 
 
 class HeadersInTime(H11Protocol):
@@ -36,7 +36,7 @@ class HeadersInTime(H11Protocol):
         self._wait()
 
     def data_received(self, data: bytes) -> None:
-        """Receive data of a request; start the timeout of the next request once this one is complete."""
+        """Receive data of a request; start its timeout, or cancel it once all headers have arrived."""
         super().data_received(data)
         self._wait()
 
@@ -46,7 +46,7 @@ class HeadersInTime(H11Protocol):
         self._stop_waiting()
 
     def _wait(self) -> None:
-        """Start the timeout if no request has all its headers; a running timeout is not restarted."""
+        """Start the timeout, unless it runs, if headers are missing; else cancel it."""
         if self.conn.their_state is not h11.IDLE:
             self._stop_waiting()
         elif self._deadline is None:
@@ -84,7 +84,7 @@ def uvicorn_server(app: Any, ends: Callable[[], None] = lambda: None) -> uvicorn
 
 
 class _Server(uvicorn.Server):
-    """A server that ends waiting requests as soon as a signal tells the server to end."""
+    """Server that ends waiting requests as soon as a signal ends it."""
 
     def __init__(self, config: uvicorn.Config, ends: Callable[[], None]) -> None:
         super().__init__(config)

@@ -40,7 +40,8 @@ def small_photo(target: Target) -> bytes:
 def in_proportions(data: Mapping[str, Any], key: str, target: Target) -> dict[str, Any]:
     """Return the changes, by key, that give the plate and the picture the proportions of a target's photo.
 
-    The longer sides keep their lengths.  A round plate, and a plate with several targets, keeps its shape.
+    The longer sides keep their lengths.  A round plate, and a plate with several targets, keeps its shape.  A source's
+    aperture that equals the outline of the plate changes with it.
     """
     shown = shown_size(target)
     sides = [each / max(shown) for each in shown]

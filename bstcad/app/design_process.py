@@ -42,9 +42,9 @@ class State:
 
     state: str  # running | finished | stopped | refused | failed; none: there is no run
     process: int = 0  # process id while the run is running, else 0
-    began: float = 0.0  # seconds since 1970
-    passed: bool | None = None  # True if all checks passed; None if none were made
-    rrmsd: float | None = None
+    began: float = 0.0  # start of the run, seconds since 1970
+    passed: bool | None = None  # True if all checks passed, or a trade-off has a lens; None: nothing was checked
+    rrmsd: float | None = None  # RRMSD of the design, or as predicted for a made part; None: unknown
     folder: str = ""  # name of the folder with the result; "" without one
     sentence: str = ""  # reason why the run stopped, was refused or failed
 
@@ -180,7 +180,7 @@ def main(folder: str, output: str, *options: str) -> int:
 def _final_state(error: BaseException) -> State:
     notes = note(error)
     if signals.termination() or isinstance(error, KeyboardInterrupt):
-        sentence = "the design so far is kept" if "is kept" in notes else "nothing is kept"
+        sentence = "the work so far is kept" if "is kept" in notes else "nothing is kept"
         return State("stopped", sentence=sentence)
     if isinstance(error, SentenceError):
         return State("refused", sentence="; ".join(filter(None, (str(error), notes))))

@@ -57,7 +57,7 @@ class Run:
         job: entries of job.json besides the kind.  contents: other files for the run, by name.
         """
         if self.state.state == "running":
-            raise SceneError(f"{self.design.name}: the {self.kind} is already running; wait until it ends, or stop it")
+            raise SceneError(f"{self.design.name}: its {self.kind} run has not ended; wait until it ends, or stop it")
         if self.folder.is_symlink() or self.folder.is_file():  # not ours; the target of a link stays as it is
             self.folder.unlink()
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -94,8 +94,8 @@ class Run:
         while self._written_state().process != process.pid and time.monotonic() < until:
             if process.poll() is not None:  # it has ended already
                 if self._written_state() == NO_RUN:
-                    failed = State("failed", sentence="its process did not start; process.log in its folder says why")
-                    failed.put(self.folder)
+                    sentence = f"its process did not start; {self.folder.name}/process.log states why"
+                    State("failed", sentence=sentence).put(self.folder)
                 return
             time.sleep(0.01)
 
@@ -123,9 +123,9 @@ class Run:
     @property
     def final_sentence(self) -> str:
         """Sentence for the terminal about a run that the ending server has stopped."""
-        state, name = self.state, f"{self.design.name}: the {self.kind}"
+        state, name = self.state, f"{self.design.name}: the {self.kind} run"
         if state.state == "running":
-            return f"{name} is stopping and keeps its results so far; run bstcad app in this folder to resume it"
+            return f"{name} is stopping; a design is kept so far; run bstcad app in this folder to see or resume it"
         reason = f"{state.sentence}; " if state.sentence else ""
         return f"{name} is {state.state}; {reason}run bstcad app in this folder to see it"
 

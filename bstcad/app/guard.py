@@ -57,7 +57,7 @@ class Guard:
     def __init__(self, app: Any, port: int, token: str, larger: tuple[str, int] = ("", 0)) -> None:
         """Guard `app`.  larger: regular expression of the paths that allow larger bodies, and the limit in bytes."""
         self._app, self._token, self._larger = app, token, larger
-        self.cookie = f"bstcad-{port}"  # browsers share cookies between ports
+        self.cookie = f"bstcad-{port}"  # name of the cookie, with the port, since browsers share cookies between ports
         self._hosts = {f"{name}:{port}" for name in ("127.0.0.1", "localhost")}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

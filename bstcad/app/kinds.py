@@ -55,7 +55,7 @@ def value_at(key: str, data: Any) -> Any:
 
 
 def records_at(key: str, data: Table) -> list[Node]:
-    """Return the schema's records for the table at a dotted key; outer tables have the kinds that `data` states."""
+    """Return the schema's records (possible tables) at a dotted key; outer tables have the kinds that `data` states."""
     union, outer = [schema()], ""
     for name, number in KEY_PART.findall(key):
         known = matching_records(union, table_at(outer, data))
@@ -142,7 +142,7 @@ def _hashable(table: Table) -> dict[str, str]:
 
 
 def convert_table(key: str, tag: Mapping[str, str], data: Table) -> dict[str, Any]:
-    """Return the table at a key converted to the kind `tag`: common keys keep their values, others get new ones."""
+    """Return the table at a key as a table of kind `tag`: common keys stay, others go, and required keys are added."""
     union, old = records_at(key, data), table_at(key, data)
     chosen = next((record for record in union if tag.items() <= tags(record).items()), None)
     if chosen is None:  # no such kind
@@ -259,7 +259,7 @@ def _on_axis(z: float | None) -> list[float] | None:
 
 
 def _screw_circle(data: Table) -> float | None:
-    """Return the diameter of a flange's circle of holes, half way between lens and rim (mm)."""
+    """Return the diameter (mm) of a flange's circle of holes: the mean of the sizes of lens and flange."""
     sizes = extent(table_at("lens.outline", data)), extent(table_at("mount.flange.outline", data))
     return None if None in sizes else (min(sizes[0]) + min(sizes[1])) / 2
 

@@ -1,7 +1,7 @@
 """A preview of a scene: the light of its lens after about a second, from a reduced design.
 
 The preview is a quick design (`Task.preview`) of the same scene with fewer pixels, control points, flux tubes and
-evaluations.  Each pixel has as many control cells and tubes as in a draft.  Details finer than a pixel are not shown.
+evaluations.  Details finer than its pixels are not shown.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class PreviewSize:
     net: int  # control points along the longer side; small prime factors make the cosine transforms fast
     tubes: int  # flux tubes per side
     rounds: int  # rounds of stage 1
-    evaluations: int  # evaluations of stage 2 for a point source
-    blurred: int  # evaluations of stage 2 for an extended source, each of which takes twice the time
+    evaluations: int  # evaluations of stage 2, for a point source
+    blurred: int  # evaluations of stage 3, for an extended source; each takes twice the time
 
 
 QUICK = PreviewSize(pixels=72, net=180, tubes=240, rounds=2, evaluations=12, blurred=8)  # first preview
@@ -107,7 +107,7 @@ def _progress(outdated: Callable[[], bool], remarks: list[str]) -> Progress:
 
 
 def reduced_scene(scene: Scene, size: PreviewSize) -> Scene:
-    """Return the scene with the pixels, control points and tailoring settings of a preview, by the default method."""
+    """Return the scene with the pixels, control points and tailoring settings of a preview, and the default method."""
     several = len(scene.targets) > 1 or scene.wavefront is not None
     size_factor, evaluations_factor = (GOALS_SIZE_FACTOR, GOALS_EVALUATIONS_FACTOR) if several else (1.0, 1)
     max_net = round(size_factor * size.net)

@@ -1,4 +1,4 @@
-"""The thread that makes previews: first for the newest scene of each page; slower answers follow when there is none.
+"""The thread that makes previews.  Quick previews come first; slower answers follow while no page waits for one.
 
 A request of a page replaces the page's earlier request, whose work ends at the next step.  The answers come in the
 order of STAGES: a quick preview, a refined preview, the effects that are left out, and predictions for each quality.
@@ -28,7 +28,7 @@ STAGES = ("preview", "settled", "effects", "predicted")  # names of the answers 
 MAX_PAGES = 32  # largest number of pages with a stored request
 IDLE_DELAY = 0.7  # pause (s) between a preview and the next of STAGES, in case another change comes
 JOIN_TIMEOUT = 0.5  # time (s) in which the thread has to end
-PAGE_TIMEOUT = 60.0  # time (s) after a page's last poll until its request is dropped
+PAGE_TIMEOUT = 60.0  # time (s) after a page's last poll until its request waits for the next poll
 
 
 @dataclass(eq=False)
@@ -123,7 +123,7 @@ class PreviewDesk:
             self._serve(request)
 
     def _next(self) -> PreviewRequest | None:
-        """Return the latest of the requests with the fewest answers, so that a new one comes first; None if none."""
+        """Return the latest of the waiting requests with the fewest answers, so that a new one comes first, or None."""
         now = time.monotonic()
         waiting = [each for each in self._unanswered() if not each.answers or now > each.preview_time + IDLE_DELAY]
         return min(reversed(waiting), key=lambda request: len(request.answers), default=None)
@@ -149,7 +149,7 @@ class PreviewDesk:
             self._news.notify_all()
 
     def _make(self, request: PreviewRequest, stage: str) -> Any:
-        """Return the answer of a stage: a preview, or entries of `plan --json`; effects also have the chosen `net`.
+        """Return the answer of a stage: a preview, or entries of `plan --json`, with the choice of the net (`net`).
 
         Outdated once the request is replaced or another one has fewer answers.
         """

@@ -76,7 +76,7 @@ def changed(text: str, key: str, value: Any) -> str:
 
 
 def _changed_tables(before: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """Return the tables with another value.  A table becomes a list if the schema says so; empty lists are removed."""
+    """Return the tables with another value of a key.  A new table becomes a list if the schema requires a list."""
     from bstcad.scene.dotted_keys import override  # loads torch
 
     after, node = copy.deepcopy(before), node_at(key, before)
@@ -186,7 +186,7 @@ def _read(lines: str) -> tuple[tuple[str, ...], Item]:
 
 
 def _numbered(names: Sequence[str], counts: dict[KeyPath, int], listed: bool) -> KeyPath:
-    """Return the path of a header.  listed: the header begins a new table of a list."""
+    """Return the path of a header, and count its table in `counts`.  listed: the header begins a table of a list."""
     path: KeyPath = ()
     for k, name in enumerate(names, start=1):
         path += (name,)
@@ -205,7 +205,7 @@ def _after_comment(found: Sequence[Piece], k: int) -> int:
 
 
 def _table_end(found: Sequence[Piece], k: int) -> int:
-    """Return the index after a table with last piece `k`, and after comments below it before a blank line."""
+    """Return the index after a table with last piece `k`, and after comments below it unless a statement follows."""
     end = over = _after_comment(found, k)
     while over < len(found) and found[over].role == "comment":
         over += 1

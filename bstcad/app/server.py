@@ -369,7 +369,7 @@ class Workbench:
             return head | {"refused": self.workspace.without_paths(str(found))}
         if isinstance(found, Exception):
             why = self.workspace.without_paths(files.first_line(found))
-            return head | {"refused": f"the {name} failed ({why}); a design may still succeed"}
+            return head | {"refused": f"the computation failed ({why}); a design may still succeed"}
         if name in ("preview", "settled"):
             return head | preview_json.of_preview(found)
         return head | (preview_json.of_plan(found) if name == "effects" else preview_json.of_predictions(found))

@@ -1,8 +1,8 @@
 """The folders of the workbench: scene files with their unsaved changes, pictures, and finished designs.
 
-The name of a scene is the stem of its file, the name of a design that of its folder; the pages get no paths.  The text
-of a scene that is being edited is in a hidden file beside the scene file, so that no change is lost when a page is
-closed or the server is killed.  `save` copies it to the scene file, unless another program has changed that file.
+A scene is named by the stem of its file, and a design by its folder; the pages get no paths.  The text of a scene that
+is being edited is in a hidden file beside the scene file, so that no change is lost when a page is closed or the server
+is killed.  `save` copies it to the scene file, unless another program has changed that file.
 """
 
 from __future__ import annotations
@@ -213,8 +213,8 @@ class Workspace:
     def adopt(self, design: str, folder: Path, written: Path | None = None) -> str:
         """Write a new scene file for the scene in a folder, with the files that it names; return the scene's name.
 
-        written: file with the original text of the scene.  The comments of this file are preserved, or else those of
-        the scene file with the design's name, if they describe the same scene.
+        written: file with the original text of the scene.  Its comments are preserved if it describes the same
+        scene, or else those of the scene file with the design's name.
         """
         text = self._text(folder / "scene.toml")
         loaded = self._loaded(folder / "scene.toml", text)
@@ -235,7 +235,7 @@ class Workspace:
         return name
 
     def _commented(self, scene: Scene, paths: list[Path]) -> str | None:
-        """Return the text of the first file that describes the scene, with or without its number of control points."""
+        """Return the text of the first file with this scene, or with it but no control_points; None if none has it."""
         alike = [scene, scene.changed({"lens.back.control_points": None})]
         for path in paths:
             with contextlib.suppress(SentenceError):

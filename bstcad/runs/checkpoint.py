@@ -38,7 +38,7 @@ Purpose = dict[str, Any]  # description of the checkpoint's design: numbers, tex
 
 
 def write(path: Path, purpose: Purpose, state: Any) -> None:
-    """Write a checkpoint of a design (`purpose`) to `path`, completely or not at all (OSError)."""
+    """Write the state of the design that `purpose` describes to `path`; an OSError leaves the old file unchanged."""
     arrays: dict[str, np.ndarray] = {}
     tree = json.dumps([purpose, state], default=partial(_packed, arrays))
     with files.atomic_file(path) as file:  # without a copy of the state in memory
@@ -51,9 +51,9 @@ def write(path: Path, purpose: Purpose, state: Any) -> None:
 
 
 def read(path: Path, kind: type, device: str = "cpu") -> tuple[Purpose, Any]:
-    """Return (purpose, state) of a checkpoint; the state is a `kind`, its tensors are on `device`.
+    """Return (purpose, state) of a checkpoint; kind: class of the state, device: device for its tensors.
 
-    Mappings are returned as dicts, lists as tuples.  SceneError if the file is not a checkpoint of this version.
+    Mappings become dicts, and lists become tuples.  SceneError if the file is not a checkpoint of this version.
     """
     try:
         content = files.contents(path, MAX_SIZE)
@@ -80,7 +80,7 @@ def read(path: Path, kind: type, device: str = "cpu") -> tuple[Purpose, Any]:
 
 
 def _packed(arrays: dict[str, np.ndarray], value: Any) -> dict[str, Any]:
-    """Encode a value that JSON lacks: {"@array" or "@tensor": name in `arrays`}, {"@module.Class": fields}, mapping."""
+    """Encode a value for JSON: {"@array" or "@tensor": name in `arrays`}, {"@module.Class": fields}, or a dict."""
     if isinstance(value, torch.Tensor):
         return {"@tensor": _packed(arrays, value.detach().cpu().numpy())["@array"]}
     if isinstance(value, np.ndarray):
@@ -92,7 +92,7 @@ def _packed(arrays: dict[str, np.ndarray], value: Any) -> dict[str, Any]:
 
 
 def _unpacked(arrays: Mapping[str, np.ndarray], records: Mapping[str, type], device: str, found: dict) -> Any:
-    """Decode a value of `_packed`; called from the innermost value outwards.  records: classes by name."""
+    """Decode `found`, a value of `_packed` with its inner values decoded.  records: classes by "module.Class"."""
     (kind, content), *_ = [*found.items(), ("", None)]
     if kind == "@array":
         return arrays[content]
@@ -108,7 +108,7 @@ def _as_tuples(value: Any) -> Any:
 
 
 def _records(kind: Any, known: dict[str, type]) -> dict[str, type]:
-    """Add the dataclasses in an annotated type, and in their fields, to `known` by name; return `known`."""
+    """Add the dataclasses in a type annotation and in their fields to `known`, by "module.Class"; return `known`."""
     if isinstance(kind, type) and is_dataclass(kind) and _name(kind) not in known:
         known[_name(kind)] = kind
         for hint in get_type_hints(kind).values():
@@ -148,14 +148,14 @@ class Keeper:
             self.flush()
 
     def flush(self) -> bool:
-        """Write the latest state; return True if a checkpoint is on disk.  A full disk does not end a design."""
+        """Write the latest state; return True if any state of the design is on disk.  A full disk raises no error."""
         if self.latest is not None and (self.latest is not self._written or not self.path.exists()):
             began = time.monotonic()
             try:
                 write(self.path, self.purpose, self.latest)
             except (OSError, MemoryError) as error:
                 reason = getattr(error, "strerror", None) or "not enough memory"
-                self.say(f"{self.path}: cannot be written ({reason}); the design continues without a checkpoint")
+                self.say(f"{self.path}: cannot be written ({reason}); the design continues without a new checkpoint")
             else:
                 self._written, self._own = self.latest, True
             ended = time.monotonic()
@@ -165,7 +165,7 @@ class Keeper:
     def keep_at_exit(self) -> str:
         """Write the latest state at the end of a run, beside the folder or else among temporary files.
 
-        Return a sentence for the user on how to resume; "" without a state.
+        Return a sentence for the user: how to resume, or that the state is lost; "" without a state.
         """
         self.say = lambda text: None
         if self.flush():
@@ -177,11 +177,11 @@ class Keeper:
             write(path, self.purpose, self.latest)
         except (OSError, MemoryError):
             path.parent.rmdir()
-            return "the design so far is lost: no space is left beside the folder or for temporary files; free some"
+            return "the design so far is lost: no space is left beside the folder or for temporary files"
         return f"the design so far is kept in {path}; move it to {self.path} and use --resume to continue it"
 
     def load(self) -> Any:
-        """Return the state to resume from; None without a checkpoint.  SceneError if it is of another design."""
+        """Return the state to resume from; None without a file.  SceneError if it is damaged or of another design."""
         if not self.path.exists():
             return None
         purpose, state = read(self.path, self.kind, self.purpose.get("device", "cpu"))
@@ -199,7 +199,7 @@ class Keeper:
         self.path.unlink(missing_ok=True)
 
     def withdraw(self) -> None:
-        """Delete the checkpoint of this run, since the scene is refused; one of an earlier run stays."""
+        """Delete the checkpoint of this run, since the scene is refused; a checkpoint of an earlier run stays."""
         self.latest = None
         if self._own:
             self.remove()

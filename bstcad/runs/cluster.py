@@ -33,7 +33,7 @@ class Answer:
     key: Any  # key with which the job was started
     where: str  # THIS_MACHINE, or the address of the worker (of the scheduler, if no worker answered)
     value: Any = None  # result; None if the job failed
-    reason: str = ""  # reason why the job failed
+    reason: str = ""  # reason why the job failed; "": it has a result
 
 
 class Machines(Protocol):
@@ -41,7 +41,7 @@ class Machines(Protocol):
 
     @property
     def capacity(self) -> int:
-        """Number of jobs that run at the same time."""
+        """Largest number of jobs that run at the same time."""
 
     def start(self, key: Any, work: Callable[..., Any], *arguments: Any) -> None:
         """Start the job work(*arguments)."""
@@ -52,7 +52,7 @@ class Machines(Protocol):
 
 @contextlib.contextmanager
 def connect(scheduler: str | None, workers: int | None = None) -> Iterator[Cluster | None]:
-    """Yield the workers of a scheduler, or `workers` local processes that end with the block; None if both are None."""
+    """Yield a Cluster of the scheduler at an address, or of `workers` local processes until the block ends; or None."""
     check(scheduler, workers)
     with contextlib.ExitStack() as stack:
         address = scheduler
@@ -166,7 +166,7 @@ class Cluster:
 
 
 def answer(wanted: str, key: Any, work: Callable[..., Any], *arguments: Any) -> Answer:
-    """Do a job on a worker, if the worker's bstcad has the version `wanted`; key: key of the job."""
+    """Return the Answer of work(*arguments) on a worker; a failure if its bstcad has another version than `wanted`."""
     from distributed import get_worker
 
     with _one_at_a_time:

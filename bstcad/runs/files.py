@@ -126,7 +126,7 @@ def within(path: Path, *folders: Path) -> Path:
     """Return the path with links resolved.  ValueError if they lead out of these folders, or back to themselves."""
     try:
         found = path.resolve()
-        endless = found.is_symlink()  # newer versions of pathlib; older ones raise
+        endless = found.is_symlink()  # newer versions of pathlib return a link; older ones raise
     except (OSError, RuntimeError):
         endless = True
     if endless:
@@ -156,7 +156,7 @@ def names(path: Path) -> list[str]:
 
 
 def net(path: Path, most: int) -> np.ndarray:
-    """Return control_points (m, n, 3) as float64 from an .npz archive; m, n: up to `most`.  Errors: as of `arrays`."""
+    """Return control_points (m, n, 3) as float64 from an .npz archive; m, n: at most `most`.  Errors: see `arrays`."""
     with zipfile.ZipFile(io.BytesIO(contents(path, MAX_ARCHIVE_SIZE))) as archive:
         with archive.open("control_points.npy") as file:
             (m, n, *_), _ = _header(file, "control_points")

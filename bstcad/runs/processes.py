@@ -73,7 +73,7 @@ PRELOADED = (  # modules that the second process loads at its start
     "matplotlib.backends.backend_agg",
     "matplotlib.backends.backend_pdf",
 )
-# Memory limit of loky in bytes: by default it would mistake a solid in memory for a leak and end the process.
+# Growth of memory (bytes) at which loky ends a process; with its default, a solid in memory would count as a leak.
 MEMORY_LEAK_LIMIT = "1000000000000000"
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # parameters of glibc's mallopt (malloc.h)
 MAX_KEPT = (1 << 31) - 1  # largest total of freed memory that stays with the process (bytes)
@@ -133,13 +133,13 @@ def run_here(work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> F
 
 
 def begin() -> None:
-    """Start the second process, unless it runs, and let it load its libraries, which takes a second or two."""
+    """Start the second process, unless it runs, and let it load its libraries; return without waiting for it."""
     if _process is None:
         submit(load, *PRELOADED)
 
 
 def load(*modules: str) -> None:
-    """Import modules; an import error is raised again at the first use of the module."""
+    """Import modules and ignore all errors; an import error is raised again at the first use of the module."""
     gc.disable()
     for module in modules:
         with contextlib.suppress(Exception):
@@ -202,7 +202,7 @@ def _serve(parent: int) -> None:
 
 
 def peak_memory() -> float | None:
-    """Return the peak memory of this process (GB); None if the system does not state it.  psutil lacks it on Linux."""
+    """Return the peak memory of this process (GB); None if unknown.  psutil does not state it on Linux."""
     with contextlib.suppress(OSError, StopIteration):  # on Linux getrusage includes the parent process
         lines = Path("/proc/self/status").read_text().splitlines()
         return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) * 1024 / 1e9
@@ -215,7 +215,7 @@ def peak_memory() -> float | None:
 
 
 def keep_freed() -> None:
-    """Let up to 2 GB of freed memory stay with this process, in arrays of up to 128 MiB; needs glibc.
+    """Let up to 2 GiB of freed memory stay with this process, in arrays of up to 128 MiB; needs glibc.
 
     By default, glibc returns freed arrays of more than 32 MiB to the system, which clears each new array page by page.
     Clearing takes an eighth of the time of an evaluation of a few million tubes.  Keeping freed arrays of more than
@@ -247,13 +247,13 @@ class ExitStatus:
     """Exit status of a child process."""
 
     code: int  # exit code; -n if signal n ended the child
-    seconds: float
+    seconds: float  # wall time
     cpu_seconds: float  # CPU time of the child and its own children, and of other children that ended meanwhile
-    stderr: str
+    stderr: str  # text that the child wrote to stderr
 
     @property
     def reason(self) -> str:
-        """Sentence that says why the child gave no result."""
+        """Reason why the child gave no result, to be quoted within a sentence."""
         if self.code < 0:
             memory = "; this machine may have too little memory for it" if self.code == -signal.SIGKILL else ""
             return f"ended by {signal.Signals(-self.code).name}{memory}"
@@ -305,7 +305,7 @@ def _end(child: subprocess.Popen) -> None:
 
 
 def end_with_parent() -> None:
-    """End the process group of a child of `run` when its parent has ended; do nothing in other processes."""
+    """End this process and its group once the parent has ended, if it is a child of `run`; else do nothing."""
     parent = os.environ.pop(PARENT, None)
     if parent is not None and os.getpgrp() == os.getpid():
         _end_with(int(parent), lambda: os.killpg(0, signal.SIGKILL))

@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 ProgressFunction = Callable[[str, int, int, str], None]
-LINE_INTERVAL = 3.0  # time (s) between two lines of a stage, where the terminal shows no progress bar
-REDRAW_INTERVAL = 0.2  # time (s) between two updates in a notebook
+LINE_INTERVAL = 3.0  # shortest time (s) between two lines of a stage, if the output is not a terminal
+REDRAW_INTERVAL = 0.2  # shortest time (s) between two updates of a stage in a notebook
 
 
 class Throttled:
@@ -80,7 +80,7 @@ def bars(console: Console) -> Iterator[ProgressFunction]:
 
 @contextmanager
 def cells(display: Callable[..., Any], clock: Callable[[], float] = time.monotonic) -> Iterator[ProgressFunction]:
-    """Display a table with one row per stage below a notebook's cell, redrawn every REDRAW_INTERVAL."""
+    """Display a table with one row per stage below a notebook's cell, updated at most every REDRAW_INTERVAL."""
     began: dict[str, float] = {}  # start time by stage
     rows: dict[str, str] = {}
     handle = display({"text/html": "", "text/plain": ""}, raw=True, display_id=True)

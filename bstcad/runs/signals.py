@@ -34,7 +34,7 @@ class Terminated(BaseException):
 
 
 def termination() -> Terminated | None:
-    """Return the signal that terminated this run, even if its exception was lost or replaced; None without one."""
+    """Return the Terminated of this run, even if its exception was lost or replaced; None without such a signal."""
     return Terminated(_received[0]) if _received else None
 
 
@@ -55,7 +55,7 @@ def raise_terminated() -> Iterator[None]:
 
 @contextlib.contextmanager
 def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns True after a first Ctrl-C in the block; a second one raises KeyboardInterrupt."""
+    """Yield a function that returns True after one Ctrl-C in the block; a second Ctrl-C raises KeyboardInterrupt."""
     pressed: list[int] = []
 
     def handle(number: int, frame: object) -> None:

@@ -121,7 +121,7 @@ class LocalPool:
         self._threads.shutdown(cancel_futures=True)
 
     def start(self, key: Any, work: Callable[..., Any], *arguments: Any) -> None:
-        """Start work(*arguments, tick) in a thread; it must call `tick` regularly."""
+        """Start work(*arguments, tick) in a thread; `work` must call `tick` regularly."""
         self._keys[self._threads.submit(work, *arguments, self._tick)] = key
 
     def next(self, tick: Tick) -> Answer:
@@ -158,7 +158,7 @@ def measure_seconds(work: Callable[[], object]) -> float:
 
 @cache
 def calibration_kernel(tubes: int = KERNEL_TUBES) -> Callable[[], Any]:
-    """Return a function that evaluates merit and gradient with flux tubes through a fixed small lens; made once."""
+    """Return a function that evaluates merit and gradient with flux tubes (`tubes` per side) through a fixed lens."""
     u = torch.linspace(-math.pi * WAVE_PERIODS, math.pi * WAVE_PERIODS, KERNEL_NET, dtype=torch.float64)
     outline, span = Rectangle(KERNEL_WIDTH, KERNEL_WIDTH), (-KERNEL_WIDTH / 2, KERNEL_WIDTH / 2)
     back = BSplineSurface(KERNEL_THICKNESS, WAVE_HEIGHT * u.cos()[:, None] * u.cos(), span, span)
@@ -177,7 +177,7 @@ Value = int | float | str | tuple[int, int]
 Settings = tuple[tuple[str, Value], ...]  # (dotted key of the scene, value), sorted by key; (): the base scene
 
 DONE, FAILED, NOT_RUN = "done", "failed", "not run: budget"  # statuses of a run
-REFERENCE_EFFORT = Effort(witness=False)  # effort of the reference: rays only, which no design uses for tailoring
+REFERENCE_EFFORT = Effort(witness=False)  # effort of the reference: no flux tubes, only rays that tailoring did not use
 WARM_UP_CHANGES = {  # settings of the first run, which compiles kernels and loads libraries and is not timed
     "lens.back.control_points": 33, "tailoring.quality": "draft", "tailoring.rays": 96,
     "tailoring.transport_grid": 64, "tailoring.levels": None,
@@ -225,7 +225,7 @@ class ColdRun(StoredRecord):
     kernel_seconds: float | None = 0.0  # time of the calibration kernel before this run
     units: float | None = None  # seconds / kernel_seconds
     cost_seconds: float | None = 0.0  # time charged to the budget, including the reference and the calibration
-    predicted_seconds: float | None = None  # time predicted for the budget before the run
+    predicted_seconds: float | None = None  # cost_seconds as predicted before the run
     peak_memory_gb: float | None = None  # peak memory of the two processes together (GB)
     rrmsd: float | None = None  # RRMSD by the reference; for several targets the largest
     rrmsd_noise: float | None = None  # standard error of rrmsd
@@ -233,7 +233,7 @@ class ColdRun(StoredRecord):
     rrmsd_reported: float | None = None  # RRMSD by the verification of the design, on the pixels of the run
     rrmsd_noise_reported: float | None = None  # standard error of rrmsd_reported
     passed: bool | None = None  # true if every check of the verification passed
-    net: str = ""  # SHA-256 of the control net; equal nets are equal lenses to the last bit
+    net: str = ""  # SHA-256 of the control nets; equal nets are equal lenses to the last bit
     stages: tuple[dict[str, Any], ...] = ()  # stages: name, seconds and rrmsd at the end (null: not measured)
     on_front: bool = False  # true if the run is on the Pareto front of the sweep
     # not in tradeoff.json
@@ -263,7 +263,7 @@ class ColdRun(StoredRecord):
 def run_and_judge(
     contents: SceneFiles, point: Settings, limit: float, effort: Effort, tick: Tick = lambda: None
 ) -> ColdRun:
-    """Design a base scene with the settings `point` in at most `limit` seconds, and measure its time and RRMSD."""
+    """Design a base scene (`contents`) with the settings `point` within `limit` seconds; measure time and RRMSD."""
     start = time.perf_counter()
     unit = min(measure_seconds(calibration_kernel()) for _ in range(KERNEL_REPEATS))
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
@@ -289,7 +289,7 @@ def warm_up(contents: SceneFiles, tick: Tick) -> None:
 
 
 def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick: Tick) -> ColdRun:
-    """Run `bstcad generate` in a process of its own, and return the figures of its report."""
+    """Run `bstcad generate` for a scene file in a new process; return a record with the figures of its report."""
     changes = [word for key, value in point for word in ("--set", f"{key}={format_value(value)}")]
     process = processes.run(["generate", str(scene), "-o", str(folder), *changes], limit, tick)
     times: dict[str, Any] = {"settings": point, "seconds": process.seconds, "cpu_seconds": process.cpu_seconds}

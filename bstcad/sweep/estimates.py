@@ -41,7 +41,7 @@ TRANSPORT_ROUNDS, COARSE_STEPS = 2, 40  # rounds of transport and slope fit, and
 
 @torch.no_grad()
 def coarse_lens(scene: Scene) -> Lens:
-    """Return a lens in which light has nearly the angles and paths of the finished lens, but with a coarse picture."""
+    """Return a lens with nearly the ray angles and path lengths of the finished lens, but with a coarse picture."""
     channel = _central_channel(scene)
     lens = channel.through(scene.flat_lens(COARSE_POINTS))
     picture = _downsample(scene.target.irradiance(), COARSE_PIXELS)
@@ -197,7 +197,7 @@ def _entry(kind: str, change: Change | None, detail: str = "", simulate_by: str 
 
 # --- the diagnosis of a finished design -------------------------------------------------------------------------------
 
-SIZE_STAGE_PREFIX = "stage 3, "  # beginning of the names of stages with one size of the source each
+SIZE_STAGE_PREFIX = "stage 3, "  # beginning of the names of the rounds of stage 3 (stage2.SOURCE_SIZES)
 
 
 def diagnosis(scene: Scene, making: DesignCourse, proof: Proof, target: np.ndarray) -> dict[str, Any]:
@@ -210,7 +210,7 @@ def diagnosis(scene: Scene, making: DesignCourse, proof: Proof, target: np.ndarr
     curve = ending(
         [(point.seconds, point.rrmsd) for point in making.history],
         [(stage.seconds, stage.rrmsd) for stage in making.stages],
-        since=math.fsum(stage.seconds for stage in making.stages[: max(sizes[2:], default=0)]),  # source at full size
+        since=math.fsum(stage.seconds for stage in making.stages[: max(sizes[2:], default=0)]),  # last round
     )
     reached = {key: at for key, at in (proof.at_bounds or {}).items() if key in scene.lens.bounded_by}
     bounds: dict[str, Any] = {

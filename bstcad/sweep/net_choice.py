@@ -6,7 +6,7 @@ pixel.  Dark pixels are lit by few cells.  The RRMSD of a net follows from the d
 its cells, and finer than cells twice as wide.  The size of the net determines time and memory (prediction.py).
 
 Among the nets that memory, tailoring.max_time and the tool radius allow, the smallest net is chosen for which each
-larger net would reduce the RRMSD by less than a fifth, or by less than half in three times the time.
+larger net would reduce the RRMSD by at most a fifth, or by at most half in three or more times the time.
 tests/benchmarks/test_net_choice.py compares the choice with designs of every net.
 """
 
@@ -34,9 +34,9 @@ from bstcad.sweep.estimates import coarse_lens
 from bstcad.sweep.prediction import REMAINING_BLUR, blur_rrmsd, memory_gb, typical_seconds
 
 NET_KEY = "lens.back.control_points"  # key of the scene that states the net
-SQUARE_NETS = (65, 129, 257, 513, 1025)  # control points per side of candidates, or as many in square cells
+SQUARE_NETS = (65, 129, 257, 513, 1025)  # control points per side; an oblong net has about as many in total
 MAX_SQUARE_ASPECT = 1.25  # largest aspect ratio of an outline with a square net
-# (reduction of the RRMSD, increase of the time), as factors: a larger net with less reduction in more time is rejected.
+# Factors (reduction of the RRMSD, increase of the time): a larger net that reduces less and takes longer is rejected.
 MIN_GAINS = ((1.25, 1.0), (2.0, 3.0))
 MEMORY_FRACTION = 0.8  # fraction of the machine's memory that a design may use
 DENSITY_TUBES = 256  # flux tubes per side for the flux density
@@ -102,7 +102,7 @@ class Choice:
 
 
 def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
-    """Return (scene with a chosen net, choice); (scene, None) if it states a net.  SceneError: no light on the back."""
+    """Return (scene with a chosen net, choice); (scene, None) if it has one.  SceneError: no light on the back."""
     if scene.lens.back.control_points is not None:
         return scene, None
     levels = scene.tailoring.levels
@@ -175,9 +175,9 @@ def _affordable(scene: Scene, candidates: list[Candidate]) -> tuple[tuple[Candid
 
 
 def seam_shift(scene: Scene) -> float:
-    """Return the shift (pixels) of light on the target across a cell in the tool's narrowest valley; inf: any tool.
+    """Return the shift (pixels) of light on the target across one cell of the narrowest valley; inf: no tool radius.
 
-    It is p L (n - 1) / R for cells of width p, a throw L and a tool radius R; a mirror deflects light by twice its
+    It is p L (n - 1) / R with the width p of a cell, the throw L and the tool radius R; a mirror deflects by twice its
     slope.  At a seam, where light separates, the tool limits the width of the valley, whatever the cells.
     """
     radius, target = scene.lens.tool_radius, scene.target

@@ -33,22 +33,21 @@ CAVEAT = "Estimates assume one target and one tailored face; with several, the l
 
 
 def plan(scene: Scene, text: str = "", keys: Sequence[str] = (), tick: Tick = lambda: None) -> Iterator[dict[str, Any]]:
-    """Yield the entries of `plan --json`: first the effects, then the predictions.
+    """Yield the entries of `plan --json`: first the effects, then the predictions (see `predict_qualities`).
 
     simulated: effects that are simulated.  goals: for each target its key, left_out (neglected effects, ordered by
     change of the RRMSD), blur and unreachable.  The entries of the most blurred target are repeated outside goals.
 
-    unreachable: part of the target that light cannot reach (optics.reach.unreached); None: light reaches all of it.
+    unreachable: part of the target that light cannot reach (optics.reach.unreached); None: none, or a tailored front.
 
     blur: width (in the target's unit and in pixels) of the image of an extended source through the coarse lens, and the
-    RRMSD of the target convolved with this image; None: point source or collimated light.
+    RRMSD of the target convolved with this image; None: a point or no divergence, or no light passes.
 
     caveat: sentence that states how the lens of the estimates differs from the scene's; only if it differs.
 
     verdict: {kind, sentence}; yielded with the effects if they determine the verdict, see `verdict`.
 
-    text: text of the scene file, for line numbers.  keys: keys that the command line overrides.  tick: called
-    regularly; an exception from it ends the plan.
+    text: text of the scene file, for line numbers.  keys: keys that --set sets.  tick: called regularly, may raise.
     """
     at, scenes = toml_positions(text), scene.single_target_scenes()
     requested = [{"what": what, "key": key, **_request_of(key, at, keys)} for what, key in simulated(scene)]
@@ -113,7 +112,7 @@ def _goal_effects(scene: Scene, lens: Lens, key: str) -> dict[str, Any]:
 
 
 def reach_drawn(scene: Scene) -> tuple[bytes, ...]:
-    """Draw each target and the part that light can reach, as PNG; raise SceneError for a tailored front."""
+    """Return a PNG per target, which shows the part that light can reach; raise SceneError for a tailored front."""
     from bstcad.report.drawing import png
     from bstcad.report.light_figures import View, reach_picture
 
@@ -132,7 +131,7 @@ def reach_drawn(scene: Scene) -> tuple[bytes, ...]:
 
 
 def _request_of(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[str, Any]:
-    """Return the place that requests an effect: line of the scene file (None: command line or default), and words."""
+    """Return what requests an effect: its line in the scene file (None: --set or a default), and words for a table."""
     for other in keys:
         if other == key or key.startswith(f"{other}.") or other.startswith(f"{key}."):
             return {"line": None, "asked_by": f"--set {other}"}
@@ -144,9 +143,9 @@ def _request_of(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[st
 
 
 def predict_qualities(scene: Scene, lenses: Sequence[Lens], tick: Tick = lambda: None) -> dict[str, Any]:
-    """Predict a scene in each quality, and with about twice the control points, or state why there is no prediction.
+    """Return {predicted, not_predicted, finer, notes}: predictions for each quality, or the reason why there are none.
 
-    lenses: a coarse lens for each target.
+    finer: predictions with about twice the control points per side.  lenses: a coarse lens for each target.
     """
     entries: dict[str, Any] = {"predicted": None, "not_predicted": None, "finer": None, "notes": []}
     try:

@@ -55,7 +55,7 @@ class Seconds:
 
     first: float  # stage 1
     search: float  # stage 2 or 3
-    rest: float  # start, writing, verification, report; for a pilot only the part independent of sizes
+    rest: float  # start, writing, verification, report; for a pilot: loading, and rounds with COARSE_ROUND_TEXT
 
     @property
     def total(self) -> float:
@@ -72,12 +72,12 @@ class Pilot:
     rrmsd: float  # largest RRMSD of all goals
     factor: float  # pixels per side of the full scene / pixels per side of the pilot
     detail: float  # relative RMS of the detail of the full picture that is finer than the pilot's pixels
-    blur: float  # RRMSD by blur of the source in the full scene minus that in the pilot
+    blur: float  # RRMSD by blur of the source on the pixels of the full scene, minus that on the pixels of the pilot
     steep: Steepness  # steepness that the map requires of the back
 
 
 def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
-    """Design a small version of a scene in some quality; raise SceneError if its design would be refused."""
+    """Design a small version of a scene in a quality (QUALITIES); raise SceneError if the design is refused."""
     small, factor = pilot_scene(with_quality(scene, quality))
     compilations = RecordingListener()
     hooks, options = Hooks(progress=lambda *event: tick()), pipeline.DesignOptions(compare_later=True)
@@ -130,7 +130,7 @@ def replace_net(scene: Scene, net: Sides, changes: Mapping[str, object] = {}) ->
 
 
 def detail(picture: np.ndarray, pixels: int) -> float:
-    """Return the relative RMS of the waves of a picture that are finer than `pixels` along its longer side."""
+    """Return the relative RMS of the waves of a picture with more than `pixels` half waves along its longer side."""
     from scipy.fft import dctn
 
     energy = dctn(picture, norm="ortho") ** 2
@@ -146,14 +146,14 @@ def blur_rrmsd(scene: Scene, lens: Lens) -> float:
 
 # --- predictions ------------------------------------------------------------------------------------------------------
 
-PILOT_EXPONENT = -0.6  # exponent by which the RRMSD scales with the factor of the pilot
+PILOT_EXPONENT = -0.6  # exponent of Pilot.factor in the ratio of the RRMSD of the full design to that of the pilot
 DETAIL_FACTORS = {"draft": 0.2, "standard": 0.02, "fine": 0.02}  # RRMSD due to detail that a pilot lacks / detail
 FINE_RATIO = 0.7  # ratio of the RRMSD in fine to that in standard quality
 REMAINING_BLUR = 0.5  # fraction of the blur by an extended source that remains after stage 3
 
 
 def predict(scene: Scene, pilots: Mapping[str, Pilot], gain: float = 1.0) -> dict[str, dict[str, Interval]]:
-    """Predict time (seconds), RRMSD and memory (GB, two processes) for each quality from pilots of PILOT_QUALITIES.
+    """Return intervals of seconds, rrmsd and memory_gb (two processes), by quality, from pilots of PILOT_QUALITIES.
 
     The RRMSD does not increase from a quality to the next better quality.  gain: ratio of the RRMSD of the scene's net
     to the RRMSD of the pilots' net.
@@ -189,7 +189,7 @@ UNIT_TUBES, UNIT_POINTS, UNIT_PIXELS, UNIT_GRID, UNIT_ITERATIONS = 1024, 513, 51
 KERNEL_SECONDS = 0.115  # time of an evaluation of cold_run.calibration_kernel
 ROUND_SECONDS, TRANSPORT_SECONDS, FIT_SECONDS = 0.06, 0.2, 0.6  # time of a round, transport, slope fit in stage 1
 TWO_FACE_TRANSPORT_SECONDS = 2.4  # time of a transport behind two freeform faces, between which light is traced
-TWO_FACE_SECONDS = 3.0  # time in stage 1 for two freeform faces of any size
+TWO_FACE_SECONDS = 3.0  # additional time in stage 1 for two freeform faces of any size
 AIMING_SECONDS = 1.0  # time to find the rays from a point source through UNIT_TUBES² points
 FRONT_SECONDS = 1.7  # time of the search for a curved front
 EVALUATION_SECONDS, VARIABLE_SECONDS, BLUR_SECONDS = 0.11, 0.046, 0.30  # time of the tubes, net, blur in an evaluation
@@ -227,7 +227,7 @@ def typical_seconds(scene: Scene) -> Seconds:
     first += transport * sum((grid / UNIT_GRID) ** 2 for grid in grids) * knobs.transport_iterations / UNIT_ITERATIONS
     fits = [fitted for level in knobs.levels[-2:] for fitted in scene.lens.nets(level)]
     first += FIT_SECONDS * sum(math.prod(as_pair(fitted)) for fitted in fits) / UNIT_POINTS**2
-    each, begun = CALL_SECONDS + VARIABLE_SECONDS * net, RRMSD_SECONDS * pixels ** (2 / 3)  # evaluation, round
+    each, begun = CALL_SECONDS + VARIABLE_SECONDS * net, RRMSD_SECONDS * pixels ** (2 / 3)  # per evaluation, round
     if scene.source.extent is not None:
         each, begun = each + BLUR_SECONDS * pixels, begun + IMAGE_SECONDS
     launched = sum((tubes / UNIT_TUBES) ** 2 for tubes, _ in sheets)
@@ -240,7 +240,7 @@ def typical_seconds(scene: Scene) -> Seconds:
 
 
 def search_rounds(scene: Scene) -> tuple[tuple[int, int], ...]:
-    """Return tubes per side and number of evaluations for each round of stage 2 or 3."""
+    """Return (tubes per side, number of evaluations) of each round of stage 2 or 3."""
     knobs = scene.tailoring.resolved(scene.lens.back.net)
     if scene.source.extent is not None:
         columns, rows = zip(*(target.columns_rows for target in scene.targets), strict=True)

@@ -80,7 +80,7 @@ class Calibration(StoredRecord):
 
     @classmethod
     def of(cls, unit: Sequence[float]) -> Calibration:
-        """Return the record of the times of the kernel (seconds); null without any."""
+        """Return the record of the kernel's times `unit` (s); its values are null without any."""
         extremes: dict[str, Any] = {"lowest": min(unit, default=None), "highest": max(unit, default=None)}
         return cls(seconds=statistics.median(unit) if unit else None, **extremes)
 
@@ -89,7 +89,7 @@ class Preset(StoredRecord):
     """Quality preset that was run."""
 
     name: str  # draft, standard, fine or paper
-    seconds: float | None  # time of the run (s)
+    seconds: float | None  # time of the run (s); null: times are not comparable
     rrmsd: float  # RRMSD by the reference
 
 
@@ -107,7 +107,7 @@ class TradeoffTable(StoredRecord):
     machine: dict[str, Any]  # machine on which the times were measured
     versions: dict[str, str]  # versions of the libraries, by name
     reference: dict[str, Any]  # reference for the RRMSD: rays (numbers of rays, ascending), what (in words)
-    calibration: Calibration  # duration of the calibration kernel
+    calibration: Calibration  # time of the calibration kernel
     runs: tuple[ColdRun, ...]  # runs that ended, then the others, each by importance, without PRIVATE_FIELDS
     knobs: tuple[TableKnob, ...]  # knobs that were varied
     front: tuple[StoredSettings, ...]  # settings of the runs on the Pareto front, the fastest first
@@ -123,7 +123,7 @@ class TradeoffTable(StoredRecord):
 
     @property
     def plotted(self) -> list[ColdRun]:
-        """Runs of the figure: those with comparable times, or all runs with a lens if no times are comparable."""
+        """Runs in the figure: those with comparable times, or all runs with a lens if no times are comparable."""
         return [run for run in self.runs_with_lens if self.errors_alone or run.comparable]
 
     @property
@@ -138,7 +138,7 @@ class TradeoffTable(StoredRecord):
 
     @property
     def failed(self) -> list[ColdRun]:
-        """Runs without a lens."""
+        """Runs that ended without a lens."""
         return [run for run in self.runs if run.status == FAILED]
 
     @property
@@ -201,7 +201,7 @@ KNOB_STYLES = {
 }
 FIGURE_WIDTH, FIGURE_HEIGHT = 10.0, 7.4  # inches
 AXIS_MARGIN = 1.25  # factor between the outermost points and the ends of the axes
-MAX_FLOOR_DISTANCE = 6.0  # largest ratio of the smallest RRMSD to the lower end of the axis
+MAX_FLOOR_DISTANCE = 6.0  # largest factor by which standard errors extend the RRMSD axis downwards
 DARK_RRMSD = 1.0  # RRMSD of a dark picture; axes do not extend to larger RRMSDs
 THIN_LINE: dict[str, Any] = {"lw": 0.9, "zorder": 1}  # style of the lines of the convergence and the standard error
 FRONT_STYLE: dict[str, Any] = {"color": "#f0c80073", "lw": 5.5, "solid_joinstyle": "round", "solid_capstyle": "round"}
@@ -243,7 +243,7 @@ def draw_runs(axes: Axes, table: TradeoffTable) -> None:
         label = "convergence of the base run (warm)"
         axes.plot(*zip(*points, strict=True), color="#b5b5b5", label=label, **THIN_LINE)
     for knob in table.knobs:
-        if knob.key in KNOB_STYLES and len(knob.places) > (knob.key != "adam"):  # others include the base
+        if knob.key in KNOB_STYLES and len(knob.places) > (knob.key != "adam"):  # all others include the base
             _draw_knob(axes, knob)
     if table.front_runs:
         times, errors = zip(*(run.time_and_error for run in table.front_runs), strict=True)
@@ -306,7 +306,7 @@ def write_page(table: TradeoffTable, scene: Scene, folder: Path) -> None:
 
 
 def verdict(table: TradeoffTable) -> tuple[str, str, str]:
-    """Return style, headline and explanation of the result."""
+    """Return the key of VERDICT_STYLES, the headline and the explanation of the result."""
     if not table.runs_with_lens:
         return "fail", "NO LENS", "No run gave a lens; the reasons are listed below."
     count, failed, style = len(table.plotted), len(table.failed), "remarks" if table.failed else "pass"

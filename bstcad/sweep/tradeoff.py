@@ -2,7 +2,7 @@
 
 A run is a design of the base scene with some settings changed.  One knob (setting) is varied at a time, then pairs.
 The budget limits the sum of the times of all runs by this version of bstcad in a folder, on any machine.  A run that is
-predicted to exceed the budget is not started; a run that exceeds the budget by the fraction MAX_OVERRUN is stopped.
+predicted to exceed the budget is not started, and a run that exceeds it by MAX_OVERRUN is stopped; the first never is.
 
 The folder contains the base scene (scene/), the record of each run (runs/), and the results (results.py).  A run with a
 record is not repeated, so an interrupted sweep continues, and a larger budget adds runs.
@@ -176,8 +176,8 @@ def _joint_points(*varied: tuple[str, Any, Sequence[float]]) -> Points:
 def run_order(scene: Scene, knobs: Sequence[Knob]) -> list[Settings]:
     """Return all runs, the most important first, so that any budget gives the most useful runs.
 
-    First come the presets draft and standard and the base, then neighbours of the base with other seeds and the preset
-    fine, then further points, and last the procedure of the paper.
+    First come the presets draft and standard and the base, then neighbours of the base, fast runs with another seed
+    and the preset fine, then further points, and last the preset paper.
     """
     presets = knobs[0].points
     single = [knob for knob in knobs[1:] if not knob.combines]
@@ -262,7 +262,7 @@ def tradeoff(
         except BaseException as error:
             if count := len(sweep.runs):
                 runs = "1 run is" if count == 1 else f"{count} runs are"
-                error.add_note(f"{runs} stored in {folder}; the same command continues from there")
+                error.add_note(f"{runs} stored in {folder}, so the work is kept; the same command continues from there")
                 if isinstance(error, KeyboardInterrupt):  # after Ctrl-C there is still time to draw a figure
                     results.write_page(sweep.table(), base, folder)
             raise

@@ -61,7 +61,7 @@ def test_a_run_that_ends_with_the_server_is_said_as_it_is(tmp_path, monkeypatch)
     run = Run(tmp_path / "small")
     run.folder.mkdir()
     State("stopped", sentence="nothing is kept").put(run.folder)
-    assert "the design is stopped; nothing is kept" in run.final_sentence
+    assert "the design run is stopped; nothing is kept" in run.final_sentence
     State("running", process=os.getpid()).put(run.folder)
     monkeypatch.setattr(Run, "_is_own_process", lambda self, process: True)
     [said] = design_runs.endings([run])

@@ -65,7 +65,7 @@ def test_the_design_ends_the_same_to_the_last_bit(open_page, tmp_path, undisturb
             page.wait_for_selector("#offline:visible")
         elif blow == "Ctrl-C":
             said = own.end(signal.SIGINT)
-            assert "the design is stopped; the design so far is kept" in said or "is stopping and" in said
+            assert "the design run is stopped; the work so far is kept" in said or "is stopping;" in said
             wait_for(lambda: run.state.state == "stopped")
         elif blow == "design killed":
             os.kill(run.state.process, signal.SIGKILL)

@@ -174,7 +174,7 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(small_scene, tmp_path, monk
     generate = functools.partial(commands.generate, small_scene, folder, device="cpu")
     with full_disk(60_000):
         generate(hooks=commands.Hooks(lambda *words: said.append(" ".join(map(str, words)))))
-    assert any("the design continues without a checkpoint" in words for words in said)
+    assert any("the design continues without a new checkpoint" in words for words in said)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["lens", "lens-unwritten"]  # which design.npz fits into
     with full_disk(500_000) as error:
         generate()

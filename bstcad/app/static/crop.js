@@ -32,7 +32,7 @@ export function show(address, { sides, given, fills }, changed) {
     part = given ?? [0, 0, 1, 1];
     if (fills) {
       const wide = Math.min(part[2] - part[0], (part[3] - part[1]) * ratio);
-      put(...middle(), wide); // as the key `fit` crops it
+      put(...middle(), wide); // the crop by fit = "crop"
     } else draw();
   };
   photo.onload = begin;
