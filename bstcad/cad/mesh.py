@@ -37,7 +37,7 @@ DEFAULT_MAX_TRIANGLES = 2_000_000  # largest number of triangles by default: 100
 MAX_TRIANGLES = 32_000_000  # largest number of triangles if a scene states a tolerance: 1.6 GB of STL
 GOAL_FRACTION = 0.95  # goal of the chordal error, as a fraction of the tolerance, because float32 rounds vertices
 CELL_MARGIN = 1.1  # ratio of estimated to allowed cells per side above which no finer mesh is tried; estimates err
-WALL_NORMAL_Z = 1e-6  # largest |z| of the unit normal of a facet of the wall
+WALL_NORMAL_Z = 1e-6  # largest |z| component of the unit normal of a facet of the wall
 MAX_FACET_SAMPLES = 100_000_000  # largest number of points at which the facets of a mesh are compared with the lens
 FACETS_PER_BLOCK = 1 << 15  # number of facets processed at a time, so that their corners stay in the cache
 
@@ -85,8 +85,8 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
 def _recessed_front(front: Recess, around: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the mesh of a front and of the plane around it: vertices, indices of the plane's outer rim, triangles.
 
-    around: vertices of the lens's rim (k, 3), below which the outer rim lies.  The grid over the front has k nodes on
-    its rim, too, and the plane's triangles join the two rims.  Indices continue those of `grid`.
+    around: vertices (k, 3) of the back's rim, below which the outer rim lies.  grid: indices of the back's nodes, which
+    the new indices continue.  The grid over the front also has k rim nodes; the plane's triangles join the two rims.
     """
     x, y = nodes(front.outline, len(grid) - 1)
     z = sag(front.optical, x, y)
@@ -226,7 +226,7 @@ def volume_and_area(mesh: Mesh) -> tuple[float, float]:
 def chordal_error(mesh: Mesh, lens: Lens) -> float:
     """Return the largest distance (mm) between the lens and the facets, at their centres and points between corners.
 
-    Since a net may bend in each knot span, edges have at least two points per span (at most MAX_FACET_SAMPLES in all).
+    Since a net may bend in each knot span, edges are sampled twice per span (MAX_FACET_SAMPLES points in all at most).
     """
     max_parts = max(1, int((MAX_FACET_SAMPLES / 2 / max(len(mesh.faces), 1)) ** 0.5))
     radius = float(lens.outline.radius) if isinstance(lens.outline, Circle) else 0.0
@@ -285,7 +285,7 @@ class FaceNumbers(NamedTuple):
 
 @njit(inline="always")
 def _basis(u, m):
-    """Return (k, B_k, B_{k+1}, B_{k+2}) at u; a copy of bspline.basis, since numba caches per file."""
+    """Return (k, B_k, B_{k+1}, B_{k+2}) at u; u, m and k as in bspline.basis, copied since numba caches per file."""
     if u < 1.5:
         k, s = 0, 2.0 - math.sqrt(4.0 - 2.0 * u)
     elif u > m - 2.5:
@@ -333,7 +333,7 @@ def _chordal_error(vertices, faces, max_parts, radius, back, front):
     """Return the largest distance (mm) of the lens from triangles, along the triangles' normals.
 
     A triangle whose unit normal has |z| <= WALL_NORMAL_Z belongs to the wall: a cylinder of the given radius, or planes
-    (radius 0).  Each edge is divided into one part per smooth part of the face, at most `max_parts`.
+    (radius 0).  Each edge is sampled in two steps per smooth part of the face, at most 2 `max_parts`.
     """
     worst = 0.0
     for k in range(len(faces)):
@@ -361,7 +361,7 @@ TRIANGLE_XML = b'<triangle v1="%d" v2="%d" v3="%d"/>\n'
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 MAX_PROBES = 4096  # largest number of occupied slots that a corner may meet in the hash table, which is half free
 STL_HEADER = b"bstcad, binary STL, lengths in mm"  # header, which must not start with "solid"
-MAX_LINE_BYTES = 90  # longest line of a 3MF model (bytes)
+MAX_LINE_BYTES = 90  # upper bound of the length of a line of a 3MF model (bytes)
 CLEAR_RGBA, MIRROR_RGBA = "#A9D3EE80", "#C9CED4FF"  # sRGB and opacity of clear material and of a mirror
 ARCHIVE_TIME = (1980, 1, 1, 0, 0, 0)  # time of the files in a 3MF package, so that equal meshes give equal bytes
 
@@ -534,7 +534,7 @@ def _glb(mesh: Mesh, lens: Lens, label: Label, off: float) -> bytes:
     across = np.cross(b - a, c - a)
     across /= np.linalg.norm(across, axis=1)[:, None]
     wall = np.abs(across[:, 2]) <= WALL_NORMAL_Z
-    if lens.front.outline is not None:  # the plane around the front meets it in an edge
+    if lens.front.outline is not None:  # the plane around the front's optical part meets that part in an edge
         wall |= across[:, 2] <= WALL_NORMAL_Z - 1
     vertices, normals = [mesh.vertices[mesh.faces[wall]].reshape(-1, 3)], [across[wall].repeat(3, axis=0)]
     faces, count = [np.arange(3 * wall.sum()).reshape(-1, 3)], 3 * wall.sum()

@@ -1,4 +1,4 @@
-"""Lenses and a body as one part: a scene's [mount], a plate with an array of lenses, the block of an insert.
+"""Lenses and a body as one part: a scene's [mount], a plate with an array of lenses, or the block of a mould insert.
 
 The body is any cadquery solid.  First, a prism over the lens's rim is cut out, which is quick, since it has no net.
 Then the walls of this opening are replaced by walls between the faces of the body and of the lens, with shared edges.
@@ -49,7 +49,7 @@ class PlacedLens:
     trim: cadquery.Wire | None = None  # rim in the lens's frame; None: the lens's outline
     holes: Sequence = ()  # holes through the lens: wires, or (x, y, diameter) in mm
     at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # origin of the lens's frame in the body's frame (mm)
-    draft: Draft = NO_DRAFT  # draft of the walls below the body
+    draft: Draft = NO_DRAFT  # draft of the lens's walls below the body
 
 
 def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[PlacedLens]) -> NamedSolid:
@@ -220,13 +220,13 @@ def check_fit(lens: Lens, rim: Sequence[LoopPiece], planes: tuple[float, float],
         if cuts and not (flat and face == "front"):
             raise ValueError(
                 f"{name}: the flange's {side} face, z = {z:g} mm, cuts the rim of the {face}, which runs from z = "
-                f"{heights.min():.4g} to {heights.max():.4g} mm; move it below or above this range"
+                f"{heights.min():.4g} to {heights.max():.4g} mm in the lens's frame; move it below or above this range"
                 + (", or into the plane of a plane front" if face == "front" else "")
             )
     if (np.minimum(upper, high) - np.maximum(lower, low)).min() < MIN_WALL:
         raise ValueError(
             f"{name}: the flange, from z = {lower:g} to {upper:g} mm, misses the lens's wall, from z = {low.max():.4g} "
-            f"to {high.min():.4g} mm; move the flange to this height"
+            f"to {high.min():.4g} mm in the lens's frame; move the flange to this height"
         )
     return bool(upper > high.max()), None if flat else bool(lower < low.min())
 

@@ -33,7 +33,7 @@ from bstcad.scene.mount import parting
 if TYPE_CHECKING:
     import cadquery
 
-EXTRA_POINTS = 4  # number of control points beyond the rim at each end: two spans, and two until x(u) is linear
+EXTRA_POINTS = 4  # number of control points beyond the rim at each end: two where x(u) is not linear, and two more
 RIM_POINTS_PER_CELL = 8  # number of points on each piece of a rim per control point along the back's longer side
 IMAGE_TOLERANCE = 1e-12  # relative deviation below which an edge's image in (u, v) is written as a line or circle
 IMAGE_SAMPLES = 65  # number of points of an image that are compared with a line and a circle
@@ -47,7 +47,7 @@ class NamedSolid(NamedTuple):
     """A solid and the names of its faces, in the order of solid.Faces()."""
 
     solid: cadquery.Solid
-    faces: tuple[str, ...]  # "back", "front", "underside", "rim", "bevel", "hole" or "flange"
+    faces: tuple[str, ...]  # "back", "front", "underside" (plane around it), "rim", "bevel", "hole" or "flange"
 
 
 def lens_solid(

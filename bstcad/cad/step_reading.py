@@ -42,7 +42,7 @@ from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, sag
 from bstcad.step_text.placement import Placement, identity, own_frame
 
 GRID_TOLERANCE = 1e-9  # largest deviation (mm) of a net from a uniform grid in x and y, or from the net of a conic
-AXIAL_TOLERANCE = 1e-9  # largest offset (mm) of a surface from the axis, and largest 1 - cosine of its angle
+AXIAL_TOLERANCE = 1e-9  # largest offset (mm) of a surface from the axis, and largest 1 - cosine of its angle to it
 CIRCLE_TOLERANCE = 1e-6  # largest deviation (mm) of an edge from its circle or rectangle
 LEVEL_TOLERANCE = 1e-7  # largest distance (mm) of the plane around a front from the front's edge
 APERTURE_DECIMALS = 9  # decimals of a clear aperture (mm); further ones are rounding errors of the coordinates
@@ -226,7 +226,7 @@ def _is_patch(surface: BRepAdaptor_Surface) -> bool:
 
 
 def freeform_surface(face: TopoDS_Face) -> BSplineSurface:
-    """Return the surface of a face, heights from its vertex; ValueError unless its net is as bstcad writes nets."""
+    """Return the surface of a face with heights from its vertex; ValueError unless its net is as bstcad writes nets."""
     surface = BRepAdaptor_Surface(face)
     return _uniform_net(surface, patches.net_of(surface.BSpline())).from_vertex()
 

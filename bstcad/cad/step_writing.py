@@ -72,7 +72,7 @@ if TYPE_CHECKING:
 
 SCHEMAS = {"AP242": "AP242DIS", "AP214": "AP214IS"}  # schema -> its name in OCC
 NO_FACTS = Part()
-TIME_VARIABLE = "SOURCE_DATE_EPOCH"  # environment variable: the file's time (s since 1970), for equal bytes
+TIME_VARIABLE = "SOURCE_DATE_EPOCH"  # environment variable that sets the file's time (s since 1970), for equal bytes
 MILLI, METRE = StepBasic_SiPrefix.StepBasic_spMilli, StepBasic_SiUnitName.StepBasic_sunMetre
 DENSITY_EXPONENT = -3.0  # exponent of the length in a density
 
@@ -116,7 +116,7 @@ def encode(
     faces: names of all faces, in the order of shape.Faces(); (): no names.
     properties: area, volume and centroid, with which a reader of the file can check the shape.
     """
-    writer = STEPCAFControl_Writer()  # OCC's variables exist only once a writer does
+    writer = STEPCAFControl_Writer()  # OCC's process-wide variables exist only after a writer is made
     with _settings(schema=SCHEMAS[part.schema]), quiet_occ():
         shape, nets = step_nets.with_placeholders(getattr(shape, "wrapped", shape))
         document = _document(shape, part, faces)
@@ -153,7 +153,7 @@ def _settings(schema: str) -> Iterator[None]:
 
 
 def part21_string(name: str) -> str:
-    r"""Encode text for Part 21: any character outside ASCII, and the backslash, becomes \X2\ UTF-16 in hex \X0\."""
+    r"""Encode text for Part 21: backslashes and all except printable ASCII become \X2\ UTF-16 in hex \X0\."""
 
     def escape(c: str) -> str:
         return c if " " <= c <= "~" and c != "\\" else "\\X2\\" + c.encode("utf-16-be").hex().upper() + "\\X0\\"

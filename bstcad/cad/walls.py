@@ -2,11 +2,11 @@
 
 An upright wall is a plane, a cylinder or the extrusion of a cubic.  A wall with draft, or a bevel, is a plane, a cone
 or a ruled surface.  Each edge is built once for the two faces that meet in it.  In space and in the parameter planes,
-an edge has the parameter of its piece of the rim: the length on a level line, a net's parameter on its boundary.
+an edge has the parameter of its piece of the rim: length on a level line, angle on an arc, a net's own on its boundary.
 
 Walls with draft begin on a parting line, the rim at one height, and lean inwards down to the front.  If the rim shrinks
-by an offset o, its point p moves to p + o m with the inward normal m; on a straight side m is linear between the mitres
-at the two corners.  Of the front, only height and slope are needed.
+by an offset o, its point p moves to p + o m, where m is the inward normal; on a straight side m is linear between the
+mitres at the two corners.  Of the front, only height and slope are needed.
 """
 
 from __future__ import annotations
@@ -313,7 +313,7 @@ class LeaningPiece:
     draft: Draft
 
     def inwards(self, t: np.ndarray) -> np.ndarray:
-        """Return the shift of a point of the rim per unit offset inwards, (n, 2)."""
+        """Return the shift m (n, 2) of the rim's points at t (n,) per unit offset inwards."""
         if not self.piece.straight:
             return self.piece.left(t)
         start, end = self.mitres

@@ -37,7 +37,7 @@ MAX_COMPARED_PIXELS = 128  # largest number of pixels along the longer side of t
 OWN_EFFORT = Effort(accuracy=0.0, witness=False)  # effort of bstcad's picture: all rays, no second one by flux tubes
 OWN_SEED_OFFSET = 500_009  # difference between the seeds of bstcad's and the judge's rays
 AGREEMENT_FACTOR = 1.5  # largest ratio of the difference of pictures to its noise, for many pixels
-MIN_NOISE = 1e-9  # lower bound of the noise, relative to the target
+MIN_NOISE = 1e-9  # lower bound of the noise, relative to the target's RMS
 FLUX_TOLERANCE = 0.005  # largest difference of the light on the target, as a fraction of the source's light
 
 
@@ -210,7 +210,7 @@ def _scale_to(picture: np.ndarray, total: float) -> np.ndarray:
 
 
 def coarse_screen(screen: Screen) -> Screen:
-    """Return the screen with nearly square pixels, along the longer side at most as many as now or MAX_COMPARED_PIXELS.
+    """Return the screen with nearly square pixels, no more than now and MAX_COMPARED_PIXELS along the longer side.
 
     Of the numbers above half this limit, the one with the most nearly square pixels is chosen, the largest of equals.
     """

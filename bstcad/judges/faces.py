@@ -24,7 +24,7 @@ from bstcad.optics.unfolding import per_radian
 
 PARAMETER_STEPS = 6  # steps of Newton's method for a parameter; the first guess has an error of at most half a span
 GRID_CELLS = 512  # number of cells per side of the grid over a face without knots
-PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # ring radius / rim radius; slim triangles would leak light
+PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # ring radii / rim radius; slim triangles leak light
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class FaceError:
 class Traced:
     """A judge's picture of the light on a screen."""
 
-    halves: np.ndarray = field(repr=False)  # flux per pixel, (2, rows, columns), row 0 = y max; each half: full flux
+    halves: np.ndarray = field(repr=False)  # flux per pixel, (2, rows, columns), row 0 = y max; full flux in each half
     rays: int  # total number of rays
     error: FaceError  # largest error of the judge's faces
     by: str = ""  # variant of the program, if it has several

@@ -6,7 +6,7 @@ the scene requests none.  Mirrors are lossless.  With a library of LLVM 16 or la
 
 The wall of the lens and a plate around its front stop the light that bstcad counts as lost: through the sides, and past
 the lens.  A parallel beam starts from a plate of the aperture's shape with normals along the beam; a cone of uniform
-radiant intensity is a spot; any other point source is a projector, whose slide is its irradiance over the lens.
+radiant intensity is a spot; any other point source is a projector, whose slide is its irradiance on a plane.
 """
 
 from __future__ import annotations

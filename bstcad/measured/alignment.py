@@ -40,7 +40,7 @@ SCALE_PATCHES = 16  # assumed number of patches with independent form errors tha
 MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty from form errors, in half widths, above which a motion is not determined
 MIN_SENSITIVITY = 1e-7  # smallest change of distance per motion (mm per mm); smaller values are rounding errors
 RIM_MARGIN = 2e-3  # width, in half widths, of the rim that is ignored: points there may lie on the edge
-FACE_DISTANCE_FRACTION = 0.25  # largest distance of a point of the face, as a fraction of the minimum thickness
+FACE_DISTANCE_FRACTION = 0.25  # largest distance of a point from the face, along z, in minimum thicknesses of the lens
 MOTION_NAMES = ("shift in x", "shift in y", "shift in z", "rotation about x", "rotation about y", "rotation about z")
 
 
@@ -72,7 +72,7 @@ class BackFace:
         return self.lens.outline.contains(*torch.from_numpy(points[:, :2].T * (1 + RIM_MARGIN))).numpy()
 
     def distance(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the signed distances (n,) in mm, positive outside the glass, and the normals (n, 3) at their feet."""
+        """Return signed distances (n,), mm, positive outside the glass, and normals (n, 3) at the nearest points."""
         foot = points[:, :2]
         for _ in range(FOOT_ITERATIONS):
             z, z_x, z_y = sampled(self.lens.back, *foot.T)
@@ -125,7 +125,7 @@ def identity_pose(face: BackFace, shift: np.ndarray | None = None) -> Pose:
 class Alignment:
     """A cloud aligned with the face."""
 
-    pose: Pose  # pose of the part in the cloud, which is removed
+    pose: Pose  # pose of the part in the frame of the cloud
     points: np.ndarray = field(repr=False)  # points of the face (n, 3), mm, in the frame of the design
     distances: np.ndarray = field(repr=False)  # signed distances along the normal (n,), mm
     normals: np.ndarray = field(repr=False)  # unit normals of the face at the points (n, 3)
@@ -159,7 +159,7 @@ def align(face: BackFace, cloud: np.ndarray, start: Pose) -> Alignment:
         if judged[chosen].all():
             break
         isolated, noise = find_outliers(points, face.distance(points)[0], ~judged[chosen], noise)
-        if isolated.any():  # without them the alignment changes
+        if isolated.any():  # the alignment changes without them, so that all points are judged again
             judged[:], noise = False, None
         else:
             judged[chosen] = True
@@ -187,7 +187,7 @@ def _least_squares(face: BackFace, cloud: np.ndarray, pose: Pose) -> Pose:
 def gauss_newton_step(
     face: BackFace, points: np.ndarray, distances: np.ndarray, normals: np.ndarray, weight: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a Gauss-Newton step (6,) to zero distances, and orthonormal motions (6, k) that the points determine."""
+    """Return a Gauss-Newton step (6,) and orthonormal motions (6, k) that the points, with weights (n,), determine."""
     columns = face.columns(points, normals)
     weight = np.full(len(points), 1 / len(points)) if weight is None else weight / weight.sum()
     weighted = columns * weight[:, None]
@@ -212,7 +212,7 @@ def _face_points(face: BackFace, cloud: np.ndarray, pose: Pose) -> tuple[np.ndar
 
 
 def _undetermined(motions: np.ndarray) -> tuple[str, ...]:
-    """Return the names of the motions that `motions` (6, k) do not contain; a combined motion is one entry."""
+    """Return the names of the motions that `motions` (6, k) do not span; a combined motion is one entry."""
     size, directions = np.linalg.eigh(np.eye(len(MOTION_NAMES)) - motions @ motions.T)
     return tuple(
         " with ".join(name for name, part in zip(MOTION_NAMES, direction, strict=True) if abs(part) > 0.3)
@@ -237,8 +237,8 @@ def scale(face: BackFace, alignment: Alignment) -> tuple[float, float]:
 # --- outliers ---------------------------------------------------------------------------------------------------------
 
 NEIGHBOURS = 24  # number of nearest points with which each point is compared
-MIN_CLUSTER = 8  # number of neighbours within 50 % of a point's distance, from which on the point is form
-OUTLIER_THRESHOLD = 6.0  # minimum deviation of an outlier, in standard deviations of all points and of its neighbours
+MIN_CLUSTER = 8  # number of neighbours within 50 % of a point's distance that make the point form, not an outlier
+OUTLIER_THRESHOLD = 6.0  # minimum deviation of an outlier, in standard deviations of neighbours or, if larger, of all
 MAD_TO_SIGMA = 1.4826  # ratio of standard deviation to median absolute deviation (MAD) of a normal distribution
 CAUCHY_SCALE = 2.0  # residual, in standard deviations, at which a neighbour's weight is one half
 REWEIGHTING_ROUNDS = 3  # iterations of the neighbours' weights
@@ -271,7 +271,7 @@ def _neighbour_planes(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compare the points with indices `part` with the planes through their neighbours, fitted with Cauchy weights.
 
-    Return the distance of each point from its plane, its neighbours' spread (mm), and how many of them are equally far.
+    Return the distance of each point from its plane, its neighbours' spread (mm), and how many are about as far off.
     """
     positions = tree.data[part]
     _, near = tree.query(positions, NEIGHBOURS + 1)

@@ -16,7 +16,7 @@ from bstcad.runs import files
 MAX_CLOUD_SIZE = 1_000_000_000  # largest size of a file (bytes)
 MIN_CLOUD_POINTS = 100  # minimum number of points, to which six degrees of freedom and a form are fitted
 MESH_SUFFIXES = (".ply", ".stl")
-UNIT_SIZES = {"inches": 1 / INCH, "metres": 1e-3, "micrometres": 1e3}  # 1 mm in each unit
+UNIT_SIZES = {"inches": 1 / INCH, "metres": 1e-3, "micrometres": 1e3}  # number of units in 1 mm
 PLAUSIBLE_RATIOS = (0.3, 1.7)  # limits of the ratio of extents, cloud to lens; for mm, the upper limit is 5 times this
 
 
@@ -29,7 +29,7 @@ class Cloud:
     path: Path
     sha256: str = ""  # hash of the file
     without_data: int = 0  # number of points of the file that lack a coordinate and are left out
-    columns: str = ""  # names of the columns that were read, if others state x, y or z, too, or for a Zygo file
+    columns: str = ""  # names of the columns that were read, for a Zygo file or if others also state x, y or z; else ""
 
 
 def load(path: Path, outline: Outline) -> Cloud:

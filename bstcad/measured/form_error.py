@@ -30,10 +30,10 @@ POLYNOMIAL_DEGREE = 2  # degree of the polynomial in x and y
 NET_MARGIN = 0.2  # margin of the field's net beyond the lens's, relative to its side; cosines end with zero slope
 POINTS_PER_NET_CELL = 6.0  # mean number of points in a cell of the net
 FIELD_NET_LIMITS = (9, 513)  # minimum and maximum number of control points per side
-MAX_REFINEMENT = 4  # refinement per side of a lens's net to which a finer field is added; the two nets are not nested
+MAX_REFINEMENT = 4  # refinement per side of a lens's net before a finer field is added; the two nets are not nested
 BANDS_PER_OCTAVE = 4  # number of bands of the spectrum per octave of frequency
 SPECTRUM_ROUNDS = 8  # number of alternating estimates of field and spectrum
-FIRST_MOTION_ROUND = 3  # round from which the spectrum is good enough to weight the motions
+FIRST_MOTION_ROUND = 3  # round, from 0, in which the motion is fitted; the spectrum is then good enough to weight it
 MAX_FIELD_STEPS, FIELD_TOLERANCE = 30, 1e-4  # maximum steps of conjugate gradients, and their relative tolerance
 DETECTION_SIGMAS = 3.0  # excess over noise, in standard deviations, at which a band of frequencies contains form
 UNDETECTED_VARIANCE = 1e-4  # variance of the form in a band without detected form, relative to the noise
@@ -52,7 +52,7 @@ class FormError:
     random_field: BSplineSurface = field(repr=False)
     spread: np.ndarray = field(repr=False)  # standard deviations (m, m) of the field's cosine amplitudes, mm
     noise: float  # RMS noise of the points, mm
-    motion: np.ndarray  # motion (6,) of fine relief from the alignment, which form errors bias; see BackFace.columns
+    motion: np.ndarray  # motion (6,) of fine relief beyond the alignment, which form errors bias; see BackFace.columns
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return δz (mm) at (x, y) in mm, relative to the alignment by least squares."""
@@ -125,7 +125,7 @@ def _field(
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
     """Return the field's heights (m, m), standard deviations (m, m) of its amplitudes, the noise (mm) and motion (k,).
 
-    rows: basis functions (n, m²).  motions: changes (n, k) of the deviations `off` due to motions, less polynomials.
+    rows: basis functions (n, m²); off: deviations (n,), mm; motions: their changes (n, k) per mm; less polynomials.
     Generalised least squares gives the motion: the fit to `off` leaves σ² V⁻¹ off, V the covariance of field + noise.
     """
     (m, _), n = net.shape, len(off)  # the net is square
@@ -148,7 +148,7 @@ def _field(
         aligned_off = off - motions @ motion
         amplitude = posterior(aligned_off, amplitude)
         residual = aligned_off - rows @ _heights(amplitude)
-        shrunk = 1 + noise2 / (per_mode * variance)  # ratio of the true amplitude to its posterior mean
+        shrunk = 1 + noise2 / (per_mode * variance)  # ratio of the least-squares amplitude to its posterior mean
         energy = np.bincount(band.ravel(), ((shrunk * amplitude) ** 2 * per_mode / noise2).ravel(), bands) / modes
         energies = energy if energies is None else (energies + energy) / 2
         free = max(n - float((1 / shrunk).sum()), 0.05 * n)
@@ -170,10 +170,10 @@ def _motion_by_relief(
 
 
 def _variances(energy: np.ndarray, modes: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Estimate the variance of the form in each band from its energy relative to the noise; modes: cosines per band.
+    """Return the variance (mm²) of the form per band; energy: relative to the variance `noise`; modes: cosines in each.
 
-    Bands below the noise continue the last bands above the noise with a power law of the frequency, which polished and
-    turned faces follow, but stay below the limit of detection.
+    Bands beyond the last detected one continue the last detected ones with a power law of the frequency, which polished
+    and turned faces follow, but stay below the limit of detection.
     """
     least = DETECTION_SIGMAS * np.sqrt(2 / modes)
     detected = energy > 1 + least
@@ -198,7 +198,7 @@ def _posterior_mean(
     """Return the posterior mean (m, m) of the amplitudes c, by conjugate gradients.
 
     (1 + sqrt(S) Cᵀ G C sqrt(S) / σ²) c / sqrt(S) = sqrt(S) Cᵀ b / σ² is solved for c / sqrt(S), preconditioned
-    with the square root of the matrix's diagonal for evenly spaced points.  C: inverse cosine transform; b: right side.
+    with the root of the diagonal for evenly spaced points.  C: inverse cosine transform; G: `gram`; b: `right_side`.
     """
     m, even = len(variance), 1 + variance * per_mode / noise2
     root = np.sqrt(variance / even)
@@ -225,7 +225,7 @@ def _basis_rows(u: np.ndarray, v: np.ndarray, m: int) -> scipy.sparse.csr_array:
 
 
 def _gram_symbol(m: int) -> np.ndarray:
-    """Return the symbol of the Gram matrix of quadratic B-splines: (66 + 52 cos ω + 2 cos 2ω) / 120."""
+    """Return the symbol (66 + 52 cos ω + 2 cos 2ω) / 120 of quadratic B-splines' Gram matrix, ω = π k / m, k < m."""
     w = np.pi * np.arange(m) / m
     return (66 + 52 * np.cos(w) + 2 * np.cos(2 * w)) / 120
 
@@ -251,7 +251,7 @@ SHORTEST_PERIOD = 2.0  # shortest period of a form error, in pitches of the fiel
 class Band:
     """Part of a form error in a band of periods."""
 
-    period: tuple[float, float] | None  # longest and shortest period, mm; None: the polynomial
+    period: tuple[float, float] | None  # longest and shortest period, mm; None: polynomial and motion
     rms: float  # RMS height, mm
     slope_rms: float  # RMS slope, rad
 
@@ -348,7 +348,7 @@ def zernike(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 # --- the minimum zone -------------------------------------------------------------------------------------------------
 
 ZONE_TOLERANCE = 1e-3  # distance by which points may lie outside the minimum zone, relative to its half width
-ZONE_CHUNK = 400  # number of points in the first linear program, and added in each round
+ZONE_CHUNK = 400  # largest number of points in the first linear program, and added in each round
 MAX_ZONE_ROUNDS = 30  # maximum number of linear programs
 
 

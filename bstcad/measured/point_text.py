@@ -54,7 +54,7 @@ class MeasuredPoints:
 
     positions: np.ndarray  # positions of the points (n, 3), mm, or in an unknown unit if the file states none
     without_data: int = 0  # number of points that lack a coordinate and were left out
-    columns: str = ""  # names of the columns that were read, if others state x, y or z, too, or for a Zygo file
+    columns: str = ""  # names of the columns that were read, for a Zygo file or if others also state x, y or z; else ""
 
 
 def make_points(positions: np.ndarray, where: Sequence[int] | None = None, columns: str = "") -> MeasuredPoints:
@@ -76,7 +76,7 @@ def read_text(data: bytes) -> MeasuredPoints:
     every = [(number, line.strip(" ")) for number, line in enumerate(decode_text(data).splitlines(), 1) if line.strip()]
     if every and re.match(r"zygo\b.*\bdata file", every[0][1], re.IGNORECASE):
         return _read_zygo(every)
-    if every and (named := re.fullmatch(r"sep=(.)", every[0][1].strip())):  # Excel states its separator so
+    if every and (named := re.fullmatch(r"sep=(.)", every[0][1].strip())):  # Excel's line
         every = every[1:]
     forced = named[1] if every and named else ""
     heading = _heading([line for _, line in every[:HEADING_LINES]])

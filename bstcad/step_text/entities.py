@@ -15,14 +15,14 @@ import numpy as np
 
 from bstcad.runs.files import one_line
 
-MAX_COORDINATE = 1e12  # largest coordinate of a point, in the file's unit; a target may be 1e8 mm away
+MAX_COORDINATE = 1e12  # largest coordinate of a point, in the file's unit; coordinates of a scene are at most 1e8 mm
 MAX_NUMBER_LENGTH = 64  # largest number of characters of a number; a double has 17 digits, a sign and an exponent
 
 ENTITY = r"[1-9]\d{0,17}"  # pattern of an entity's number, which fits into 64 bits
 REAL = r"[-+]?\d+\.\d*(?:E[-+]?\d+)?"
 COORDINATE = rf"[-+]?\d{{1,{MAX_NUMBER_LENGTH}}}+\.\d{{0,{MAX_NUMBER_LENGTH}}}+(?:E[-+]?\d{{1,4}}+)?"
 BLANKS = bytes(code for code in range(256) if chr(code).isspace())
-STRING = re.compile(  # text, which may contain empty strings, then a string or comment: few calls of `numbered`
+STRING = re.compile(  # text, which may contain empty strings, then a string or comment, for few calls of `numbered`
     r"((?:[^'/]++|''(?!')|/(?!\*))*+)('[^']*(?:''[^']*)*'|/\*.*?(?:\*/|\Z)|'|\Z)", re.DOTALL
 )
 POINT_TEXT = re.compile(rf"(?<=;)#({ENTITY})=CARTESIAN_POINT\('\d*',\(({COORDINATE},{COORDINATE},{COORDINATE})\)\);")
@@ -34,7 +34,7 @@ STATEMENT = re.compile(rf"#({ENTITY})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
 TOKENS = re.compile(  # tokens without blanks: separators, references, numbers, strings, enumerations, keywords
     r"[(),;]++|(?:#\d{1,20}+,)++|#\d{1,20}+(?=[)=])=?|'\d*+'|\.[A-Z_0-9]++\.|[$*](?=[,)])|!?[A-Z_][A-Z_0-9]{0,99}+(?=\()"
     r"|[-+]?\d{1,99}+(?:\.\d{0,99}+(?:[Ee][-+]?\d{1,9}+)?)?(?=[,)])|\"[0-9A-F]*+\""
-)  # a token is of bounded length, or begins with a character that it cannot contain, so that matching takes linear time
+)  # matching takes linear time: the length of a token is bounded, or its first character cannot occur in the rest of it
 LONG_NUMBER = re.compile(rf"(?<=[(,])[-+.\d][-+.\dEe]{{{MAX_NUMBER_LENGTH},}}")
 HUGE_NUMBER = re.compile(r"(?<=[(,])[-+]?\d++\.\d*+[Ee]\+?\d{3,}+")  # number whose exponent has three digits or more
 

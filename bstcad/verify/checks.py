@@ -49,13 +49,13 @@ CLEAR_APERTURE_TOLERANCE = 1e-3  # largest distance (mm) between the rims of mea
 MIN_MOUNT_LOSS = 1e-3  # fraction of the light that a mount must cut away to be given as the reason for a failure
 MAX_FLANGE_LIGHT = 1e-3  # largest fraction of the light through the clear apertures that may meet the flange
 WAVEFRONT = "wavefront error, RMS in waves, piston and tilt removed"
-DRAFT_ACCURACY = 0.01  # relative standard error of the RRMSD of a draft at which ray tracing ends
+DRAFT_ACCURACY = 0.01  # relative standard error of the RRMSD at which ray tracing ends, for draft quality
 MAX_FLOOR = 0.1  # largest ratio of the wavefront error's rounding error to accept.wavefront, for a certain verdict
 TIME_LIMIT, TIME_LIMIT_PER_MB = 120.0, 3.0  # timeout of OCC (s) and its increase per MB, 100 times the usual time
 
 R = TypeVar("R")
 Lines = tuple[SpectralLine, ...]  # pictures of the lines of a spectrum on one target
-OnLight = Callable[[Light, Lines, int], None]  # function that is called with the light on a target, and its index
+OnLight = Callable[[Light, Lines, int], None]  # function of the light on a target, its Lines, and its index
 FINE_GRID = ", on a grid four times finer than the net"  # suffix of the names of checks on such a grid
 
 
@@ -136,11 +136,11 @@ def verify(
     on_light: OnLight = lambda light, lines, number: None,
     effort: Effort | None = None,
 ) -> Proof:
-    """Check lens.step and lens.stl in `folder` against the design; ValueError if one of the two cannot be read.
+    """Check lens.step, lens.stl and, if the scene has a mount, part.step in `folder` against the design.
 
-    submit: with bstcad.runs.processes.submit, a second process reads the STEP file by OCC, while this one reads the
-    file's text and the mesh.  on_lens: called with the lens of the STEP file once it has been read.  on_light: called
-    for each target with the light there, the lines of a spectrum, and the target's index.
+    Raises ValueError if lens.step or lens.stl cannot be read or a target receives no light.  submit: with
+    bstcad.runs.processes.submit, OCC reads the STEP file in a second process, while this one reads text and mesh.
+    on_lens: called with the re-read lens.  on_light: called for each target, as OnLight states.
     """
     effort = nominal.effort(effort)
     effort = replace(effort, seed=effort.seed + VERIFY_SEED, seconds=effort.seconds / len(nominal.goals))
@@ -198,7 +198,7 @@ def _check_solids(path: Path, nominal: Nominal, part: Part, points: int, submit:
 
 
 def _read_text(path: Path, read: Future[Lens]) -> StepText:
-    """Read the text of lens.step, whose errors are more precise than OCC's.  read: OCC's job, which an error ends."""
+    """Read the text of lens.step, with more precise errors than OCC's.  read: job of OCC, which an error ends."""
     try:
         return part21.read_lens(path)
     except ValueError:
@@ -229,7 +229,7 @@ def _with_design_facts(lens: Lens, designed: Lens) -> Lens:
 def _mounted_lens(read: Future[Lens], bare: Lens, nominal: Nominal, path: Path) -> tuple[Lens, list[Check], str]:
     """Return the lens of part.step, checks of its clear apertures and lost light, and the loss in words, "" if small.
 
-    bare: lens of lens.step, returned with the designed apertures if the part cannot be read, which checks report.
+    bare: lens of lens.step, returned with the designed apertures if the part cannot be read, which a check reports.
     """
     designed, mount = nominal.lens, nominal.scene.mount
     flange = None if mount is None else mount.flange
@@ -310,7 +310,7 @@ def time_limit(path: Path) -> float:
 def _ripple_checks(shape: Mapping[str, float | None]) -> list[Check]:
     """State the RMS slope of the ripple of each tailored face: a checkerboard in its net.
 
-    There is no limit: the RRMSD judges the effect on the light, and the bounds of the scene the effect on a tool.
+    There is no limit: the RRMSD contains the effect on the light, and bounds of the scene limit the effect on a tool.
     """
     slopes = {"": shape["ripple_slope"], " of the front": shape.get("front_ripple_slope")}
     measured = "RMS slope of the checkerboard in the net"
@@ -390,7 +390,7 @@ def _mesh_checks(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal)
     enclosed, area = meshes.volume_and_area(mesh)
     off, error = abs(enclosed / volume - 1), meshes.chordal_error(mesh, lens)
     off_faces, rounding = meshes.vertex_error(mesh, lens), VERTEX_ROUNDING * size
-    smallest = error * len(mesh.faces) / meshes.MAX_TRIANGLES  # the error is inversely proportional to their number
+    smallest = error * len(mesh.faces) / meshes.MAX_TRIANGLES  # the error is proportional to 1 / triangles
     where = (
         f"a mesh cannot have more than {meshes.MAX_TRIANGLES} triangles, whose error is about {smallest:.1g} mm; "
         "set output.mesh_tolerance to more than that"
@@ -414,8 +414,8 @@ def _light_checks(light: Light, accept: Accept, optic: str = "lens", of: str = "
     on_target = f"light on the target, as a fraction of the light that meets the {optic}{of}"
     aimed = f"efficiency: light on the target, as a fraction of all light behind the last face{of}"
     rrmsd = f"RRMSD of the light, traced through the STEP file{of}"
-    # the figure is resolved if the noise is below the RRMSD; the verdict is certain if it is below the distance to the
-    # limit
+    # noise up to the RRMSD leaves the RRMSD resolved; noise up to the distance of the RRMSD from its limit leaves the
+    # verdict certain
     noise = None if accept.rrmsd is None else max(light.rrmsd, accept.rrmsd - light.rrmsd)
     checks = [
         Check.at_most(rrmsd, light.rrmsd, accept.rrmsd, where=why, id="rrmsd"),

@@ -44,7 +44,7 @@ PART_FILE = "part.step"
 
 
 def one_sentence(work: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a job so that any error of OCC becomes a ValueError in one sentence; path: the file or its folder."""
+    """Decorate a job so that any error of OCC becomes a ValueError in one sentence; its path is a file or a folder."""
 
     @functools.wraps(work)
     def checked(path: Path, *arguments: Any, **options: Any) -> Any:
@@ -79,7 +79,7 @@ def lens(path: Path, index: float, passes: Passes = LENS) -> Lens:
 def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, ...]:
     """Check the solid in the STEP file of a design; ValueError if the file has no lens.
 
-    form: tolerance of the tailored faces and of the front's vertex (mm); points: number of points per compared face.
+    form: tolerance (mm) of placement, tailored faces and front vertex; points: number of points per compared face.
     """
     reread = _read(path, _stamp(path))
     return (
