@@ -143,7 +143,7 @@ Shapes = tuple[tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]], ...]
 
 
 def _in_cell(at: Tensor, nodes: np.ndarray, step: float) -> tuple[Tensor, Shapes]:
-    """Return the cell of each coordinate `at`, and the functions there, [H or K][corner]: (value, derivative in s)."""
+    """Return the cell of each coordinate `at`, and H and K of Patches there, [H or K][corner]: (value, d/ds)."""
     place = ((at - float(nodes[0])) / step).clamp(0.0, len(nodes) - 1.0)
     cell = place.detach().nan_to_num(0.0).floor().clamp(0, len(nodes) - 2)
     s = place - cell

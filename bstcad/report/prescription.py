@@ -55,7 +55,7 @@ EXACT_FACES = (  # sentence on a freeform back, and on two freeform faces
 )
 SHEET, PART, LENS = "datasheet.pdf", "part.step", "lens.step"
 DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # mount.datum: plane z = 0
-EDGE_TOLERANCE = 1e-3  # fraction of an outline's area up to which the part outside an edge counts as zero
+EDGE_TOLERANCE = 1e-3  # largest fraction of an outline's area outside the back's edge that counts as zero
 
 Point = tuple[float, float, float]
 Measures = tuple[Point, Point, float | None]  # smallest and largest x, y, z (mm); volume (mm³), None: unknown

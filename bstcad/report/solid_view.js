@@ -2,7 +2,7 @@
 // Replaces the picture of a lens by a model that can be rotated.  The picture stays if WebGL 2 is missing, and on paper.
 // There is no animation, so a request for reduced motion needs no action.
 //
-// A page calls solidView.begin(figure, solid) once with the JSON of rendering.turnable, and update(solid) of the result
+// A page calls solidView.begin(figure, solid) once with the JSON of rendering.turnable, and update(solid) of its result
 // for each new lens.  With rays there are two framings: look("lens") is the close view, z up; look("way") is the whole
 // path of the light with its walls (the screens), to scale, y up.  The pictures on walls are data URLs, which the
 // policy of the page has to allow (img-src data:).

@@ -132,7 +132,7 @@ def rounded_up(value: float) -> str:
 
 
 def tilt_words(tilt: Sequence[float], number: Callable[[float], str] = number) -> str:
-    """Return a tilt in words: angles in degrees about x, then about y."""
+    """Return a tilt in words: angles in degrees, which `number` formats, about x, then about y."""
     turns = (f"{number(angle)} degrees about {axis}" for angle, axis in zip(tilt, "xy", strict=True) if angle)
     return ", then ".join(turns) or "none"
 
