@@ -49,7 +49,7 @@ MAX_PALETTE_COLOURS = 600  # largest number of colours that a palette of 256 sho
 
 
 def styled(draw: Callable[..., Any]) -> Callable[..., Any]:
-    """Run `draw` with STYLE, whatever the user's matplotlibrc states."""
+    """Decorate `draw` to run with STYLE, whatever the user's matplotlibrc states."""
 
     @functools.wraps(draw)
     def wrapper(*args: Any, **kwargs: Any) -> Any:

@@ -182,7 +182,7 @@ def surface_maps(lens: Lens, found: Survey, face: str = "back") -> Figure:
 
     found: extreme values of the face, which the samples of the maps may miss.  face: "back" or "front".
 
-    The best-fit plane is subtracted from the sag if the PV of the plane exceeds the PV of the residual.
+    The best-fit plane is subtracted from the sag if the PV of the plane exceeds the PV of the residual, else the mean.
     """
     x, y, sag, slope_x, slope_y = _sample(lens, getattr(lens, face))
     columns = np.stack([np.ones_like(sag), *np.meshgrid(x, y)], axis=-1)
@@ -292,7 +292,7 @@ def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
 
 @styled
 def convergence(history: Sequence[CurvePoint], stages: Sequence[StageRecord], noise: float) -> Figure:
-    """Draw the RRMSD against time (s): a curve per stage, rings after stages, a line at `noise`, the standard error."""
+    """Draw the RRMSD against time (s): a curve per stage, a ring after it, and a line at the standard error `noise`."""
     seconds, values = np.array([(point.seconds, point.rrmsd) for point in history], dtype=float).T
     ends = np.cumsum([0.0, *(stage.seconds for stage in stages)])
     after = np.isin(values, [stage.rrmsd for stage in stages if stage.rrmsd is not None])

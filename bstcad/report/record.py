@@ -382,7 +382,7 @@ def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: 
 
 
 def too_steep(found: Steepness) -> list[str]:
-    """Return the remark on light that needs a steeper face than a height z(x, y) can have; empty if negligible."""
+    """Return the remark on light that needs a face steeper than MAX_SLOPE_DEG (70°); empty if there is little of it."""
     sent = {"steep_share": found.share, "steepest_deg": found.steepest}
     return [remark.text for remark in written("remarks.txt.j2", "steep", sent=sent)]
 
@@ -516,7 +516,7 @@ def _block(value: Any) -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Report:
-    """Result of a verification, traced through the geometry read back from lens.step.
+    """Result of a verification, traced through the geometry read back from lens.step, or with a mount from part.step.
 
     Every key of report.json is an attribute, such as `rrmsd`, `checks` or `flux` (fields of Contents); `facts` are all
     of them as plain values.

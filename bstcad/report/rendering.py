@@ -86,7 +86,7 @@ def draw(path: LightPath, picture: Path | None) -> bool:
 
 
 def _run(arrays: Mapping[str, np.ndarray], picture: str, patience: float | None) -> bool:
-    """Run this file as a script that draws `arrays`; return True if it succeeded within `patience` seconds."""
+    """Run `main` in another process; return True if it succeeded within `patience` seconds (None: without a limit)."""
     with tempfile.TemporaryDirectory() as folder:
         given = Path(folder, "arrays.npz")
         np.savez(given, **arrays)

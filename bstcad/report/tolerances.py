@@ -36,7 +36,7 @@ MAX_NAMED_ERRORS = 3  # number of errors that are named per trial
 Yield = tuple[Fraction, Fraction, Fraction]  # lower bound, estimate and upper bound of the yield (95 % Wilson interval)
 Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
 Width = Annotated[float, Field(gt=0, le=1e6)]
-Spread = TypedDict("Spread", {"5 %": Size, "50 %": Size, "95 %": Size})  # percentiles of RRMSD
+Spread = TypedDict("Spread", {"5 %": Size, "50 %": Size, "95 %": Size})  # percentiles of RRMSD, or RMS in waves
 Disagreement = TypedDict("Disagreement", {"median": Size, "95 %": Size})  # relative errors of superposed pictures
 
 
@@ -104,7 +104,7 @@ class TargetStudy:
 
 @dataclass(frozen=True)
 class WavefrontStudy:
-    """Results on the wavefront, for the trials of the pictures: RMS error in waves, piston and tilt removed."""
+    """Results on the wavefront in the same trials: RMS error in waves, with piston and tilt removed."""
 
     rms: Size  # RMS error of the design
     rms_trials: Spread  # RMS error of the trials by superposed wavefronts

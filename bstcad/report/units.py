@@ -97,7 +97,7 @@ def bound(check: Check) -> str:
 
 
 def amount(value: float, unit: str, signed: bool = False) -> str:
-    """Return a tolerance or an error in a unit such as "mm RMS", "deg" or "nm", scaled to suit its size."""
+    """Return an error in its unit, such as "deg" or "nm"; "mm", "mm RMS" and "deg" are scaled to suit its size."""
     length, _, kind = unit.partition(" ")
     text = quantity(value, length) if length in ("mm", "deg") else f"{number(value)} {unit}".strip()
     text = f"{text} {kind}".strip() if length == "mm" else text
