@@ -144,7 +144,7 @@ class LeftOut:
     kind: str  # key of LEFT_OUT
     flux_change: float | None  # change of the flux on the target, as a fraction; None here and below: unknown
     rrmsd_change: float | None  # RRMSD of a lens that would be perfect without the effect
-    blur_pixels: float | None  # full width of the blur on the target (pixels)
+    blur_pixels: float | None  # diameter of the spot to which the effect spreads a point of the picture (pixels)
     detail: str = ""  # assumption of the estimate, or reason why nothing is known
     simulate_by: str = ""  # line of a scene file that simulates the effect; empty: bstcad cannot simulate it
     assumed: bool = False  # True if `detail` is an assumed example, not a known fact
