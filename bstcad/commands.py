@@ -80,7 +80,7 @@ class ProofOptions:
     drawing: Drawing | None = None  # class that draws the figures of the report; None: Pictures
     checks: Sequence[OwnCheck] = ()  # additional checks
     sections: Sequence[OwnSection] = ()  # additional sections of report.html
-    limit: float | None = None  # largest time of design and verification together (s; `write` only); None: no limit
+    limit: float | None = None  # largest time of design and verification together (s), not for `verify`; None: no limit
 
 
 # --- generate ---------------------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ BASELINES = {  # methods without limits of time, accuracy or shape: name in mess
     "adam": ("the paper's procedure", "tailoring.quality"),
     "integration": ("point-by-point integration", "tailoring.method"),
 }
-COARSEST_GRID = 64  # smallest number of cells per side of the transport problem; such a grid costs almost no time
+COARSEST_GRID = 64  # smallest default of cells per side of the transport map; such a grid costs almost no time
 VERIFICATION_POINTS = 32  # points of an extended source in a verification; the RRMSD is from random points instead
 VERIFICATION_DRAW = 1 << 12  # number of the set of these points; each further spectral line has the next number
 

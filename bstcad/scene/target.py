@@ -31,7 +31,7 @@ from bstcad.scene.schema import COORDINATES, OneOrTwo, Record, from_file, leavin
 
 MIN_PIXELS = 8  # smallest number of pixels along a side of a target
 MIN_EXTENT = 1e-3  # smallest side of a target, mm or another unit of its receiver
-WITHOUT_GAMMA = ("text", "uniform", "profile")  # keys of targets without an image file
+WITHOUT_GAMMA = ("text", "uniform", "profile")  # picture keys that allow no gamma and no crop
 MAX_TARGETS = 8  # largest number of targets of a scene
 NOTICEABLE = 0.01  # RRMSD between two readings of a picture above which a remark states the reading
 PLANE_DISTANCE = 1e-3  # mm; smallest distance between the planes of two targets
