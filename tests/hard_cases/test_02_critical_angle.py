@@ -63,7 +63,8 @@ def test_flag_and_direction(offset, dtype, holds):
     holds(f"length of the direction minus 1, {NAMES[dtype]}", error, 4 * eps(dtype))
     if after.alive[0]:
         height = float(after.direction[2].detach())  # cos θ'; its square is off by some units
-        holds(f"error of cos² θ', against 60 digits, {NAMES[dtype]}", abs(height**2 - float(truth)), 4 * eps(dtype))
+        figure = f"error of cos² θ', θ' the angle of refraction, against 60 digits, {NAMES[dtype]}"
+        holds(figure, abs(height**2 - float(truth)), 4 * eps(dtype))
     assert torch.equal(after.flux, rays.flux)
 
 
@@ -127,7 +128,7 @@ def test_the_back_face_keeps_to_the_same_rule_in_every_form(spread, holds):
         (status, plain), (other, fused) = found["plain"], found["fused"]
         assert torch.equal(status, other)
         # cos θ' > MIN_COS_REFRACTION is known to 1e-16 / MIN_COS_REFRACTION², and below that it hardly counts
-        figure = "difference between fused and plain gradient at the critical angle, float64"
+        figure = "difference between compiled and plain gradient at the critical angle, float64"
         bound = 100 * eps(plain.dtype) / MIN_COS_REFRACTION**2
         holds(figure, largest(plain - fused) / largest(plain), bound)
 

@@ -131,7 +131,7 @@ def test_our_mesh_is_closed_at_each_deflection(holds, written, tmp_path, cells):
     holds("STL: distance of vertices from the faces, relative to the size", vertices_off / size, checks.VERTEX_ROUNDING)
     deflection = meshes.chordal_error(found, written.lens)
     off = abs(meshes.volume_and_area(found)[0] / written.volume - 1)
-    of = f"of {cells} cells" if cells else "by default"
+    of = f"of {cells} cells per side" if cells else "by default"
     holds(f"STL {of}: error of the volume", off, deflection * written.area / written.volume, "of it")
     if cells is None and asked < meshes.max_cells(written.lens):
         holds("STL by default: chordal error", deflection, MESH_TOLERANCE, "mm")

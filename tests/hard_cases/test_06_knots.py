@@ -55,7 +55,7 @@ def test_the_basis_is_one_altogether(m, dtype, holds):
     holds(f"sum of the basis functions' derivatives, {NAMES[dtype]}", largest(sum(slopes)), 2 * eps(dtype))
     abscissa = sum((k + i).to(dtype) * w for i, w in enumerate(weights))
     # t is known to the unit of m, and so is what is summed
-    figure = f"x(t(x)) minus x, relative to the width of the net, {NAMES[dtype]}"
+    figure = f"x computed back from its knot parameter t(x), minus x, relative to the width of the net, {NAMES[dtype]}"
     holds(figure, largest(abscissa - u) / m, 2 * eps(dtype))
 
 

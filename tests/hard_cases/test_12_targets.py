@@ -45,8 +45,8 @@ TARGETS = {
     "a bright pixel on a dim ground": (cells((35, 20, 1.0), ground=1e-6), 1.0),
     "one bright pixel": (cells((35, 20, 1.0)), 1.0),
     "one bright corner": (cells((0, 0, 1.0)), 1.0),
-    "smallest numbers": (cells((slice(9, 40), slice(3, 50), 3e-300), ground=1e-300), 0.01),
-    "largest numbers": (cells((slice(9, 40), slice(3, 50), 1e308), ground=1e300), 0.01),
+    "irradiance of 1e-300": (cells((slice(9, 40), slice(3, 50), 3e-300), ground=1e-300), 0.01),
+    "irradiance of 1e308": (cells((slice(9, 40), slice(3, 50), 1e308), ground=1e300), 0.01),
 }
 SOURCES = {
     "disc": Density.from_function(lambda x, y: 1.0 * ((x - 0.5) ** 2 + (y - 0.5) ** 2 < 0.25), N),

@@ -99,7 +99,7 @@ def test_kill_9_at_random_moments(name, kills, tmp_path, holds):
             checkpoint.read(kept, DesignState)  # raises if it is damaged
     assert "done" in started(folder, name).communicate(timeout=300)[0] and intact(folder, digest)
     assert sorted(tmp_path.iterdir()) == [folder, whole]  # what the killed ones left has been cleared away
-    holds(f"runs killed at random ({name}, {kills}) that left a damaged folder or checkpoint", 0, 0)
+    holds(f"{kills} designs of {name}, killed at random: damaged folders or checkpoints", 0, 0)
 
 
 def intact(folder, digest):
