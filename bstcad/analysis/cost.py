@@ -72,7 +72,7 @@ def ending(history: History, stages: StageResults, since: float = 0.0) -> Conver
 def _last_points(
     seconds: np.ndarray, values: np.ndarray, ends: np.ndarray, since: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (time, values) of the last points, after `since` and within the last stage.
+    """Return (time, values) of the points in the last FITTED_FRACTION of the time after `since`, within the last stage.
 
     Each evaluation counts with the median time of its stage, so that other work of the machine has no effect.
     """
@@ -103,7 +103,7 @@ def _fit_power(time: np.ndarray, values: np.ndarray) -> tuple[float | None, floa
 RIM_RATIO = 64  # side of the target divided by the width of its rim
 EDGE_QUANTILE = 0.9  # quantile of the gradient above which a pixel is at an edge
 MIN_EDGE_GRADIENT = 0.02  # smallest gradient at an edge, per pixel, relative to the brightest pixel
-TONE_QUANTILE = 0.1  # quantile of the irradiance below which a pixel is dark; it is bright above 0.9
+TONE_QUANTILE = 0.1  # quantile of the irradiance below which a pixel is dark; bright: above 1 - TONE_QUANTILE
 
 
 def remaining(picture: np.ndarray, target: np.ndarray, per_unit: tuple[float, float]) -> dict[str, Any]:

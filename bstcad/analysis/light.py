@@ -42,7 +42,7 @@ GRID_LINES = 33  # number of grid lines in each direction in `ray_map`
 
 
 def fan(source: Emitter, lens: Lens, plane: Receiver) -> np.ndarray:
-    """Return polylines (rays, k, 3) in mm of rays in y = 0 that reach the plane, from the source via each surface."""
+    """Return polylines (rays, k, 3) in mm, from the source via each surface to the plane, of rays in y = 0."""
     half = clear_window(source, lens).width / 2
     x = torch.linspace(-0.98 * half, 0.98 * half, FAN_RAYS, dtype=torch.float64)
     return _polylines(source.rays(x, torch.zeros_like(x), lens.entrance.z, 1.0), lens, plane)[0]
@@ -68,7 +68,7 @@ def _polylines(rays: Rays, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.
 
 
 def ray_map(source: Emitter, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.ndarray]:
-    """Return a regular grid on the vertex plane of the front, and where its rays land on the plane, (k, k, 2) mm each.
+    """Return a grid on the vertex plane of the first surface, and where its rays meet `plane`, (k, k, 2) mm each.
 
     The values are NaN where there is no light, and where the ray is lost.
     """

@@ -45,7 +45,7 @@ MIN_CELL_FLUX = 1e-4  # smoothed flux of a cell / mean, below which a field need
 MIN_LIGHT_SHIFT = 1e-6  # largest shift that counts as zero (pixels)
 HALF_SHARP_WIDTH = 1.3  # measured width of a control cell's light (pixels) at which edges are half as sharp as at best
 MAX_SHARPNESS = 0.75  # fraction of the jump at an edge that the finest cells reproduce, measured
-MAX_SAMPLED_PIXELS = 1 << 19  # largest number of pixels; of larger pictures some rows are sampled
+MAX_SAMPLED_PIXELS = 1 << 19  # largest number of sampled pixels: of a larger picture only some rows are used
 PADDING = 4  # dark pixels around a picture, within which the ringing of its spline ends
 AIRY_SIGMA = 0.376  # standard deviation of the Gaussian with the FWHM of a diffraction image, in λ L / D
 
@@ -133,7 +133,7 @@ class Reference:
         return np.stack([self._over_cells(p, np.where(arrives, self.flux, 0.0)) for p in shift]), share
 
     def _over_cells(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Average values (n, n) of the light over the cells (rows, columns) of the target where it lands, weighted."""
+        """Return the smoothed, weighted mean of values (n, n) of the light that lands in each cell (rows, columns)."""
         sums = [self._landing(weight * v) for v in (values, 1.0)]
         field, known = np.zeros(sums[0].shape), np.zeros(sums[0].shape, bool)
         for sigma in FIELD_SMOOTHING:

@@ -25,7 +25,7 @@ GRID_POINTS = 1025  # points per side of the grid for thickness, and along a qua
 HEIGHT_ROUNDING = 1e-13  # rounding of the heights, relative to the largest height
 SMOOTH_RATIO = 2.0  # largest ratio of the slope energies of the two highest octaves of a net without ripple
 AT_BOUND = 0.97  # fraction of a bound above which a point counts as at the bound (the penalty begins at 0.99)
-MIN_CURVATURE, MAX_RADIUS = 1e-9, 1e9  # curvature below which a face is flat (1/mm), and its radius (mm)
+MIN_CURVATURE, MAX_RADIUS = 1e-9, 1e9  # curvature (1/mm) below which a face is flat; its radius then (mm)
 OUTLINE_ROUNDING = 1e-9  # relative rounding of the outline, so that the last points of a net that ends there are inside
 
 
@@ -220,7 +220,7 @@ def departure(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> float:
 class Extreme:
     """Extreme of a quantity over a face."""
 
-    largest: float  # largest value
+    largest: float  # largest value; for a radius, the radius of the largest curvature
     where: str  # position, as text
     at_bound: float  # fraction of the area that is at the bound; 0 without a bound
 

@@ -173,7 +173,7 @@ class _Grid:
 
 
 def _outwards(grid: _Grid, position: Tensor, reached: Tensor, plane: Receiver, law: Law) -> SurfacePoints:
-    """Integrate lines of points outwards from their starts on the middle ray, position (3, 1, lines) mm, reached."""
+    """Integrate lines of points outwards from the middle ray, with its `position` (3, 1, lines) mm and `reached`."""
     middle = grid.alive.shape[0] // 2
     points, all_reached = torch.zeros_like(grid.origin), torch.zeros_like(grid.alive)
     points[:, [middle]], all_reached[[middle]] = position, reached

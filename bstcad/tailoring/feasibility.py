@@ -31,8 +31,8 @@ from bstcad.tailoring.stage2 import with_pixels
 from bstcad.tailoring.two_faces import front_map
 from bstcad.transport.mapping import Solver
 
-TRIAL_CELLS, TRIAL_PIXELS = 64, 128  # cells per side of the coarse maps, pixels along the longer side of their pictures
-TRIAL_ITERATIONS = 100  # iterations of the coarse maps
+TRIAL_CELLS, TRIAL_PIXELS = 64, 128  # transport grid of the trial (cells per side), pixels on the pictures' longer side
+TRIAL_ITERATIONS = 100  # iterations of the trial's maps
 MAX_UNSERVED = 0.5  # largest fraction of the light whose rays may miss the back's aperture or cross each other
 REPORTED_FRACTION = 1e-3  # smallest fraction of the light with such rays that is reported
 MAX_GENTLE_DEFLECTION = 30.0  # largest deflection at the front for which the furthest picture needs no floor (degrees)

@@ -48,7 +48,7 @@ from bstcad.transport.mapping import Points, Solver, grid_coordinates, solve
 
 MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # number of rounds; all but the last: max(n / 4, 64) cells
 MAX_WAVE_ITERATIONS = 40  # largest number of iterations for the point of a wave that sends a ray to a given point
-WAVE_TOLERANCE = 1e-9  # change of this point at which the iterations have converged (mm)
+WAVE_TOLERANCE = 1e-9  # change (mm) of the point of the wave below which these iterations have converged
 SOURCE_FLOOR = 0.02  # smallest irradiance of the map's source picture, relative to its mean: black would leave holes
 # Standard deviations (pixels) of the blur of the source picture, solved in this order.  For a portrait with dark parts
 # beside bright ones, Newton's method ends at a mass error of 0.06 to 0.25 without this blur, and at 0.003 with it.
@@ -77,7 +77,7 @@ class LightBehind:
         return replace(self, position=position, direction=direction, picture=self.picture[::-1, ::-1])
 
     def positions_on(self, plane: Receiver) -> Points:
-        """Return x and y (mm) of the points where the rays cross a plane, in its frame, each (c + 1, r + 1)."""
+        """Return the coordinates x and y (mm) on a plane of the points where the rays cross it, each (c + 1, r + 1)."""
         (e_x, e_y, normal), (x, y) = _frame(plane), plane.origin
         off = np.array(plane.middle).reshape(3, 1, 1) - self.position
         off = _dot(normal, off) / _dot(normal, self.direction) * self.direction - off

@@ -390,7 +390,7 @@ def _excess_leverage(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, on_sc
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Sobolev variable of the slope fit: heights h = C^T (c · scale) C of a net (m, n), with Σ c² = mean |∇h|²."""
+    """Sobolev variable c of the slope fit: heights h = inverse cosine transform of c · scale, Σ c² = mean |∇h|²."""
 
     energy: Tensor  # slope energy of each cosine (1/mm²), (m, n), zero for the piston
     scale: Tensor  # sqrt(m n / energy), (m, n), zero for the piston

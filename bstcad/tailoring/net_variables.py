@@ -1,10 +1,10 @@
 """The variables of stage 2 for all nets of a lens: coupled for two faces and several pictures, otherwise independent.
 
 For a point source or collimated light the slopes of both faces have nearly the same effect: light from the point q of
-the front meets the back at b(q), and a slope at q moves its landing point on a plane behind the lens nearly as far as
-an equal slope at b(q).  In the heights of the two nets the merit is therefore a long narrow valley.  The direction
-along the valley separates from the one across it if the back repeats each change h(q) of the front where the light
-arrives:
+the front meets the back at b(q), and a slope at q moves the landing point of this light on a plane behind the lens
+nearly as far as an equal slope at b(q).  In the heights of the two nets the merit is therefore a long narrow valley.
+The direction along the valley separates from the one across it if the back repeats each change h(q) of the front where
+the light arrives:
 
     δz_front(q) = h(q),    δz_back(b(q)) = κ h(q),    κ = (n d_z - d_z,in) / (n d_z - d_z,out).
 

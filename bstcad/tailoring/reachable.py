@@ -6,7 +6,7 @@ there are three checks, each more expensive and only made if the previous check 
 
 1. Every lit point of the face reaches all of the lit target: then any map is feasible.
 2. Each aim is reached from the point at the same relative position in the face: rays of transport maps do not cross,
-   so that these maps are close to the affine map.
+   so that they are close to the map to equal relative positions.
 3. Coarse maps are computed, each for the part of the target that the previous map could light.  The first map is for
    the part that at least one point of the face reaches.
 """

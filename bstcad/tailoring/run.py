@@ -83,7 +83,7 @@ RRMSD_SECONDS = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
 # error of the product of two pictures of n² stratified rays varies as (p / n)³ / p, so a target of p pixels per side
 # needs (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays per side.
 STAGE_EFFORT, STAGE_EFFORT_PIXELS = Effort(rays=724, accuracy=0, witness=False), 512
-FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays if an accuracy or bounds are given, or to compare
+FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays for a scene with accuracy or bounds, or `better`
 FLUX_EFFORT = Effort(rays=128, accuracy=1.0, witness=False)  # rays for the flux on the target alone
 
 Progress = Callable[[str, int, int, str], None]  # called with stage, units done, units in total, text
@@ -115,9 +115,9 @@ class Task:
     rim_sags: tuple[float, float] = (-math.inf, math.inf)  # range of the front's sag at the rim (mm)
     progress: Progress = no_progress  # receives the progress within a step
     tidy: Callable[[], None] = lambda: None  # returns freed memory to the system between large allocations
-    sampled_sources: tuple[tuple[Channel, ...], ...] = ()  # source at each size of stage 3; (): no stage 3 follows
+    sampled_sources: tuple[tuple[Channel, ...], ...] = ()  # light of the source at its sizes in stage 3; (): no stage 3
     bounds: Bounds | None = None  # bounds on the shape of the tailored faces; None: no bounds
-    extended_sources: tuple[ExtendedSource, ...] = ()  # source at each size of stage 3, for its blur
+    extended_sources: tuple[ExtendedSource, ...] = ()  # source at its sizes in stage 3, to blur the picture
     edge: Edge | None = None  # light at the edge of a target cut to its reachable part; None: not cut
     # error of a picture relative to the target in the merit, both (rows, columns) and of sum <= 1; None: RRMSD²
     merit: Callable[[Tensor, Tensor], Tensor] | None = None

@@ -45,7 +45,7 @@ IMAGE_PAIRS = 256  # pairs of source points that represent an image
 PIXEL_PARTS = 5  # parts of a pixel per axis in the images; odd
 ERROR_RAYS = 1448  # square root of the number of rays in each of the two sets that measure the error of the blur
 ERROR_POINTS = 256  # source points in each of the two sets
-ERROR_SMOOTHING = 0.15  # standard deviation of the smoothing of the blur error, relative to (border - 2) pixels
+ERROR_SMOOTHING = 0.15  # standard deviation of the smoothing of the blur error / reach of the images (border - 2)
 MAX_TRANSFORM_BYTES, VALUE_BYTES = 2 << 30, 8  # largest size of the transforms of all images, size of one value (bytes)
 MIN_BORDER = 16  # smallest border around the screen (pixels)
 ERROR_SEED_OFFSET = 500_009  # offset of the seed, so that these rays are independent of the rays of the verification
@@ -62,7 +62,7 @@ class ExtendedSource:
 
 @dataclass(frozen=True, eq=False)
 class BlurOperator:
-    """Operator B from the picture by the source's centre, on a screen with a border, to the one by the whole source."""
+    """Operator B from a picture of the source's centre, on a screen with a border, to a picture of the whole source."""
 
     border: int  # width of the border whose light is blurred onto the screen (pixels)
     hats: tuple[np.ndarray, np.ndarray]  # hat functions, (nodes, rows + 2 border) and (nodes, columns + 2 border)
@@ -170,9 +170,9 @@ def blurs(extended: ExtendedSource, lens: Lens, screen: Screen) -> tuple[BlurOpe
 
 
 def widest(screen: Screen, lines: int) -> int:
-    """Return the largest border (pixels), up to the screen's longer side, within MAX_TRANSFORM_BYTES for all `lines`.
+    """Return the largest border (pixels) within MAX_TRANSFORM_BYTES for all spectral lines; at least MIN_BORDER.
 
-    Without this limit images on a tilted target that some light grazes would be arbitrarily large.
+    It is at most the screen's longer side.  Images on a tilted target that some light grazes may be arbitrarily large.
     """
     side = math.sqrt(MAX_TRANSFORM_BYTES / (lines * IMAGE_NODES**2 * VALUE_BYTES))
     return max(min(max(screen.shape), int((side - max(screen.shape)) / 4)), MIN_BORDER)

@@ -82,7 +82,7 @@ class FrontSearch:
     repeats: int = 3  # slope fits of the back for each front
 
 
-PREVIEW_NET, PREVIEW_SEARCH = 17, FrontSearch(cells=32, iterations=40, repeats=1)  # `shaped_front` in a preview
+PREVIEW_NET, PREVIEW_SEARCH = 17, FrontSearch(cells=32, iterations=40, repeats=1)  # net and effort in a preview
 
 
 def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
@@ -117,7 +117,7 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
 def is_poor_result(task: Task, lens: Lens, by_rays: float, state: SlopeRound) -> bool:
     """Return True if the result of the rounds is poor: a large RRMSD, or a map that still changes.
 
-    The RRMSD is computed on at most as many pixels as the net has control points: no method resolves finer detail.
+    The RRMSD is computed with no more pixels per side than control points: no method resolves finer detail.
     """
     goal = task.goals[0]
     few = resample(goal, pixels=max(as_pair(task.knobs.levels[-1])))

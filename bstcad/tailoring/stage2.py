@@ -116,7 +116,7 @@ class TubeRound:
     def run(
         self, problem: Problem, variables: NetVariables, position: SearchPosition, total: int, state: TubeSearch | None
     ) -> Iterator[tuple[Iterate, StageStep]]:
-        """Yield (iterate, step) of one run of the minimiser from a lens or a saved state, until `goal_by_tubes`.
+        """Yield (iterate, step) of one run of the minimiser from a lens or a saved state, until RRMSD `goal_by_tubes`.
 
         total: evaluations of all rounds.
         """
@@ -206,7 +206,7 @@ def round_shares(task: Task) -> RoundFractions | None:
 
 
 def sheet_sizes(knobs: ResolvedTailoring, shares: RoundFractions | None = None) -> Iterator[tuple[int, int]]:
-    """Yield (tubes per side, evaluations) of each round; tubes: as many as control points or knobs.rays, at least."""
+    """Yield (tubes per side, evaluations) of each round; tubes: at least min(control points, knobs.rays)."""
     shares = shares or (DENSE_ROUNDS if knobs.rays >= DENSE_TUBES * knobs.side else SPARSE_ROUNDS)
     if knobs.stage2_iterations < MIN_EVALUATIONS:
         shares = ((1.0, 1.0),)
@@ -381,7 +381,7 @@ class Stage3State:
 def with_stage3(before: Stage | None, task: Task, lens: Lens, state: Any = None) -> Steps:
     """Yield the steps of stage 3, from its start or from a saved state.
 
-    before: stage that runs first, for the centre of the source; its lens is rated with the whole source.  None: none.
+    before: stage that runs first, for the centre of the source; its lens is rated with the whole source; or None.
     """
     if before is not None and not isinstance(state, Stage3State):
         for last in before(task, lens, state):

@@ -140,7 +140,7 @@ def front_map(
 
     lens: lens with only its front free.  grid: `square_grid` of its lit `window`.  picture: (r, c) flux of the tube
     between each four rays, row 0 = y max.  b: (3, c + 1, r + 1) points where these rays meet the back (mm).  q: points
-    where they meet the front (mm) in the last round; None: by the inverse of r.  The result contains the new q.
+    where they meet the front (mm) in the last round; None: by the inverse affine map.  The result contains the new q.
     """
     lit = slope_map.lit_corners(picture)
     low, high = (np.array([f(p[lit]) for p in b[:2]]) for f in (np.min, np.max))

@@ -75,7 +75,7 @@ def grade_limit(kind: Kind, grade: ToleranceGrade, setup: Setup) -> float:
 
 
 def graded_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[Tolerance, ...]:
-    """Return the tables of a scene after a table with the grade; `grade` overrides the grade stated in the scene."""
+    """Return a table with `grade`, then the scene's tables without their general grade; None: default, then all."""
     if grade is None:
         return Tolerance(grade=DEFAULT_GRADE), *table
     if grade not in GRADES:

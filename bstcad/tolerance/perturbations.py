@@ -118,7 +118,7 @@ class Kind:
     name: str  # name in scene files, such as "lens.decentre_x"
     words: str  # name in reports
     unit: str  # unit of its amounts; "" for a ratio
-    apply: Callable[[Setup, float], Setup]  # function (setup as designed, amount) -> setup with the error
+    apply: Callable[[Setup, float], Setup]  # function (setup, amount) -> setup with this error too
 
 
 @dataclass(frozen=True)
@@ -341,8 +341,8 @@ def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
 
 FRONT_SEED_OFFSET = 100  # offset of the seeds for the form of the front, so that its fields differ from the back's
 FACE_NET = 513  # control points per side of the net that replaces a plane or a conic with a form error
-FACE_MARGIN = 6  # number of control points of this net outside a round outline, on each side
-FACE_REACH = 1.03  # radius / rim radius up to which this net follows the face, so that its end does not affect the rim
+FACE_MARGIN = 6  # number of control points of the FACE_NET net outside a round outline, on each side
+FACE_REACH = 1.03  # radius / rim radius up to which the FACE_NET net follows the face: its end must not affect the rim
 CELLS_PER_PERIOD = 4.0  # minimum number of control cells in a correlation length or a period
 
 

@@ -305,7 +305,7 @@ class Study:
 
     @property
     def bias(self) -> float:
-        """Numerical error of the study's traces: squared RRMSD minus the squared RRMSD by independent rays."""
+        """Squared numerical error of the tubes: squared RRMSD by tubes minus squared RRMSD by independent rays."""
         return self.model.rrmsd**2 - self.rrmsd**2
 
     def within_limit(self, amounts: np.ndarray) -> np.ndarray:

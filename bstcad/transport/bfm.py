@@ -5,9 +5,9 @@ Source rho on x, target nu on y, potentials psi(x) and phi(y):
 
     J(phi) = ∫ phi dnu + ∫ phi^c drho,   T = id - ∇phi^c,   H1 gradient  (-Δ)^-1 (nu - T_# rho)
 
-and likewise for psi.  Gradient ascent alternates between phi and psi; a c-transform converts one into the other.  The
-grid limits the accuracy: c-transforms map cell centres to cell centres, so the mass error levels off at a few per cent,
-which the flux tubes of monge_ampere.py then reduce.
+and likewise for psi.  T_# rho is rho moved by T.  Gradient ascent alternates between phi and psi; the c-transform phi^c
+converts one into the other.  The grid limits the accuracy: c-transforms map cell centres to cell centres, so the mass
+error levels off at a few per cent, which monge_ampere.py then reduces.
 
 The c-transform is exact, in a time linear in the number of cells: phi^c(x) = min_y |x - y|²/2 - phi(y) = |x|²/2 - v*(x)
 with v(y) = |y|²/2 - phi(y) is a Legendre transform, which separates: v*(x1, x2) = max_y1 [x1 y1 + max_y2 (x2 y2 -
@@ -88,7 +88,7 @@ def _line(v, out, hull, slope, first):
 
 @njit(cache=True, nogil=True, parallel=True)
 def _transform_lines(v, out, sign, blocks):
-    """Compute out = `sign` times the transposed matrix of the transforms of the rows of v."""
+    """Compute out = `sign` times the transposed matrix of the Legendre transforms of the rows of v."""
     n = v.shape[0]
     for block in prange(blocks):
         hull, slope, first = np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64)

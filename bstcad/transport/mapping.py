@@ -15,7 +15,7 @@ from bstcad.transport.density import Density, gradient_at_corners
 from bstcad.transport.monge_ampere import ROUGH_MASS_ERROR, MongeAmpere, corners, newton_on_grids
 
 FLOOR = 1e-3  # smallest density of a target, relative to its mean: maps of tubes need a positive target
-FALLING_FLOORS = (0.03, 0.01, 0.003)  # floors, relative to the mean, solved before FLOOR if Newton's method needs them
+FALLING_FLOORS = (0.03, 0.01, 0.003)  # floors, relative to the mean, used one after another before FLOOR on rough maps
 BACK_AND_FORTH_CELLS = 64  # cells per side to which the grid is halved, while even, for the back-and-forth method
 STEPS_PER_GRID = 8  # largest number of Newton steps on each grid; MAX_STEPS_FACTOR times as many on a rough map
 MAX_MAP_NODES = 257  # largest number of points per side of a TransportMap: 0.5 MB
@@ -109,7 +109,7 @@ class Solver:
 
     iterations: int = 40  # largest number of iterations of the back-and-forth method on each grid
     tolerance: float = 2e-3  # mass error (mean |flux - target|, both of mean 1) at which the solve has converged
-    floors: tuple[float, ...] = FALLING_FLOORS  # floors solved before FLOOR, relative to the mean of the target
+    floors: tuple[float, ...] = FALLING_FLOORS  # floors of the target, relative to its mean, used before FLOOR
     progress: Listener = None  # called after each iteration; None: not called
 
 
