@@ -57,7 +57,7 @@ class Mesh:
 
 
 def lens_mesh(lens: Lens, cells: int) -> Mesh:
-    """Return the lens as a closed mesh of `cells` grid cells per side (an even number); see `fit_mesh`."""
+    """Return the lens as a closed mesh of `cells` grid cells per side, an even number, which `fit_mesh` can choose."""
     if cells < 2 or cells % 2:
         raise ValueError(f"mesh: the number of cells per side is {cells}; give an even number of at least 2")
     x, y = nodes(lens.outline, cells)
@@ -115,7 +115,7 @@ def _triangles(grid: np.ndarray, rising: np.ndarray) -> np.ndarray:
 
 
 def _cell_corners(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the values at the corners of each cell, counterclockwise."""
+    """Return four arrays: the values at the four corners of each cell, counterclockwise."""
     return values[:-1, :-1], values[1:, :-1], values[1:, 1:], values[:-1, 1:]
 
 

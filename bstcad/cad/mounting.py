@@ -232,7 +232,7 @@ def check_fit(lens: Lens, rim: Sequence[LoopPiece], planes: tuple[float, float],
 
 
 def _replace_loops(face: cadquery.Face, replacements: dict[int, list[Loop]] | None) -> TopoDS_Face:
-    """Return a plane face of the body; replacements: loops in place of some wires, by index of the wire; None: none."""
+    """Return a plane face of the body with some wires replaced; replacements: loops by index of the wire, or None."""
     if replacements is None:
         return face.wrapped
     loops: list[Loop] = []

@@ -185,7 +185,7 @@ def _hole_loop(name: str, hole: cadquery.Wire | Sequence[float]) -> list[LoopPie
 
 
 def cap(patch: Patch, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
-    """Return the back or front inside the first rail and outside the others; along: True to use rails forwards."""
+    """Return the back (along: True) or front (False) inside the first rail and outside the others."""
     loops = [rail.along() if along else rail.against() for rail in rails]
     face = face_inside(patch.surface, patch.outward, *loops)
     for rail in rails if patch.uv is not None else ():
@@ -212,7 +212,7 @@ def dome_cap(lens: Lens) -> tuple[NamedFace, Rail]:
 
 
 def image(patch: Patch, curve: RailCurve) -> Geom2d_Curve:
-    """Return the image in (u, v) of a curve on a patch, with the curve's parameter: a line, a circle or a spline."""
+    """Return the image in (u, v) of a curve on a patch: a line, circle or spline with the parameter of the curve."""
     piece, uv = curve.piece, patch.uv
     assert uv is not None  # a plane needs no image
     cubic = curve.knots if curve.knots is not None and len(curve.knots) == len(curve.poles) + 4 else None

@@ -405,7 +405,7 @@ def clear_apertures(front: np.ndarray, back: np.ndarray) -> tuple[Outline, Outli
     """Return the clear apertures of front and back from points (n, 2) in mm along the edges of these faces.
 
     The aperture of the back is the circle or rectangle about the axis, with sharp or round corners, on which its edge
-    lies.  The aperture of the front is inset from it by the largest inset of the front's edge.  A front's edge outside
+    lies.  The front's aperture is the back's, reduced by the largest inset of the front's edge.  A front's edge outside
     the back's, for example in the plane of a flange, does not limit the light of the lens.
     Raises ValueError if the edge of the back has another shape.
     """

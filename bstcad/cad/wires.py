@@ -91,7 +91,7 @@ def wire_loop(given: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list
 
 
 def shape_in(given: Any) -> tuple[Any, str]:
-    """Return the given shape, or the only object of a Workplane, and its type; if not one, None and their number."""
+    """Return a shape, or the only object of a Workplane, and its type's name; for another number, None and words."""
     values = given.vals() if hasattr(given, "vals") else [given]
     if len(values) != 1:
         return None, f"a Workplane of {len(values)} objects"

@@ -210,7 +210,7 @@ def _scale_to(picture: np.ndarray, total: float) -> np.ndarray:
 
 
 def coarse_screen(screen: Screen) -> Screen:
-    """Return the screen with nearly square pixels, no more than now and MAX_COMPARED_PIXELS along the longer side.
+    """Return the screen with nearly square pixels, on the longer side at most as many as now and MAX_COMPARED_PIXELS.
 
     Of the numbers above half this limit, the one with the most nearly square pixels is chosen, the largest of equals.
     """

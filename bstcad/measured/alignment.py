@@ -149,7 +149,7 @@ class Alignment:
 def align(face: BackFace, cloud: np.ndarray, start: Pose) -> Alignment:
     """Align a cloud (n, 3) in mm with a face by least squares, with equal weights and without outliers.
 
-    start: a pose near the solution.  Outliers are sought there, and again among points that reach the face later.
+    start: a pose near the solution.  Outliers are sought there, and again among points that come onto the face later.
     """
     pose, noise = start, None
     judged, out = np.zeros((2, len(cloud)), dtype=bool)

@@ -125,7 +125,7 @@ def _field(
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
     """Return the field's heights (m, m), standard deviations (m, m) of its amplitudes, the noise (mm) and motion (k,).
 
-    rows: basis functions (n, m²); off: deviations (n,), mm; motions: their changes (n, k) per mm; less polynomials.
+    rows: basis functions (n, m²); off: deviations (n,), mm, and motions: their changes (n, k), without polynomials.
     Generalised least squares gives the motion: the fit to `off` leaves σ² V⁻¹ off, V the covariance of field + noise.
     """
     (m, _), n = net.shape, len(off)  # the net is square
@@ -216,7 +216,7 @@ def _posterior_mean(
 
 
 def _basis_rows(u: np.ndarray, v: np.ndarray, m: int) -> scipy.sparse.csr_array:
-    """Return the matrix (n, m²) of the nine nonzero products of basis functions at each point."""
+    """Return the matrix (n, m²) of the nine nonzero products of basis functions at each point (u, v), in pitches."""
     in_u, in_v = basis_matrix(u, m), basis_matrix(v, m)
     n = len(u)
     columns = in_u.indices.reshape(n, 3, 1) * m + in_v.indices.reshape(n, 1, 3)

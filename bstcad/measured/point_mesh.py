@@ -60,7 +60,7 @@ class _Element:
         return np.dtype([(name, order + kind) for name, kind, _ in self.properties])
 
     def shortage_error(self, follow: int) -> ValueError:
-        """Return the error for a file in which only `follow` rows follow."""
+        """Return the error for a file in which only `follow` of the declared rows follow."""
         what = "points" if self.name == "vertex" else f"rows of element {self.name!r}"
         return ValueError(f"its header declares {self.count} {what}, but {follow} follow; {EXPORT_HINT}")
 

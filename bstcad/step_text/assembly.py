@@ -142,7 +142,7 @@ def _shapes(entities: Entities) -> dict[str, set[str]]:
 
 
 def _transformation(name: str, first: list[str], second: list[str], entities: Entities) -> Placement:
-    """Return the placement of one representation in another; first, second: items of the two representations."""
+    """Return the placement of the first representation in the second; first, second: items of the two."""
     if entities.bodies[name][0] != "ITEM_DEFINED_TRANSFORMATION":
         return _frame(name, entities)
     origin, target = _pair(name, entities)

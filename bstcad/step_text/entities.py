@@ -22,7 +22,7 @@ ENTITY = r"[1-9]\d{0,17}"  # pattern of an entity's number, which fits into 64 b
 REAL = r"[-+]?\d+\.\d*(?:E[-+]?\d+)?"
 COORDINATE = rf"[-+]?\d{{1,{MAX_NUMBER_LENGTH}}}+\.\d{{0,{MAX_NUMBER_LENGTH}}}+(?:E[-+]?\d{{1,4}}+)?"
 BLANKS = bytes(code for code in range(256) if chr(code).isspace())
-STRING = re.compile(  # text, which may contain empty strings, then a string or comment, for few calls of `numbered`
+STRING = re.compile(  # text, perhaps with empty strings, then a string or comment, so that `numbered` is called rarely
     r"((?:[^'/]++|''(?!')|/(?!\*))*+)('[^']*(?:''[^']*)*'|/\*.*?(?:\*/|\Z)|'|\Z)", re.DOTALL
 )
 POINT_TEXT = re.compile(rf"(?<=;)#({ENTITY})=CARTESIAN_POINT\('\d*',\(({COORDINATE},{COORDINATE},{COORDINATE})\)\);")
@@ -34,7 +34,7 @@ STATEMENT = re.compile(rf"#({ENTITY})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
 TOKENS = re.compile(  # tokens without blanks: separators, references, numbers, strings, enumerations, keywords
     r"[(),;]++|(?:#\d{1,20}+,)++|#\d{1,20}+(?=[)=])=?|'\d*+'|\.[A-Z_0-9]++\.|[$*](?=[,)])|!?[A-Z_][A-Z_0-9]{0,99}+(?=\()"
     r"|[-+]?\d{1,99}+(?:\.\d{0,99}+(?:[Ee][-+]?\d{1,9}+)?)?(?=[,)])|\"[0-9A-F]*+\""
-)  # matching takes linear time: the length of a token is bounded, or its first character cannot occur in the rest of it
+)  # matching takes linear time: a failed match has a bounded length, or contains its first character only once
 LONG_NUMBER = re.compile(rf"(?<=[(,])[-+.\d][-+.\dEe]{{{MAX_NUMBER_LENGTH},}}")
 HUGE_NUMBER = re.compile(r"(?<=[(,])[-+]?\d++\.\d*+[Ee]\+?\d{3,}+")  # number whose exponent has three digits or more
 

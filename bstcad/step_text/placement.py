@@ -54,7 +54,7 @@ class Placement:
         return Placement(self.rotation.T, -(self.rotation.T @ self.shift))
 
     def after(self, first: Placement) -> Placement:
-        """Return the composition of the placement `first`, then this placement."""
+        """Return the placement that applies `first`, then this placement."""
         return Placement(self.rotation @ first.rotation, self(first.shift))
 
     @property

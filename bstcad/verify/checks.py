@@ -287,7 +287,7 @@ def examine(path: Path, submit: Submit = run_here) -> ExaminedFile:
 
 
 def _result(read: Future[R], path: Path, again: Callable[[], Future[R]] | None = None) -> R:
-    """Return the result of a job of OCC's process; again: starts it again, if another file may have crashed OCC."""
+    """Return the result of a job of OCC's process; again: restarts the job, if another file may have crashed OCC."""
     limit = time_limit(path)
     try:
         return result(read, limit)
@@ -434,7 +434,7 @@ def _light_checks(light: Light, accept: Accept, optic: str = "lens", of: str = "
 
 
 def _wavefront_checks(lens: Lens, nominal: Nominal) -> tuple[WavefrontError | None, list[Check]]:
-    """Return the wavefront error of the re-read lens, and its checks; None: not requested, or the lens misses it."""
+    """Return the wavefront error of the re-read lens, and its checks; None: not requested, or no light reaches it."""
     wave, accepted = nominal.scene.wavefront, nominal.scene.accept.wavefront
     if wave is None:
         return None, []
