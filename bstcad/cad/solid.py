@@ -47,7 +47,7 @@ class NamedSolid(NamedTuple):
     """A solid and the names of its faces, in the order of solid.Faces()."""
 
     solid: cadquery.Solid
-    faces: tuple[str, ...]  # "back", "front", "underside" (plane around it), "rim", "bevel", "hole" or "flange"
+    faces: tuple[str, ...]  # "back", "front", "underside" (plane around the front), "rim", "bevel", "hole" or "flange"
 
 
 def lens_solid(

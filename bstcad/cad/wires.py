@@ -29,7 +29,7 @@ MIN_INTERVALS = 64  # smallest number of intervals of a spline over a piece
 MAX_INTERVALS, MAX_HALVINGS = 1 << 14, 4  # limits of a cubic: number of intervals, or of halvings if these give more
 QUINTIC_INTERVALS = 256  # intervals of a quintic; along half a circle on a sphere or conic its error is 1e-12 mm
 MIN_BREAK_DISTANCE = 1e-7  # smallest distance of two breaks, relative to the length of the piece
-ONE_SIDED_SLOPE = np.array([-25, 48, -36, 16, -3]) / 12  # weights of 5 evenly spaced values: slope at the first
+ONE_SIDED_SLOPE = np.array([-25, 48, -36, 16, -3]) / 12  # weights of 5 values at unit spacing in the slope at the first
 CROSSING_BISECTIONS = 50  # number of bisections, which leave only rounding errors
 
 Locus = Callable[[np.ndarray], np.ndarray]  # function of t (n,) that returns points (n, k)

@@ -83,7 +83,7 @@ class ValidationProperties:
 
     areas: tuple[float, ...] = ()  # area of the whole surface (mm²)
     volumes: tuple[float, ...] = ()  # volume (mm³)
-    centroids: tuple[tuple[float, float, float], ...] = ()  # centroid (mm)
+    centroids: tuple[tuple[float, float, float], ...] = ()  # centroid (mm), in the frame in which the part is defined
     materials: tuple[str, ...] = ()
     densities: tuple[float, ...] = ()  # density (g/cm³)
     profiles: tuple[ProfileTolerance, ...] = ()
