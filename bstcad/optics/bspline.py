@@ -127,7 +127,7 @@ def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Ten
 
 
 def basis_matrix(u: np.ndarray, m: int, derivative: int = 0) -> scipy.sparse.csr_matrix:
-    """Return the banded matrix (len(u), m) whose row r contains the basis functions, or their derivative, at u[r]."""
+    """Return the banded matrix (len(u), m): row r contains the basis functions, or their first derivatives, at u[r]."""
     points = torch.as_tensor(np.asarray(u, dtype=np.float64))
     k, *weights = basis(points, m)
     columns = (k[:, None] + torch.arange(3)).numpy()
@@ -273,7 +273,7 @@ class BSplineSurface(Surface):
         return net
 
     def refined(self, sides: Sides) -> BSplineSurface:
-        """Resample the surface to a number of control points per side, or along x and y (`resample`)."""
+        """Resample the surface to `sides` control points per side, or (along x, along y), by `resample`."""
         if as_pair(sides) == self.shape:
             return self
         in_x, in_y = as_pair(sides)

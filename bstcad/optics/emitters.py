@@ -72,7 +72,7 @@ class Emitter(ABC):
         return self.start_plane
 
     def complaints(self, z: float, optic: str) -> Iterator[str]:
-        """Yield faults of the size as "key: sentence"; z: plane of the first face (mm), optic: "lens" or "mirror"."""
+        """Yield faults of the source as "key: sentence"; z: plane of the first face (mm), optic: "lens" or "mirror"."""
         yield from ()
 
     @property
@@ -122,7 +122,7 @@ class Emitter(ABC):
         raise self._missing_method("how its light moves", "moved(motion, entrance)")
 
     def reference(self, place: Tensor, z: float, sense: int) -> Tensor:
-        """Return the path (mm) from the wavefront through o = (0, 0, z) to points o + place, (3, …); sense: of Rays."""
+        """Return the path (mm) from the wavefront through o = (0, 0, z) to points o + place (3, …); sense: see Rays."""
         if not self.parallel:
             raise self._missing_method("its wavefronts", "reference(place, z, sense)")
         n_x, n_y, n_z = self.axes[2]
@@ -169,7 +169,7 @@ class Emitter(ABC):
 
     @property
     def main_wavelength(self) -> float:
-        """Wavelength (nm) of the line with the largest weight; the median of several equal lines."""
+        """Wavelength (nm) of the line with the largest weight; the lower median of several such lines."""
         if isinstance(self.wavelength, int | float):
             return self.wavelength
         largest = max(weight for _, weight in self.wavelength)

@@ -195,7 +195,7 @@ LEDGER = {  # status of lost rays, by line of the ledger
 
 
 def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
-    """Return the flux of rays by fate; the lines sum to the flux of all rays except Status.BLOCKED."""
+    """Return the flux of rays by fate; the lines sum to the flux of all rays that are not Status.BLOCKED."""
     flux = rays.flux.double()
     on_screen = screen.contains(rays.position[0], rays.position[1])
     lines = {

@@ -89,7 +89,7 @@ class Lens:
 
     @property
     def optical_faces(self) -> dict[str, Surface]:
-        """Faces of the solid that light meets, by name, in the order of the light; a plain mirror has only the back."""
+        """Faces that light meets, by name, in the order of the light; the back alone for a first-surface mirror."""
         return {face: self.front if face == "front" else self.back for face in self.passes.faces}
 
     @property

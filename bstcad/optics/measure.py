@@ -452,7 +452,7 @@ class RayTubes:
         return tuple(sheet.landing(channel.through(lens), screen.plane) for channel, sheet in pairs)
 
     def picture(self, lens: Lens, screen: Screen) -> Tensor:
-        """Return the flux in each pixel (rows, columns), row 0 = y max, as a fraction of all light."""
+        """Return the flux in each pixel (rows, columns), row 0 = y max, as a fraction of the source's flux."""
         pairs = zip(self.sheets, self.landing(lens, screen), strict=True)
         return weighted_sum(self.channels, (sheet.collect(corners, screen)[0] for sheet, corners in pairs))
 
@@ -460,7 +460,7 @@ class RayTubes:
 def tubes_picture(
     lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, over_the_back: bool = False
 ) -> Tensor:
-    """Return the flux in each pixel (rows, columns), as a fraction of all light, by n x n tubes per channel."""
+    """Return the flux in each pixel (rows, columns), as a fraction of the source's, by n x n tubes per channel."""
     few = COARSE_SHEET if over_the_back else tubes.SHEET_TUBES
     lights = ((c.source, c.through(lens)) for c in channels)
     pictures = (tubes.picture(*light, screen, n, few=few, over_the_back=over_the_back) for light in lights)

@@ -70,7 +70,7 @@ class Point(Emitter):
         return self.position[2]
 
     def nearest_z(self, upwards: bool) -> float:
-        """Return z (mm) of the point of the source that is nearest to a lens above it, or below it."""
+        """Return z (mm) of the point of the source that is nearest to a lens above it (upwards) or below it."""
         reach = 0.0 if self.extent is None else self.extent.reach(*(axis[2] for axis in self.axes[:2]))
         return self.position[2] + (reach if upwards else -reach)
 

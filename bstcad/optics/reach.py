@@ -77,10 +77,9 @@ def wanted_slopes(at_face: Rays, aim: Tensor, plane: Receiver, law: Law) -> tupl
 def slopes_towards(at_face: Rays, out: Tensor, law: Law) -> tuple[Tensor, Tensor]:
     """Return the slopes (∂z/∂x, ∂z/∂y) that deflect each ray into the direction d' of `out`, unit vectors (3, …).
 
-    By the laws of refraction and reflection η d - d' is parallel to the normal (-z_x, -z_y, 1), with d and d' the
-    directions before and behind the face; into glass, η < 1, it is antiparallel.  If no face can deflect a ray so far,
-    the slope deflects it towards the same side by the largest angle, that of a ray which meets or leaves the face at
-    MAX_EXIT_ANGLE.  No slope is steeper than MAX_SLOPE.
+    By the laws of refraction and reflection the normal (-z_x, -z_y, 1) is parallel to ±(η d - d') (`normal_towards`).
+    If no face can deflect a ray so far, the slope deflects it towards the same side by the largest angle, that of a ray
+    which meets or leaves the face at MAX_EXIT_ANGLE.  No slope is steeper than MAX_SLOPE.
     """
     d = at_face.direction
     along = dot(d, out)
@@ -92,7 +91,7 @@ def slopes_towards(at_face: Rays, out: Tensor, law: Law) -> tuple[Tensor, Tensor
 
 
 def normal_towards(at_face: Rays, out: Tensor, law: Law) -> Tensor:
-    """Return ±(η d - d'): the normal (3, …), of any length, of a face that deflects each ray into d' = `out`."""
+    """Return ±(η d - d'): the normal (3, …), of any length, of a face that deflects each ray from d into d' = `out`."""
     return (at_face.sense if law.eta >= 1 else -at_face.sense) * (law.eta * at_face.direction - out)
 
 

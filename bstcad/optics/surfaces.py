@@ -65,7 +65,7 @@ class Surface(ABC):
         return torch.ones_like(x, dtype=torch.bool)
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
-        """Return (path in mm along rays from (x, y) on the plane z, True if they meet the surface); sense: of Rays."""
+        """Return (path in mm along rays from (x, y) on the plane z, True if they meet the surface); sense: see Rays."""
         raise self.unknown
 
     @abstractmethod

@@ -130,7 +130,7 @@ def _useful(
 ) -> Rectangle:
     """Return the part of `area`, on the plane of the first vertex, whose light meets one of the planes `faces`.
 
-    Two grids are traced; the second covers only the useful part found on the first.
+    Two n x n grids are traced; the second covers only the useful part found on the first.
     """
     z = before[0].surface.z
     for _ in range(2):
@@ -152,7 +152,7 @@ def _around(area: Rectangle, points: tuple[Tensor, ...], n: int, useful: Tensor)
 
 @torch.no_grad()
 def clear_window(source: Emitter, lens: Lens, n: int = 256) -> Rectangle:
-    """Return the part of `window` whose light passes all faces, with a margin of two cells.
+    """Return the part of `window` whose light passes all faces, with a margin of two cells of an n x n grid.
 
     Light outside this part counts as lost, and need not be traced during tailoring.
     """

@@ -51,7 +51,7 @@ class Tubes:
     flux: Tensor  # flux launched in each tube (rows, columns), as a fraction of the source's
 
     def landing(self, lens: Lens, plane: Receiver) -> Landed:
-        """Trace the corners to the receiver, without the solid's apertures, whose losses `flux` already excludes."""
+        """Trace the corners to the receiver without the solid's apertures: `flux` excludes the light that they stop."""
         return from_first_net(self.rays, lens.unbounded(), plane)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:

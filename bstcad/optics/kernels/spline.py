@@ -106,7 +106,7 @@ def curved(net, m, n, u, v):
 
 @njit(inline="always")
 def scatter(own, touched, u, v, g, g_u, g_v):
-    """Add a point's gradients to its nine control points, the transpose of `sag`; own (m, n): see reductions.py."""
+    """Add g, g_u, g_v of a point to its nine control points, the transpose of `sag`; own (m, n): see reductions.py."""
     m, n = own.shape
     i, a0, a2, p0, p2 = basis(u, m)
     j, b0, b2, q0, q2 = basis(v, n)
