@@ -1,4 +1,4 @@
-"""Light through a lens: rays for plots, clear apertures needed, losses at a mount, margins of the trace, blur."""
+"""Light through a lens: rays for plots, clear apertures, ripple, losses at a mount, margins of the trace, blur."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ SOLUTION_NAMES = {1.0: "convex", -1.0: "concave"}  # names of the solutions with
 class Demand:
     """Deflections and losses that the goals cause in a lens, for one of the two solutions."""
 
-    solution: float  # sign σ of light_behind.py
+    solution: float  # sign σ of the solution: 1 convex, -1 concave (light_behind.py)
     angle: float  # largest angle to the axis at which light leaves the lens (degrees)
     rms_angle: float  # RMS angle to the axis over the rays (degrees)
     crossed: float  # fraction of the light whose rays would cross between lens and target
