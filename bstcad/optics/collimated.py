@@ -19,7 +19,7 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, tilt_of
 
-WIDTHS_BEFORE_LENS = 4.0  # distance of the aperture of a tilted beam without z from the lens, in aperture diagonals
+WIDTHS_BEFORE_LENS = 4.0  # distance from the lens to the aperture of a rotated beam without z, in its diagonals
 MAX_INCLINATION = 89.0  # degrees, largest angle of parallel light to the axis of the lens
 
 

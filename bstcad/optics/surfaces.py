@@ -25,7 +25,7 @@ class Surface(ABC):
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
     z: float  # z of the vertex (mm); for a net, z of the plane from which its heights are measured
-    kind: str  # kind of surface, such as "sphere"; the names of scenes
+    kind: str  # kind of surface as scenes name it, such as "sphere"
     is_net = False  # True for a B-spline net, which has `heights`
     curvature: float | Tensor  # curvature at the vertex of a surface of revolution (1/mm), > 0: concave towards +z
     conic_constant: float | Tensor  # conic constant of a surface of revolution

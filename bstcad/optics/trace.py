@@ -8,8 +8,8 @@ A simulation traces stratified rays a strip at a time, so that memory does not g
 A ghost is light that is reflected twice inside the lens: it enters through the front, is reflected at the back and
 again at the front, and leaves through the back.  With T and R the transmittance and reflectance of the front, T' and R'
 those of the back, it carries the fraction T R' R T' of a ray's flux, about a thousandth for bare glass; beyond the
-critical angle R = 1.  Light that is reflected more often is a few hundred times fainter and is neglected.  A ghost's
-light that meets a face outside its outline counts as absorbed.  Only verification traces ghosts, in plain torch.
+critical angle R = 1.  Light that is reflected more often is a few hundred times fainter and is neglected.  Light of a
+ghost that misses a face stays in the ledger line of its first reflection.  Tailoring traces no ghosts.
 """
 
 from __future__ import annotations
