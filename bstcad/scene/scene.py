@@ -67,7 +67,7 @@ class Accept(Record):
         ),
     ] = None
     light_on_target: Annotated[
-        float | None, Key("Minimum fraction of flux into the lens that is on the target.", "", 0.0, 1.0, of_light=True)
+        float | None, Key("Minimum fraction of flux at the lens that is on the target.", "", 0.0, 1.0, of_light=True)
     ] = None
     leak: Annotated[
         float | None, Key("Maximum fraction of flux on the target that is on dark pixels.", "", 0.0, 1.0, of_light=True)
