@@ -106,7 +106,7 @@ class LightSnapshot:
 
 
 def design(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool) -> State:
-    """Design the scene of the run's folder into `output`."""
+    """Design the scene of the run's folder into `output`; resume: continue from the checkpoint."""
     from bstcad import commands
     from bstcad.scene.scene import load
 

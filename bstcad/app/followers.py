@@ -81,7 +81,7 @@ def with_followers(data: Mapping[str, Any], key: str, value: Any, locked: bool =
 
 
 def _other_side(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """Return the change of the other side of a table that keeps the ratio; {} if one of the sides has no length."""
+    """Return {key: value} of the other side, in its ratio to the changed side; {} if one of the sides has no length."""
     parent, _, name = key.rpartition(".")
     other = f"{parent}.{LOCKED_SIDES.get(name, '')}"
     was, its = value_at(key, data), value_at(other, data)

@@ -191,7 +191,7 @@ def form(data: Table) -> SceneForm:
 
 
 def _without(group: Group, taken: set[str]) -> Group:
-    """Return a group without the main fields, and without inner groups that they have emptied."""
+    """Return a group without the fields with the keys `taken`, and without inner groups that are then empty."""
     left = tuple(field for field in group.fields if field.key not in taken)
     inner = (_without(each, taken) for each in group.groups)
     groups = tuple(each for each in inner if each.fields or each.groups or each.additions or each.removable)

@@ -35,7 +35,7 @@ Table = Mapping[str, Any]
 
 
 def without_numbers(key: str) -> str:
-    """Return a dotted key without the numbers of tables."""
+    """Return a dotted key without the numbers of tables: target[1].z becomes target.z."""
     return TABLE_NUMBER.sub("", key)
 
 

@@ -149,7 +149,7 @@ class PreviewDesk:
             self._news.notify_all()
 
     def _make(self, request: PreviewRequest, stage: str) -> Any:
-        """Return the answer of a stage: a preview, or entries of `plan --json`, with the choice of the net (`net`).
+        """Return the answer of a stage: a preview, or entries of `plan --json`; effects also state the chosen `net`.
 
         Outdated once the request is replaced or another one has fewer answers.
         """

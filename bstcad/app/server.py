@@ -549,7 +549,7 @@ def _number(given: Any, key: str) -> float:
 
 
 def _zip_parts(name: str, paths: list[tuple[str, Path]]) -> Iterator[bytes]:
-    """Iterate over the parts of a ZIP archive with the files in a folder `name`."""
+    """Yield the parts of a ZIP archive with a folder `name`; paths: (name in this folder, file) of each file."""
     written = _ZipBuffer()
     with zipfile.ZipFile(written, "w", zipfile.ZIP_DEFLATED) as archive:
         for each, path in paths:

@@ -80,7 +80,7 @@ def bars(console: Console) -> Iterator[ProgressFunction]:
 
 @contextmanager
 def cells(display: Callable[..., Any], clock: Callable[[], float] = time.monotonic) -> Iterator[ProgressFunction]:
-    """Display a table with one row per stage below a notebook's cell, updated at most every REDRAW_INTERVAL."""
+    """Display a table of the stages below a notebook's cell, updated every REDRAW_INTERVAL and when a stage ends."""
     began: dict[str, float] = {}  # start time by stage
     rows: dict[str, str] = {}
     handle = display({"text/html": "", "text/plain": ""}, raw=True, display_id=True)

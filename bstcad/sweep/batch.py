@@ -254,7 +254,7 @@ def _store_design(contents: SceneFiles, folder: Path) -> None:
 
 
 def _hash_of_design(folder: Path) -> str:
-    """Return the SHA-256 of the design in a folder; "" if there is none."""
+    """Return the SHA-256 of design.npz in a folder; "" if the folder contains no design."""
     try:
         data = files.contents(folder / "design.npz", files.MAX_ARCHIVE_SIZE)
     except ValueError:

@@ -123,7 +123,7 @@ def _glass_effects(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
         yield _entry("ghost", None, "ghosts of a mirror behind glass are not simulated")
     elif find_effect(scene.effects, Ghost) is None:
         reflecting = _central_channel(scene, *(() if find_effect(scene.effects, Fresnel) else (bare,)))
-        change, reason = reference.ghost(reflecting), "a rough estimate, since it may focus to a spot"
+        change, reason = reference.ghost(reflecting), "a rough estimate, since ghosts may focus to a spot"
         yield _entry("ghost", change, reason, '[[effects]] kind = "ghost"')
 
 

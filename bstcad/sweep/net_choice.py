@@ -198,7 +198,7 @@ def candidate_nets(scene: Scene) -> list[Sides]:
 
 @torch.no_grad()
 def area_cells(scene: Scene, lens: Lens) -> ControlCells:
-    """Return the area (mm²) of the back that lights each pixel, as cells of 1 mm².
+    """Return the area (mm²) of the back that lights each pixel, as ControlCells of 1 mm².
 
     lens: coarse lens for the scene, whose light gives the flux density at the back for each part of the target.
     """

@@ -157,7 +157,7 @@ def _adam_points(own: bool) -> Points:
 
 
 def _joint_points(*varied: tuple[str, Any, Sequence[float]]) -> Points:
-    """Return points that vary keys together: (key, base value, multiples) of each.  A net is scaled by its spans."""
+    """Return points that vary keys together; varied: (key, base value, factors).  A net is scaled by its spans."""
     points = {}
     for multiples in zip(*(multiples for _, _, multiples in varied), strict=True):
         values = {
@@ -195,7 +195,7 @@ def run_order(scene: Scene, knobs: Sequence[Knob]) -> list[Settings]:
 
 
 def _neighbour(knob: Knob, steps: int) -> list[Settings]:
-    """Return the point that is `steps` steps from the base, or [] if there is none.
+    """Return a list of the point that is `steps` steps from the base (negative: less work); [] if there is none.
 
     If the base is not a point of the knob, the first point is the neighbour with less work, the second with more work.
     """
