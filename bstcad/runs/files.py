@@ -169,7 +169,7 @@ def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> np.nd
     member = archive.getinfo(f"{name}.npy")
     known = member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # unpack to the stated size
     if member.file_size > 8 * math.prod(shape) + MAX_ARRAY_HEADER or not known:
-        raise ValueError(f"{name} is larger than {shape} numbers, or compressed by an unknown method")
+        raise ValueError(f"{name} is larger than an array of shape {shape}, or compressed by an unknown method")
     file = io.BytesIO(archive.read(member))
     found, kind = _header(file, name)
     if found != shape or kind not in "fiu":
