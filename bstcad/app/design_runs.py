@@ -125,7 +125,7 @@ class Run:
         """Sentence for the terminal about a run that the ending server has stopped."""
         state, name = self.state, f"{self.design.name}: the {self.kind} run"
         if state.state == "running":
-            return f"{name} is stopping; a design is kept so far; run bstcad app in this folder to see or resume it"
+            return f"{name} is stopping; run bstcad app in this folder to see it and, if it is a design, to resume it"
         reason = f"{state.sentence}; " if state.sentence else ""
         return f"{name} is {state.state}; {reason}run bstcad app in this folder to see it"
 
