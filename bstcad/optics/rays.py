@@ -24,7 +24,7 @@ class Status(IntEnum):
     ALIVE = 0  # not lost
     MISSED_FRONT = 1  # missed the clear aperture of the first face of the solid, or an element before it
     VIGNETTED = 2  # missed a later face of the solid, or met it outside its clear aperture
-    TOTAL_REFLECTION = 3  # total internal reflection at a face
+    TOTAL_REFLECTION = 3  # total internal reflection at a face, or met a refracting face from behind
     TURNED_BACK = 4  # left the last surface away from the receiver, or met a mirror from its rear
     BLOCKED = 5  # missed a window or mirror behind the lens, or met it outside its outline
 

@@ -136,7 +136,7 @@ class OpdSize:
 
 @dataclass(frozen=True, eq=False)
 class WavefrontError:
-    """Wavefront behind a lens relative to the goal; waves are those of the source's main wavelength in air."""
+    """Wavefront behind a lens relative to the goal; one wave is the source's main wavelength (nm, as stated)."""
 
     z: float  # plane of the comparison, mm
     wavelength: float  # main wavelength, nm

@@ -55,7 +55,7 @@ class GoalFigures:
 
 @dataclass(frozen=True)
 class WavefrontFigures:
-    """Error of the wavefront behind the lens; 1 wave is `wavelength` in air."""
+    """Error of the wavefront behind the lens; 1 wave is `wavelength`."""
 
     z: float  # plane on which the wavefronts are compared (mm)
     wavelength: Size  # nm

@@ -162,8 +162,8 @@ class LossTables(NamedTuple):
     """
 
     present: int  # 0: no losses
-    front: np.ndarray  # transmission of the front
-    back: np.ndarray  # transmission of the back
+    front: np.ndarray  # transmission of the front; unused for a mirror
+    back: np.ndarray  # transmission of the back, or reflectance of a mirror
     coefficient: float  # absorption coefficient of the glass (1/mm)
 
 
