@@ -247,8 +247,8 @@ def _page(material: str, expected: tuple[Medium, ...]) -> Medium:
     hint = f"did you mean {' or '.join(map(repr, near))}?"
     if not near:
         shorts = ", ".join(medium.name for medium in expected)
-        otherwise = "; or give the index itself" if expected is MEDIA else ""
-        hint = f"known are {shorts}, and the pages of refractiveindex.info as 'shelf/book/page'{otherwise}"
+        otherwise = ", or give the index itself" if expected is MEDIA else ""
+        hint = f"choose one of {shorts}, or a page of refractiveindex.info as 'shelf/book/page'{otherwise}"
     raise ValueError(f"{cut!r} is not a known material; {hint}")
 
 

@@ -176,7 +176,7 @@ class ZernikeWave(_Wave):
         """Yield the common reasons, and a sentence if the list of coefficients is empty."""
         yield from super().complaints(back)
         if not self.coefficients:
-            yield "coefficients: the list is empty; give at least one, such as [0.0, 0.0, 0.0, 1.5], or kind = 'plane'"
+            yield "coefficients: the list is empty; give one such as [0.0, 0.0, 0.0, 1.5], or choose kind = 'plane'"
 
 
 Wave = PlaneWave | SphericalWave | ZernikeWave

@@ -92,7 +92,7 @@ class TestMetals:
         assert abs((index - 1) / (index + 1)) ** 2 == pytest.approx(reflectance, abs=0.015)
 
     @pytest.mark.parametrize(
-        ("name", "words"), [("Silvr", "did you mean 'silver'"), ("?", "known are Al, Ag, Au, Cu"), ("PMMA", None)]
+        ("name", "words"), [("Silvr", "did you mean 'silver'"), ("?", "choose one of Al, Ag, Au, Cu"), ("PMMA", None)]
     )
     def test_a_wrong_one_gets_a_sentence_of_metals(self, name, words):
         if words is None:  # light does pass it, but it has n and k
@@ -131,7 +131,7 @@ class TestNames:
         ("name", "words"),
         [
             ("PMNA", "did you mean 'PMMA'"),
-            ("unobtainium", "known are PMMA, .* as 'shelf/book/page'; or give the index itself"),
+            ("unobtainium", "choose one of PMMA, .* as 'shelf/book/page', or give the index itself"),
             ("specs/SCHOTT-optical/N-LAK33", "did you mean .*'specs/SCHOTT-optical/N-LAK33A'"),
             ("main/SiO2", "'main/SiO2' contains 16 pages .*'main/SiO2/Malitson', .* and others; give one of them"),
             ("main/AgGaSe2/Boyd-o", "cannot be read"),
