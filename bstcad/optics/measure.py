@@ -196,7 +196,7 @@ class _Rays:
     weight: float = 1.0  # weight of the pictures in a mean: inverse variance of their noise, on any scale
 
     def joined(self, other: _Rays) -> _Rays:
-        """Return the weighted mean of each set and the set of the same number in `other`; sets stay independent."""
+        """Return the sets averaged, by weight, with the sets of the same number in `other`; they stay independent."""
         weight = self.weight + other.weight
         share = other.weight / weight
 
@@ -563,7 +563,7 @@ def detail_width(source_image: float, pixel: float) -> float:
 
 @torch.no_grad()
 def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMAGE_POINTS_PER_SIDE) -> ImageSamples:
-    """Return the source's images through the lit points of an n x n grid on the back, at the first spectral line."""
+    """Return the source's images in the first spectral line through the lit cells of an n x n grid on the back."""
     first = channels[0]
     channels = [c for c in channels if (c.source.wavelength, c.index) == (first.source.wavelength, first.index)]
     pixel, flux = landing_pixels(channels, lens, screen, n)
@@ -580,7 +580,7 @@ def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMA
 
 @torch.no_grad()
 def landing_pixels(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int) -> tuple[Tensor, Tensor]:
-    """Return (pixel (2, channels, points), flux (channels, points)) of the light through n x n points of the back.
+    """Return (pixel (2, channels, points), flux (channels, points)) of the light through n x n cells of the back.
 
     pixel: column and row at which each channel's light lands, meaningless where the flux is zero.
     """

@@ -55,7 +55,7 @@ class Tubes:
         return from_first_net(self.rays, lens.unbounded(), plane)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
-        """Return (flux per pixel, row 0 = y max; Σ flux · mean squared distance of corners outside, pixel²)."""
+        """Return (flux per pixel, row 0 = y max; `outside` (pixel²) as the function `collect` defines it)."""
         return collect(screen.pixels_of(corners.position.double()), self.arriving_flux(corners), screen.shape)
 
     def transmitted_flux(self, corners: Landed) -> Tensor:

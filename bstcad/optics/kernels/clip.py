@@ -357,7 +357,7 @@ def _is_followed(thinnest, a, b, c):
 
 @inlined
 def _reversed(edge):
-    """Return the integrals of `along_edge` from b to a."""
+    """Return the integrals of `along_edge` for the edge traversed backwards."""
     return -edge[0], edge[2], edge[1]
 
 

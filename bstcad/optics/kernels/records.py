@@ -133,7 +133,7 @@ class RayCells(NamedTuple):
     """Grid of n x n cells with a ray in each."""
 
     n: int  # cells per side
-    key: np.uint64  # key of the jitter
+    key: np.uint64  # key of the jitter: sampling.hash_seed of the seed
     width: float  # size of a cell (mm)
     height: float
     half_x: float  # half extent of the window (mm)
