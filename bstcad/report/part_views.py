@@ -45,7 +45,7 @@ MIN_FONT_SCALE = 0.8  # smallest factor on the font size of a wide text; a text 
 UNKNOWN = "\u25a1"  # box for a character that the font lacks
 CONTOUR_POINTS, SECTION_POINTS = 241, 401  # points of the map of heights per axis, and of each face of a section
 MAX_CONTOURS = 18  # largest number of contour lines
-NOTE_CORNERS = ((1, 1), (-1, -1), (1, -1))  # corners of the plan (right, up) for the notes on kinds of holes
+NOTE_CORNERS = ((1, 1), (-1, -1), (1, -1))  # corners of the plan for notes on holes (1: right or up, -1: left or down)
 EQUAL_DIMENSIONS = 5e-4  # difference below which two dimensions print the same number (mm)
 AXIS_LENGTH = 7.0  # length of the arrows of the coordinate frame (mm)
 # Margins on paper (mm): left of the plan, between plan and first section, between the sections, right of the second;
