@@ -28,8 +28,8 @@ MAIN_FIELDS: tuple[Mapping[str, str], ...] = (
         "target.uniform": "Uniform light instead of a picture", "target.profile.shape": "Shape of the light spot",
     },
     {"target.z": "Position of the wall (z)"},
-    {"target.x": "Picture on the wall: from left to right (x)"},
-    {"target.y": "Picture on the wall: from bottom to top (y)"},
+    {"target.x": "Picture on the wall: horizontal range (x)"},
+    {"target.y": "Picture on the wall: vertical range (y)"},
     {"lens.outline.shape": "Outline of the lens"},
     {
         "lens.outline.width": "Width of the lens", "lens.outline.diameter": "Diameter of the lens",
@@ -46,8 +46,9 @@ MAIN_FIELDS: tuple[Mapping[str, str], ...] = (
     {"target.gamma": "Gamma of the picture"},
     {"tailoring.quality": "Quality"},
 )  # fmt: skip
-# Labels of two keys z for a front face at z = 0: they are then distances from it.
+# Labels of two keys z, which are distances if the front face or the lamp is at z = 0.
 FROM_FRONT = {"lens.back.z": "Thickness at the centre", "target.z": "Distance of the wall from the front face"}
+FROM_LAMP = {"lens.back.z": "Back face: position from the lamp (z)", "target.z": "Wall: position from the lamp (z)"}
 HELP = {  # help of main fields, instead of the description of the key
     "target.z": "The front is the face that the light enters; the drawing shows the distance from the other face.",
     "target.x": "-30, 30 is a picture 60 mm wide, centred on the axis of the lens.",
@@ -60,7 +61,7 @@ HELP = {  # help of main fields, instead of the description of the key
     "source.wavelength": "Colour; for sunlight or white light, leave it unchanged. Several: [[nm, weight], …].",
     "target.seen_from": "lens: beside the lens, in front of the wall. behind: behind a translucent wall.",
     "target.fit": "crop: cut off its edges. pad: add dark borders. stretch: change its proportions.",
-    "target.gamma": "Leave it empty for a photo; 1 if the numbers of the file are irradiance.",
+    "target.gamma": "Leave it empty for a photo or a drawing; 1 if the numbers of the file are irradiance.",
     "tailoring.quality": "draft is fast, fine is accurate; paper is the procedure of Wang et al. 2023.",
 }
 SECTIONS = {  # labels, by key, of sections whose key would be unclear as a title
@@ -174,14 +175,17 @@ def form(data: Table) -> SceneForm:
     sections = (names, *(replace(group, label=SECTIONS.get(group.key, group.label)) for group in whole.groups))
     known = {field.key: field for group in whole.walk() for field in group.fields}
     several = "target[0]" in {group.key for group in whole.walk()}
+    lamp = value_at("source.position", data) if value_at("source.kind", data) == "point" else []
+    is_lamp_at_zero = lamp is None or (isinstance(lamp, list) and lamp[2:] == [0])
+    distances = FROM_FRONT if value_at("lens.front.z", data) == 0 else FROM_LAMP if is_lamp_at_zero else {}
     first = []
     for labels in MAIN_FIELDS:
         found = []
         for key, label in labels.items():
             if several and key.startswith("target."):
                 key, label = key.replace("target", "target[0]", 1), f"{label} ({_label('target[0]')})"
-            elif value_at("lens.front.z", data) == 0:
-                label = FROM_FRONT.get(key, label)
+            else:
+                label = distances.get(key, label)
             if key in known:
                 meaning = HELP.get(without_numbers(key), known[key].meaning)
                 found.append(replace(known[key], label=label, meaning=meaning))

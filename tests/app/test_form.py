@@ -114,7 +114,8 @@ def test_the_first_fields_are_keys_and_follow_the_kind():
     known = {without_numbers(row.key): row for row in rows()}
     assert all(key in known and label for labels in MAIN_FIELDS for key, label in labels.items())
     labels = {name: {field.label: field for field in form(data).first} for name, data in DATA.items()}
-    assert {"Width of the lens", "Height of the lens", "Position of the wall (z)", "Quality"} <= labels["disk"].keys()
+    assert {"Width of the lens", "Height of the lens", "Wall: position from the lamp (z)"} <= labels["disk"].keys()
+    assert {"Position of the wall (z)", "Quality"} <= labels["thu"].keys()
     assert labels["beam_shaper"]["Diameter of the lens"].value == "15"
     assert labels["led"]["Radius of the lens"].value == "12" and "Width of the lens" not in labels["led"]
     assert labels["beam_shaper"]["Refractive index"].key == "lens.index"
