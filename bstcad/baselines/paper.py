@@ -126,7 +126,7 @@ def tent_average(target: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class TentMerit:
-    """RRMSD² of rays by tent binning (Wang et al. 2023, Eq. 15), plus the overshoot term of merit.py, over channels."""
+    """RRMSD² (Wang et al. 2023, Eq. 15) of all channels by tent binning of rays, plus overshoot term of merit.py."""
 
     channels: tuple[Channel, ...]  # channels of the light
     screen: Screen  # screen of the target

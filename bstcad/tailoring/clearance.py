@@ -46,8 +46,8 @@ def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], flo
 
     The excess is e = max(thinnest - t, t - thickest) / unit, along the rim with max(thinnest, edge) as thinnest.  With
     m = PENALTY_MARGIN the penalty is the mean of max(e + m, 0)² over the grid, plus the mean along the rim if `edge` is
-    given.  If every e < -m, the largest excess is -m and the gradients are {}.  The key of a gradient is the number
-    of the face in whose heights it is.  Sums have fixed parts, so that no bit depends on the number of threads.
+    given.  If every e < -m, the largest excess is -m and the gradients are {}.  The keys of the gradients are the
+    numbers of the faces.  Sums have fixed parts, so that no bit depends on the number of threads.
     """
     length, square, worst = unit(lens, bounds), 0.0, -PENALTY_MARGIN
     front, back = lens.number_of("front"), lens.number_of("back")
@@ -157,7 +157,7 @@ class CellGrid:
 
 
 def _tile_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: np.ufunc) -> np.ndarray:
-    """Return the minimum (np.minimum) or maximum height (mm) of the control points of each tile of cells."""
+    """Return the lowest or highest control point (mm) of each tile; begins: first points of the cells, by axis."""
     for axis, begin in enumerate(begins):
         tiles = np.split(begin, range(TILE_CELLS, len(begin), TILE_CELLS))
         windows = [slice(tile[0], tile[-1] + CELL_POINTS) for tile in tiles]
@@ -167,7 +167,7 @@ def _tile_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: n
 
 
 def _cell_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: np.ufunc) -> np.ndarray:
-    """Return the minimum (np.minimum) or maximum height (mm) of the control points of each cell."""
+    """Return the lowest or highest control point (mm) of each cell; begins: first points of the cells, by axis."""
     for axis, begin in enumerate(begins):
         heights = np.moveaxis(heights, axis, 0)
         for step in (1, 2):  # extremes of two neighbouring control points, then of four

@@ -64,7 +64,7 @@ class Grazing:
         return cls(net, rays, weight / total(weight), eta=eta, angle=edge.angle)
 
     def __call__(self, heights: Tensor) -> tuple[float, Tensor, float]:
-        """Return the penalty, its gradient in the heights (m, n) in 1/mm, and the largest u over the light."""
+        """Return the penalty, its gradient in the heights (m, n) in 1/mm, and the largest u where there is light."""
         (x, y, _), (d_x, d_y, d_z) = self.at_face.position.double(), self.at_face.direction.double()
         pitch_x, pitch_y = self.net.pitch
         leaf, limit = heights.detach().double().requires_grad_(), math.sin(self.angle) ** 2

@@ -46,7 +46,7 @@ from bstcad.tailoring.slope_map import centroid, pixel_corners, resample_picture
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Points, Solver, grid_coordinates, solve
 
-MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # number of rounds; all but the last: max(n / 4, 64) cells
+MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds; cells per side in all except the last: max(n/4, 64)
 MAX_WAVE_ITERATIONS = 40  # largest number of iterations for the point of a wave that sends a ray to a given point
 WAVE_TOLERANCE = 1e-9  # change (mm) of the point of the wave below which these iterations have converged
 SOURCE_FLOOR = 0.02  # smallest irradiance of the map's source picture, relative to its mean: black would leave holes
@@ -84,7 +84,7 @@ class LightBehind:
         return _dot(e_x, off) + x, _dot(e_y, off) + y
 
     def sampled_at(self, screen: Screen, values: np.ndarray) -> np.ndarray:
-        """Interpolate values (k, c + 1, r + 1) at the rays to pixel corners of a screen, (k, columns + 1, rows + 1)."""
+        """Interpolate values at the rays (k, c + 1, r + 1) to a screen's pixel corners, (k, columns + 1, rows + 1)."""
         x, y = self.positions_on(screen.plane)
         if float((x[1:] - x[:-1]).mean()) < 0:
             x, y, values = x[::-1, ::-1], y[::-1, ::-1], values[:, ::-1, ::-1]

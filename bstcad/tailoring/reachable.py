@@ -5,8 +5,8 @@ map decides which point of the face lights which point of the target (aim), and 
 there are three checks, each more expensive and only made if the previous check is inconclusive:
 
 1. Every lit point of the face reaches all of the lit target: then any map is feasible.
-2. Each aim is reached from the point at the same relative position in the face: rays of transport maps do not cross,
-   so that they are close to the map to equal relative positions.
+2. Each aim is reached from the point of the face with the same relative position in the lit window as the aim has in
+   the lit target: rays of transport maps do not cross, so that these maps nearly preserve relative positions.
 3. Coarse maps are computed, each for the part of the target that the previous map could light.  The first map is for
    the part that at least one point of the face reaches.
 """

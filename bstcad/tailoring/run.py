@@ -83,7 +83,7 @@ RRMSD_SECONDS = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
 # error of the product of two pictures of n² stratified rays varies as (p / n)³ / p, so a target of p pixels per side
 # needs (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays per side.
 STAGE_EFFORT, STAGE_EFFORT_PIXELS = Effort(rays=724, accuracy=0, witness=False), 512
-FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays for a scene with accuracy or bounds, or `better`
+FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays for scenes with accuracy or bounds, and `better`
 FLUX_EFFORT = Effort(rays=128, accuracy=1.0, witness=False)  # rays for the flux on the target alone
 
 Progress = Callable[[str, int, int, str], None]  # called with stage, units done, units in total, text
@@ -170,7 +170,7 @@ class Task:
             pixels = max(goal.picture.size for goal in self.goals)
             rays = STAGE_EFFORT.rays * (pixels / STAGE_EFFORT_PIXELS**2) ** (1 / 3)
             effort = replace(STAGE_EFFORT, rays=round(rays))
-        sources = () if self.sampled_sources else self.extended_sources  # before stage 3 the light of the centre rates
+        sources = () if self.sampled_sources else self.extended_sources  # centre alone before stage 3
         draw = sources[-1].draw if sources else None  # samples the source at full size
         lens = lens.plain()
         values = [rrmsd_by_rays(lens, self.channels, goal, effort, draw=draw) for goal in self.goals]

@@ -1,8 +1,8 @@
 """The transport map of stage 1: optimal transport from points of a face to its slopes, a map that a surface can follow.
 
-The map of Wang et al. 2023 leads from source points to target points.  It is a gradient only in the paraxial limit;
-off axis, a fit to it loses the part that no surface can follow.  Here the transport problem is solved between points of
-the face and slopes, where the map is the gradient of the surface.  A ray that meets the last freeform face at b and
+The map of Wang et al. 2023 leads from source points to target points.  The slopes that it needs are a gradient only in
+the paraxial limit; off axis, a fit to them loses the part that no surface can follow.  Here the transport problem is
+solved between points of the face and slopes, which are a gradient.  A ray that meets the last freeform face at b and
 shall reach the target point t needs the slope p(b, t), which follows from Snell's law or the law of reflection in
 closed form.  Let m be the centroid of the light on the target, and g a surface fitted to the slopes p(b, m), which
 nearly sends all light to m.  The coordinate
@@ -128,7 +128,7 @@ class SlopeMap:
     gathering: BSplineSurface  # surface g
     sign: float  # sign σ, 1 or -1
     face_points: Points  # b (mm) for the corners of the target's pixels, (columns + 1, rows + 1)
-    moved: float  # RMS change of b in the last round at lit corners / half a side of the `square_grid`; NaN: none
+    moved: float  # RMS change of b in the last round at lit corners / half side of the `square_grid`; NaN: first round
 
     def slopes(self, x: Tensor, y: Tensor) -> Slopes:
         """Return the slopes (∂z/∂x, ∂z/∂y) needed at points x, y (n,) of the last freeform face (mm)."""
@@ -223,7 +223,7 @@ def gathering(
 ) -> BSplineSurface:
     """Return g, the net of GATHERING_NET points per side whose slopes fit p(b, m) best over the lit part of a grid.
 
-    For a fixed sag, p(b, m) is a gradient except for a curl of the order of x y |∂p/∂z|.  middle: m (mm).
+    The slopes p(b, m) themselves are in general not exactly the gradient of a surface.  middle: m (mm).
     """
     count, fit = (PREVIEW_SAMPLES, PREVIEW_FIT) if preview else (GATHERING_SAMPLES, GATHERING_FIT)
     few, law = grid.thinned(count), lens.last_freeform.law

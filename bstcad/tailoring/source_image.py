@@ -38,7 +38,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import point_pairs
 
-IMAGE_NODES = 5  # nodes per side, from border to border of the screen
+IMAGE_NODES = 5  # nodes per side; the outermost lie on the edges of the screen
 IMAGE_GRID = 32  # points per side on the back through which the images of the source are traced
 POINT_DISTANCE = 0.7  # spacing of the 3 x 3 points of the source along each axis, in half widths of the source
 IMAGE_PAIRS = 256  # pairs of source points that represent an image

@@ -47,8 +47,8 @@ COARSE_FACE_FIT = Fit(bending=1e-2, steps=40, degree=3)  # fit of coarse rounds:
 FINE_FACE_FIT = Fit(unlit=1e-2)  # fit of fine rounds: weak fit to the previous slopes where no light falls
 FINE_ROUNDS = 2  # number of fine rounds: the first has half the cells per side of the last
 # RRMSD, and RMS change of the map in the last round, above which `follow_aims` is tried.  The unit of the change is
-# half a side of the square around the light (`slope_map.square_grid`).  Where more rounds gain nothing, the change is
-# at most 0.016.
+# half a side of the square around the light (`slope_map.square_grid`).  For lenses that further rounds do not improve
+# the change is at most 0.016.
 RETRY_RRMSD, RETRY_CHANGE = 0.25, 0.025
 SETTLED_CHANGE = 0.01  # RMS change of the map, in the unit of RETRY_CHANGE, below which coarse rounds end
 MAX_RAY_CELLS = 1026  # largest number of rays per side in the slope fit; a finer grid interpolates between rays

@@ -68,7 +68,7 @@ LARGE_PIXELS, FAR_OFF_RRMSD = 16, 0.04
 # since no coarse round can follow it: a stage must not end with few pixels.  (Draft of a plate with at most 2 mm of
 # glass: RRMSD 0.264 with a factor of 1.5, 0.236 with 3, but 0.408 if 60 evaluations on 64 pixels come last.)
 EVALUATION_FACTOR, SINGLE_ROUND_FACTOR = 1.5, 3.0
-IMAGE_POSITIONS, SECOND_MOMENT_POINTS = 16, 8  # rays per side and source points that give the source image's width
+IMAGE_POSITIONS, SECOND_MOMENT_POINTS = 16, 8  # cells per side of the back, source points: for the image width
 MIN_EVALUATIONS = 30  # evaluations below which stage 2 has a single round and stage 3 gets twice as many
 COMPARED_NET = 65  # largest number of control points per side in `compare_precisions`, for speed
 COMPARED_TUBES = 128  # tubes per side in `compare_precisions`
@@ -76,7 +76,7 @@ COMPARED_EVALUATIONS = 6  # evaluations in each precision in `compare_precisions
 # Rounds of stage 3: (size of the source, evaluations), as fractions of the full size and of all evaluations.  Each
 # round measures the error of the blur anew (source_image.py).
 SOURCE_SIZES = ((1 / 3, 1 / 8), (2 / 3, 1 / 8), (1.0, 1 / 4), (1.0, 1 / 4), (1.0, 1 / 4))
-TUBES_PER_CELL, TUBES_PER_PIXEL = 2.0, 1.1  # tubes per axis in a net cell and a pixel (stage 3): the blur hides detail
+TUBES_PER_CELL, TUBES_PER_PIXEL = 2.0, 1.1  # tubes per axis in a cell and a pixel in stage 3: the blur hides detail
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ class TubeSearch:
 def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Steps:
     """Yield the steps of stage 2: if the evaluations suffice, rounds with few tubes come first.
 
-    Few tubes resolve the large errors at first as well as many.  The last round corrects the finer errors.
+    Few tubes resolve the large errors at the start as well as many tubes do.  The last round corrects finer errors.
     """
     coarse, fine = coarse_rounds(task, lens), tuple(sheet_sizes(task.knobs, round_shares(task)))
     factor = 1.0 if not coarse else EVALUATION_FACTOR if len(fine) > 1 else SINGLE_ROUND_FACTOR
@@ -289,8 +289,8 @@ def _overshoot_weight(task: Task, lens: Lens) -> float:
 class Problem:
     """Merit of stage 2 and its gradients in the heights of all nets, for a fixed sheet of tubes per channel.
 
-    The fused kernels store the landing point of each tube corner, not its path.  They need some 100 bytes of memory per
-    corner, whatever the number of control points.
+    For each tube corner the fused kernels store the landing point and the path length to the face, not the steps of the
+    intersection.  They need some 100 bytes of memory per corner, whatever the number of control points.
     """
 
     lens: Lens

@@ -43,8 +43,8 @@ from bstcad.transport.mapping import Points, Solver
 
 POINT_SHIFT = 1e-4  # shift of a point for difference quotients of slopes, relative to the thickness
 # Number of fine rounds: the last one has the full grid and nets, the others have half as many cells per side and the
-# second finest nets, until the faces fit each other.  (With two fine rounds, the errors of two photographs averaged
-# over blocks of 4 to 32 pixels are 1.5 times larger.)
+# second finest nets.  Several rounds are needed until the faces fit each other.  (With two, the errors of two
+# photographs, averaged over blocks of 4 to 32 pixels, are 1.5 times larger.)
 FINE_PAIR_ROUNDS = 4
 SETTLED_FRONT = 0.003  # RMS change of q(t), in half widths of the front's lit part, below which the coarse rounds end
 
