@@ -203,4 +203,4 @@ def test_a_gradient_that_is_not_finite_is_counted_and_left_out(bad, small_scene,
     assert found.making.skipped_steps == 2 and small_design.report["skipped_steps"] == 0
     assert bool(torch.isfinite(found.lens.back.heights).all())
     ratio = found.making.history[-1].rrmsd / small_design.report["history"][-1]["rrmsd"]
-    holds("RRMSD with two gradients that are not finite, divided by that without", ratio, 1.5)
+    holds("RRMSD with two gradients that are not finite, divided by the RRMSD without them", ratio, 1.5)
