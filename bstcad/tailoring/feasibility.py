@@ -34,7 +34,7 @@ from bstcad.transport.mapping import Solver
 TRIAL_CELLS, TRIAL_PIXELS = 64, 128  # transport grid of the trial (cells per side), pixels on the pictures' longer side
 TRIAL_ITERATIONS = 100  # iterations of the trial's maps
 MAX_UNSERVED = 0.5  # largest fraction of the light whose rays may miss the back's aperture or cross each other
-REPORTED_FRACTION = 1e-3  # smallest fraction of the light with such rays that is reported
+REPORTED_FRACTION = 1e-3  # smallest reported fraction of light that misses the aperture or whose rays cross
 MAX_GENTLE_DEFLECTION = 30.0  # largest deflection at the front for which the furthest picture needs no floor (degrees)
 TRIED_FLOORS = (0.1, 0.2, 0.4, 1.0)  # floors, relative to the mean of the furthest picture, tried in this order
 SOLUTION_NAMES = {1.0: "convex", -1.0: "concave"}  # names of the solutions with the sign σ of light_behind.py

@@ -48,7 +48,7 @@ from bstcad.transport.mapping import Points, Solver, grid_coordinates, solve
 
 MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds; cells per side in all except the last: max(n/4, 64)
 MAX_WAVE_ITERATIONS = 40  # largest number of iterations for the point of a wave that sends a ray to a given point
-WAVE_TOLERANCE = 1e-9  # change (mm) of the point of the wave below which these iterations have converged
+WAVE_TOLERANCE = 1e-9  # change (mm) below which the iterations for a point of the wave have converged
 SOURCE_FLOOR = 0.02  # smallest irradiance of the map's source picture, relative to its mean: black would leave holes
 # Standard deviations (pixels) of the blur of the source picture, solved in this order.  For a portrait with dark parts
 # beside bright ones, Newton's method ends at a mass error of 0.06 to 0.25 without this blur, and at 0.003 with it.
@@ -140,7 +140,7 @@ def light_for_task(task: Task) -> LightBehind:
     # twice, so that a single goal is both the nearest and the furthest
     near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.receiver.plane.throw(0.0))
     if any(goal.receiver.plane.frame is None for goal in (near, far)):
-        raise SceneError("target: a design for several targets needs planes; make each target a plane")
+        raise SceneError("target: several targets, or a wavefront, need plane targets; make each target a plane")
     n = task.knobs.transport_grid
     if task.wave is not None:
         parts = max(1, round(n / max(near.receiver.shape)))
@@ -258,7 +258,7 @@ def _normalised(way: np.ndarray) -> np.ndarray:
 def without_crossings(light: LightBehind, screen: Screen, surface: Surface, n: int) -> LightBehind:
     """Return `light`, or if its rays cross between a surface and the screen, similar rays that do not.
 
-    The flux on the surface stays the same.  The new rays follow the optimal map from the screen to the surface.
+    The flux on the surface stays the same.  The new rays follow the optimal map on n x n cells from screen to surface.
     """
     if light.crossed_fraction(surface) <= CROSSING_TOLERANCE:
         return light

@@ -113,7 +113,7 @@ def lit_window(source: Emitter, lens: Lens, n: int = 128) -> Rectangle:
     lit = grid.density > 0
     if not bool(lit.any()):
         raise SceneError(
-            "source: none of its rays reaches the back; move the source away from the front, or lower lens.back.z"
+            "source: no ray reaches the tailored face; move the source away from the front, or lower lens.back.z"
         )
     x, y, _ = grid.at_face.position
     x_max, y_max = (float(p.abs()[lit].max()) + 2.5 * 2 * half / n for p, half in ((x, half_x), (y, half_y)))

@@ -44,11 +44,11 @@ POINT_DISTANCE = 0.7  # spacing of the 3 x 3 points of the source along each axi
 IMAGE_PAIRS = 256  # pairs of source points that represent an image
 PIXEL_PARTS = 5  # parts of a pixel per axis in the images; odd
 ERROR_RAYS = 1448  # square root of the number of rays in each of the two sets that measure the error of the blur
-ERROR_POINTS = 256  # source points in each of the two sets
+ERROR_POINTS = 256  # source points in each of the two sets of rays that measure the error of the blur
 ERROR_SMOOTHING = 0.15  # standard deviation of the smoothing of the blur error / reach of the images (border - 2)
 MAX_TRANSFORM_BYTES, VALUE_BYTES = 2 << 30, 8  # largest size of the transforms of all images, size of one value (bytes)
 MIN_BORDER = 16  # smallest border around the screen (pixels)
-ERROR_SEED_OFFSET = 500_009  # offset of the seed, so that these rays are independent of the rays of the verification
+ERROR_SEED_OFFSET = 500_009  # offset of the seed of the rays of ERROR_RAYS: independent of the verification's rays
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class LocalImages:
 
     at: Tensor  # (2, points) landing points of the centre's light (column, row) in pixels
     offset: Tensor  # (2, 9, points) displacement δ of 3 x 3 points of the source, in pixels
-    flux: Tensor  # (9, points) flux from each of the 3 x 3 points, relative to the centre
+    flux: Tensor  # (9, points) flux from each of the 3 x 3 points, relative to the flux from the centre
 
     @classmethod
     def of(cls, source: Emitter, channel: Channel, lens: Lens, screen: Screen) -> LocalImages:
