@@ -51,8 +51,8 @@ SCENES = {  # template: what it is
     "portrait": "Portrait, point source (example 1 of Wang et al.)",
     "off_axis": "Portrait, off axis, collimated",
     "mirror": "Portrait on the wall, by a mirror below a lamp",
-    "caustic_portrait": "Portrait, on axis, 100 mm (the scene of other programs)",
-    "caustic_letters": "Letters, on axis, 100 mm (the scene of other programs)",
+    "caustic_portrait": "Portrait, on axis, 300 mm behind the lens (the scene of other programs)",
+    "caustic_letters": "Letters, on axis, 300 mm behind the lens (the scene of other programs)",
 }
 PEER = "caustic_portrait"  # the scene of Mitsuba's caustic optimisation
 FIGURES = {PEER: "accuracy.png", "thu": "accuracy-letters.png"}  # names of the figures in docs/, by sweep
