@@ -244,7 +244,7 @@ class BSplineSurface(Surface):
 
     @property
     def side(self) -> int:
-        """Control points per side of a square net with as many points."""
+        """Control points per side of a square net with about as many points as this net."""
         return side(self.shape)
 
     @property
@@ -282,7 +282,7 @@ class BSplineSurface(Surface):
         return replace(self, heights=torch.from_numpy(heights).to(self.heights))
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Return the minimum and maximum (mm) of zero and the heights that act on the surface inside the outline."""
+        """Return the minimum and maximum of zero and of the control heights over z0 (mm) acting inside the outline."""
         (pitch_x, pitch_y), net = self.pitch, self.control_points()
         x, y = (np.maximum(np.abs(net[..., i]) - 2 * pitch, 0.0) for i, pitch in enumerate((pitch_x, pitch_y)))
         heights = self.heights.detach().cpu()[outline.contains(torch.from_numpy(x), torch.from_numpy(y))]
@@ -374,9 +374,9 @@ class Spans:
 
     shape: tuple[int, int]  # control points of the net along x and along y
     pitch: tuple[float, float]  # spacing of the control points along x and along y (mm)
-    i: Tensor  # numbers of the spans along x, (n,) int64
-    j: Tensor  # numbers of the spans along y, (n,) int64
-    heights: Tensor  # heights of the nine control points of each span, (9, n) mm, x along the slower index
+    i: Tensor  # numbers of the spans along x, (spans,) int64
+    j: Tensor  # numbers of the spans along y, (spans,) int64
+    heights: Tensor  # heights of the nine control points of each span, (9, spans) mm, x along the slower index
 
     @classmethod
     def of(cls, surface: BSplineSurface, i: Tensor, j: Tensor) -> Spans:
@@ -408,7 +408,7 @@ class Spans:
         return [[torch.stack([w[order][k] for w in each]).to(self.heights) for k in range(3)] for order in range(3)]
 
     def scattered(self, gradient: Tensor) -> Tensor:
-        """Return a gradient in `heights` (9, n) as a gradient in the net (m, n), added up in a fixed order."""
+        """Return a gradient in `heights` (9, spans) as a gradient in the net (m, n), added up in a fixed order."""
         m, n = self.shape
         net, corner = torch.zeros(m * n).to(gradient), self.i * n + self.j
         for k, part in enumerate(gradient):

@@ -19,7 +19,7 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, tilt_of
 
-WIDTHS_BEFORE_LENS = 4.0  # distance from the lens to the aperture of a rotated beam without z, in its diagonals
+WIDTHS_BEFORE_LENS = 4.0  # distance from lens to aperture of a rotated beam without z, in diagonals of the aperture
 MAX_INCLINATION = 89.0  # degrees, largest angle of parallel light to the axis of the lens
 
 
@@ -114,7 +114,7 @@ class Collimated(Emitter):
         return replace(self, divergence=share * self.divergence if share and self.divergence else None)
 
     def element(self, u: float, v: float) -> Collimated:
-        """Return the beam at (u, v) of the extent: (d_x, d_y) = cos α n + u e_x + v e_y, and d_z from |d| = 1."""
+        """Return the beam at (u, v) of the extent: d_x and d_y from cos α n + u e_x + v e_y, and d_z from |d| = 1."""
         e_x, e_y, n = self.axes
         cos = math.cos(math.radians((self.divergence or 0.0) / 2))
         d_x, d_y = (cos * n[i] + u * e_x[i] + v * e_y[i] for i in (0, 1))

@@ -42,7 +42,7 @@ class Refract:
 
     cos² θ' = 1 - η² (1 - cos² θ) <= 0 means total internal reflection; rays that meet the surface from behind
     (cos θ <= 0) also count as totally reflected.  Neither has a gradient.  The gradient of the other rays grows towards
-    the critical angle as d cos θ' = η² cos θ / cos θ' d cos θ.  It is capped there: in this derivative, and nowhere
+    the critical angle as d cos θ' = (η² cos θ / cos θ') d cos θ.  It is capped there: in this derivative, and nowhere
     else, cos θ' is at least MIN_COS_REFRACTION.
     """
 
@@ -246,8 +246,8 @@ def first_root(
 ) -> tuple[Tensor, Tensor]:
     """Return (s, meets): path s (mm) of live rays from their points `start` (3, …) on the base plane to the surface.
 
-    path: length (mm) from the position of each ray to `start`; roots behind the position do not count.  Rays that are
-    steep to the surface must begin in the glass.
+    path: signed length (mm) from the position of each ray to `start`; roots behind the position do not count.  Rays
+    that are steep to the surface must begin in the glass.
     """
     dx, dy, dz = rays.direction
     steep = rays.alive & ~(rays.sense * dz > bounds.steepest_x * dx.abs() + bounds.steepest_y * dy.abs())

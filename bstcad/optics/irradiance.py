@@ -95,7 +95,7 @@ class Screen:
         return (x - self.x[0]) * per_x, (self.y[1] - y) * per_y
 
     def pixels_of(self, position: Tensor) -> Tensor:
-        """Return columns and rows (2, …) in pixels of positions (2, …)."""
+        """Return (column, row) (2, …) of positions (2, …), as `pixel` does."""
         shape = (2, *[1] * (position.ndim - 1))
         per_x, per_y = self.per_unit
         corner = torch.tensor((self.x[0], self.y[1]), dtype=position.dtype, device=position.device).view(shape)

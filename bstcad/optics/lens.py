@@ -43,7 +43,7 @@ class Lens:
     index: float  # refractive index at the design wavelength; unused for a first-surface mirror
     reflects: bool = False  # True if a face reflects; if `own_passes` is None, True: MIRROR, False: LENS
     losses: LensLosses | None = None  # losses at its faces and in its glass; None: no losses
-    clear: tuple[Outline, Outline] | None = None  # clear apertures (front, back); None: front.outline or outline
+    clear: tuple[Outline, Outline] | None = None  # clear apertures (front, back); None: see `apertures`
     before: tuple[Interface, ...] = ()  # interfaces before the solid, such as a window
     behind: tuple[Interface, ...] = ()  # interfaces behind the solid, such as a fold mirror
     shaped: tuple[int, ...] | None = None  # numbers of the interfaces that tailoring shapes; None: the back alone
@@ -84,7 +84,7 @@ class Lens:
 
     @property
     def back_net(self) -> BSplineSurface:
-        """Back, which is a net in every scene; TypeError if it is not."""
+        """Back, which is a net in every scene; TypeError for another surface, which only a script can give."""
         return require_net(self.back)
 
     @property

@@ -11,10 +11,10 @@ For an extended source each set samples new source points, so that their finite 
 
 The picture for display is the mean of all sets, smoothed as long as this removes more noise than detail.  Flux tubes
 (tubes.py) give a second picture without noise, the witness; rays and tubes share only the trace.  Tubes interpolate
-linearly between their corners: with two tubes per control cell and side the error is about the RRMSD that remains after
-tailoring with tubes, with four a third of this error, with eight a tenth (measured).  The tubes are therefore halved in
-width until the pictures agree, or until the error of the tubes cannot explain the difference.  The RRMSD by tubes
-(`rrmsd_by_tubes`) is a few per cent too low for a lens tailored with them.  A ghost is traced once, for all sets.
+linearly between their corners: with two tubes per side of a cell of the net the error is about the RRMSD that remains
+after tailoring with tubes, with four a third of this error, with eight a tenth (measured).  The tubes are therefore
+halved in width until the pictures agree, or until the error of the tubes cannot explain the difference.  The RRMSD by
+tubes (`rrmsd_by_tubes`) is a few per cent too low for a lens tailored with them.  A ghost is traced once, for all sets.
 
 An extended source forms an image of itself through each point of the lens (`ImageSamples`).  All rays through one point
 of the back meet the same slope, whichever source point they come from: no lens can unite them in one point.
@@ -55,11 +55,11 @@ SIDE_EXPONENT = 0.5
 RAYS_PER_POINT = 1 << 13  # rays of each set per point of an extended source
 MIN_SOURCE_POINTS, MAX_SOURCE_POINTS = 8, 1024  # limits of the number of source points of each set
 MIN_TUBES = 513  # minimum tubes per side (`tubes_of`): fewer do not resolve pixels
-COARSE_SHEET = 64  # tubes per side of the coarse sheet (`few` of tubes.picture) if over_the_back; its error is 1e-6
+COARSE_SHEET = 64  # tubes per side of the coarse sheet (tubes.picture: `few`) if over_the_back; moves 1e-6 of the light
 PASS_SEEDS = 1 << 20  # difference between the seeds of successive passes of rays from an extended source
 GHOST_DIVISOR = 4  # rays per side divided by those of the ghost, which is about a thousandth of the light
 IMAGE_POINTS_PER_SIDE = 48  # points per side of the back face through which the image of the source is computed
-# Largest distance of an image from the centre of the screen, relative to the screen's width plus the median distance.
+# Largest distance of landing light from the screen's centre, divided by (longer side of the screen + median distance).
 # Light farther out grazes a tilted plane and does not belong to the image.
 MAX_IMAGE_DISTANCE = 16
 EVEN_POINT_PAIRS = 2048  # pairs of points that represent a uniformly bright source
@@ -69,13 +69,13 @@ EVEN_POINT_PAIRS = 2048  # pairs of points that represent a uniformly bright sou
 class Effort:
     """Limits of the work of a measurement; the default is the effort of a verification."""
 
-    rays: int = 2896  # maximum rays per side of the window in each of SETS sets: 67 million in total
+    rays: int = 2896  # maximum rays per side of the window in each of SETS sets: 67 million per spectral line
     seed: int = 0  # seed of the rays
     places: int = 1025  # points per side of the lens at which a verification evaluates the thickness
     points: int = 1 << 17  # points per face at which the written file is compared with the design
     accuracy: float = 0.005  # relative standard error of the RRMSD at which tracing ends; 0: all rays are traced
     seconds: float = math.inf  # time limit (s): no sets of rays are started that would end later
-    witness: bool = True  # True: flux tubes give a second picture of a point source
+    witness: bool = True  # True: flux tubes give a second picture, if the source has no extent
 
 
 FULL = Effort()
@@ -196,7 +196,7 @@ class _Rays:
     weight: float = 1.0  # weight of the pictures in a mean: inverse variance of their noise, on any scale
 
     def joined(self, other: _Rays) -> _Rays:
-        """Return the sets averaged, by weight, with the sets of the same number in `other`; they stay independent."""
+        """Return each set i averaged, by weight, with set i of `other`; the averaged sets stay independent."""
         weight = self.weight + other.weight
         share = other.weight / weight
 
@@ -220,7 +220,7 @@ class _Setup:
     ghost: GhostImage | None = None
 
     def trace(self, side: int, seed: int) -> _Rays:
-        """Trace SETS sets of about side x side rays each."""
+        """Trace SETS sets, each of about side x side rays per spectral line."""
         sets = []
         count = min(max(side**2 // RAYS_PER_POINT, MIN_SOURCE_POINTS), MAX_SOURCE_POINTS)
         for i in range(SETS):
@@ -554,9 +554,9 @@ def even_image(extent: Outline) -> ImageSamples:
 
 
 def detail_width(source_image: float, pixel: float) -> float:
-    """Return √(D² + 4/3 p²): diameter of the uniform disc whose variance is the sum of those of a disc D and a pixel p.
+    """Return √(D² + 4/3 p²): diameter of the uniform disc whose variance is the sum of those of a disc and a pixel.
 
-    The variances are D² / 8 and p² / 6; D, p and the result have the same unit of length.
+    D: `source_image`, diameter of the disc, variance D² / 8.  p: `pixel`, its side, variance p² / 6.  All in one unit.
     """
     return math.sqrt(source_image**2 + 4 / 3 * pixel**2)
 

@@ -112,9 +112,9 @@ def normalise_name(name: str) -> str:
 
 @lru_cache(maxsize=64)
 def find(name: str) -> str | None:
-    """Return the page named "shelf/book/page" or "book/page", or by the name of a glass alone, "N-LAK33A".
+    """Return the page of a name: "shelf/book/page", "book/page", or that of a glass alone, such as "N-LAK33A".
 
-    None if there is no such page; ValueError, with the names of pages, if there are several, or if it names a book.
+    None if there is no such page; ValueError, which lists pages, if several have the name or if it is that of a book.
     """
     known = pages()
     if name in known:

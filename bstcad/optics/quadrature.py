@@ -20,7 +20,7 @@ from bstcad.optics.surfaces import Surface
 MIN_SPANS = 128  # minimum parts of an axis of a net; the spans of a coarser net are divided
 GAUSS_POINTS_PER_PART = 3  # Gauss points in each part of a chord or of an edge
 FINE_NET = 400  # smallest number of control points per side at which FINE_POINTS give the area to 1e-9
-FINE_POINTS = 2  # Gauss points in each part of a chord or of an edge of a net with at least FINE_NET control points
+FINE_POINTS = 2  # Gauss points in each part of a chord or of an edge of a net of at least FINE_NET points per side
 CHORD_POINTS = 96  # Gauss points of a chord over a smooth face; exact to rounding on a sphere to 0.95 of its radius
 END_PARTS = 12  # minimum parts of an end span, where h(x) is not a polynomial; gives volumes to 1e-12
 BORDER_POINTS_PER_STRIP = 512  # border points evaluated at a time

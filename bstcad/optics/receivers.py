@@ -198,7 +198,7 @@ def _rotate(motion: Motion, vector: Array | Sequence[Array]) -> tuple[Array, Arr
 
 
 class PlaneReceiver(Receiver):
-    """Plane P = C + (x - o_x) e_x + (y - o_y) e_y, n · (p - C) = 0, with centre C at the coordinates o."""
+    """Plane of points p = C + (x - o_x) e_x + (y - o_y) e_y: n · (p - C) = 0, with centre C at the coordinates o."""
 
     @property
     def frame(self) -> Frame:

@@ -83,7 +83,7 @@ class PlaneWave(_Wave):
         """Yield the common reasons, and a sentence if the direction does not lead away from the lens."""
         yield from super().complaints(back)
         if not self.direction[2] > math.cos(MAX_RAY_ANGLE) * math.hypot(*self.direction):
-            yield f"direction: {list(self.direction)} does not point along +z; give a vector such as [0.0, 0.0, 1.0]"
+            yield f"direction: {list(self.direction)} is 89 degrees or more from +z; give one such as [0.0, 0.0, 1.0]"
 
 
 @dataclass(frozen=True)

@@ -157,7 +157,7 @@ class WavefrontError:
 def wavefront_error(source: Emitter, lens: Lens, wave: Wave, n: int = RAYS_PER_SIDE) -> WavefrontError:
     """Return the wavefront error of a lens, computed with n x n rays of a point or parallel source.
 
-    The lens must have the index for the source's main wavelength.  Raises ValueError if no ray can be compared.
+    The lens must have the index at the main wavelength.  Raises ValueError if fewer than three rays can be compared.
     """
     pupil, nm = exit_pupil(source, lens, wave.z, n), source.main_wavelength
     compared, without_piston, fit, share = _compare(pupil, wave, nm)
@@ -178,9 +178,9 @@ def wavefront_error(source: Emitter, lens: Lens, wave: Wave, n: int = RAYS_PER_S
 
 @torch.no_grad()
 def residual(pupil: ExitPupil, wave: Wave, nm: float) -> Tensor:
-    """Return the OPD (n, n) without piston and tilt, in waves of nm, times sqrt(flux fraction); 0 if not compared.
+    """Return the OPD (n, n) without piston and tilt, in waves of nm, times sqrt(flux / total flux); 0: not compared.
 
-    The root of the sum of squares is the RMS OPD.  Raises ValueError if no ray can be compared.
+    The root of the sum of squares is the RMS OPD.  Raises ValueError if fewer than three rays can be compared.
     """
     compared, without_piston, fit, share = _compare(pupil, wave, nm)
     weighted = torch.zeros_like(pupil.path)
@@ -193,7 +193,7 @@ def _compare(pupil: ExitPupil, wave: Wave, nm: float) -> tuple[Tensor, Tensor, _
     """Return (compared rays (n, n); for these: OPD without piston in mm, its plane fit, flux divided by its sum)."""
     compared = pupil.alive & wave.contains(pupil.x, pupil.y)
     if int(compared.sum()) < 3:
-        raise ValueError(f"no light reaches the goal wave on the plane z = {wave.z:g} mm; change z or the circle")
+        raise ValueError(f"too few rays reach the wave at z = {wave.z:g} mm; change z, or the circle of a Zernike wave")
     x, y, path, flux = (part[compared] for part in (pupil.x, pupil.y, pupil.path, pupil.flux))
     opd, share = path - wave.path(x, y, nm), flux / float(total(flux))
     fit = _least_squares(x, y, opd, share=share)

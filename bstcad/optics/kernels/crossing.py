@@ -7,8 +7,8 @@ With the ray x + t d, the face's normal n = (-p, -q, 1) of its slopes p and q, a
 
     dX = dx + t dd + d dt,   dt = (dsag - n · (dx + t dd)) / (n · d),   dp = S_xx dX_x + S_xy dX_y, dq likewise,
 
-and the direction behind the face is e = η d + s n, s(p, q, n · d) by the law.  The adjoint is the transpose of this
-map. It is computed for the net, and for x and d where these need a gradient.
+S_xx … the sag's second derivatives.  The direction behind the face is e = η d + s n, s(p, q, n · d) by the law.  The
+adjoint is the transpose of this map. It is computed for the net, and for x and d where these need a gradient.
 """
 
 from __future__ import annotations

@@ -169,7 +169,7 @@ def search(net, faces, count, work, active):
 
 @njit(error_model="numpy")
 def at_back(faces, count, work):
-    """Move rays to the back face; lose rays outside its clear aperture, with a hit behind them, or tangent to it."""
+    """Move rays to the back face; lose rays that hit it outside its aperture, behind their start, or tangentially."""
     for r in range(count):
         s, dx, dy, dz = work[S + r], work[DX + r], work[DY + r], work[DZ + r]
         x, y = work[X + r] + s * dx, work[Y + r] + s * dy

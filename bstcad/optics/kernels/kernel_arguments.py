@@ -44,7 +44,7 @@ def rules() -> Rules:
 def faces(
     interface: Interface, plane: Receiver | None, sense: int, start: float, front: Interface | None = None
 ) -> tuple[Faces, records.TiltedScreen | None]:
-    """Return (numbers of a net, and of front and screen if any; TiltedScreen, None for a level screen or none).
+    """Return (Faces of a net, with front and screen if given; TiltedScreen, or None for a level screen or no screen).
 
     The kernels trace light along +z.  If light comes along -z (sense -1), all numbers describe the scene reflected by
     z -> -z, as the heights and the rays must (crossing.reflect_z).  start: `Rays.z`, or z of the first vertex (mm).

@@ -84,7 +84,7 @@ class Fates(NamedTuple):
 
 
 class TiltedScreen(NamedTuple):
-    """Tilted plane as numbers, in the frame in which light starts along +z; z of C over the net is `Faces.throw`."""
+    """Tilted plane as numbers, in the frame in which light starts along +z; `Faces.throw` is z of C over the net."""
 
     x: float  # position of the centre C of the rotation (mm), also the coordinates of C on the plane
     y: float
