@@ -8,7 +8,7 @@ import bstcad
 
 design = bstcad.open(sys.argv[1] if len(sys.argv) > 1 else "outputs/disk")
 box = design.solid().BoundingBox()
-gap, edge = 2.0, 4.0  # mm, between lenses and around them
+gap, edge = 2.0, 4.0  # mm; gap between lenses; sides of the plate beyond three pitches
 pitch_x, pitch_y = box.xlen + gap, box.ylen + gap
 
 plate = (

@@ -46,7 +46,7 @@ class HeadersInTime(H11Protocol):
         self._stop_waiting()
 
     def _wait(self) -> None:
-        """Start the timeout, unless it runs, if headers are missing; else cancel it."""
+        """If headers are missing, start the timeout unless it is running; else cancel it."""
         if self.conn.their_state is not h11.IDLE:
             self._stop_waiting()
         elif self._deadline is None:

@@ -71,7 +71,7 @@ class Preview:
     pictures: tuple[tuple[np.ndarray, np.ndarray], ...]  # (target, irradiance) per target, each (rows, columns)
     flux: dict[str, float]  # ledger of the light: fractions that sum to 1
     shape: dict[str, float | None]  # shape of the lens, by the keys of report.json
-    source_images: tuple[Blur | None, ...]  # image of the source on each target; None for a point
+    source_images: tuple[Blur | None, ...]  # image of the source on each target; None: the source has no size
     lit_fraction: float  # fraction of the back's area, up to the rim, that the central point of the source lights
     remarks: tuple[str, ...] = ()  # warnings of the scene, and remarks on light that cannot reach the target
     seconds: float = math.nan  # time of the preview (s)

@@ -28,7 +28,7 @@ STAGES = ("preview", "settled", "effects", "predicted")  # names of the answers 
 MAX_PAGES = 32  # largest number of pages with a stored request
 IDLE_DELAY = 0.7  # pause (s) between a preview and the next of STAGES, in case another change comes
 JOIN_TIMEOUT = 0.5  # time (s) in which the thread has to end
-PAGE_TIMEOUT = 60.0  # time (s) after a page's last poll until its request waits for the next poll
+PAGE_TIMEOUT = 60.0  # time (s) after a page's last poll until the thread stops working for it, up to its next poll
 
 
 @dataclass(eq=False)

@@ -130,7 +130,7 @@ class NoPictures(Pictures):
 
 
 def draw_lens(source: Emitter, lens: Lens, screens: Sequence[Screen], view: View) -> Pngs:
-    """Return the pictures of the lens except the 3-D one: maps of each tailored face, and a side view with rays."""
+    """Return the pictures of the lens except the 3-D one: maps of the back and a tailored front, and a side view."""
     farthest = max(screens, key=lambda screen: screen.plane.throw(0.0))
     of_front = {}
     if lens.shapes("front"):
@@ -292,7 +292,7 @@ def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
 
 @styled
 def convergence(history: Sequence[CurvePoint], stages: Sequence[StageRecord], noise: float) -> Figure:
-    """Draw the RRMSD against time (s): a curve per stage, a ring after it, and a line at the standard error `noise`."""
+    """Draw the RRMSD over time (s): a curve per stage, a ring at the end of each, and the standard error `noise`."""
     seconds, values = np.array([(point.seconds, point.rrmsd) for point in history], dtype=float).T
     ends = np.cumsum([0.0, *(stage.seconds for stage in stages)])
     after = np.isin(values, [stage.rrmsd for stage in stages if stage.rrmsd is not None])

@@ -345,7 +345,7 @@ def _with_remarks(contents: Contents, *more: Remark) -> Contents:
 
 
 def _finest_detail(scene: Scene, proof: Proof, screen: Screen, estimates: tuple[LeftOut, ...]) -> FinestDetail | None:
-    """Return the finest detail, by the source's size in the scene or else in `estimates`; None: neither has a size."""
+    """Return the finest detail, computed with the source's size in the scene, else in `estimates`; None: no size."""
     if proof.blur:
         of = ", ".join(f"source.{key} = {size}" for key, size in extent(scene.source))
         return finest_detail(proof.blur.pixels, proof.lens, screen, of)
