@@ -45,7 +45,7 @@ from bstcad.tailoring.merit import PictureError
 from bstcad.tailoring.run import Hooks
 from bstcad.transport.mapping import TransportMap
 
-RELATIVE_TOLERANCE = 1e-9  # largest difference that is ignored: of indices, relative; of nets' ends, in net widths
+RELATIVE_TOLERANCE = 1e-9  # largest ignored difference of indices, relative, and of the ends of nets, in net widths
 PREVIEW_TUBES = 521  # flux tubes per side of the light, for the picture of a design that is not verified yet
 AnyPath = str | os.PathLike[str]  # path of a file or of a folder
 
@@ -115,8 +115,8 @@ class Design:
     def transport(self) -> TransportMap | None:
         """Transport map of stage 1: points of the target, and where their light passes the lens (mm), see TransportMap.
 
-        None for your own lens (with_lens, with_heights) and for a folder of an earlier version.  With several spectral
-        lines, the map of the line with most light; for an extended source, the map for its centre.
+        None for your own lens (with_lens, with_heights) and for a folder that an earlier version wrote.  With several
+        spectral lines, the map of the line with most light; for an extended source, the map for its centre.
         """
         return self._made.transport
 

@@ -80,7 +80,7 @@ class ProofOptions:
     drawing: Drawing | None = None  # class that draws the figures of the report; None: Pictures
     checks: Sequence[OwnCheck] = ()  # additional checks
     sections: Sequence[OwnSection] = ()  # additional sections of report.html
-    limit: float | None = None  # largest time of design and verification together (s), not for `verify`; None: no limit
+    limit: float | None = None  # largest time (s) from the design to its report, not for `verify`; None: no limit
 
 
 # --- generate ---------------------------------------------------------------------------------------------------------
@@ -274,8 +274,7 @@ def verify(
 ) -> Report | Examined:  # fmt: skip
     """Verify a design again from the files of its folder and rewrite its report; or examine a single STEP file.
 
-    against: other programs that also trace the lens, as names (judges.comparison.JUDGES) or as objects with the three
-    functions of a judge.
+    against: programs that also trace the lens, by name (judges.comparison.JUDGES) or as your own judge (OwnJudge).
     measured: file of measured points of a made part, which is also verified.  With `place` its report is written there
     and the design's folder does not change.  Without `place` it is written to the design's folder and to its subfolder
     measured/CLOUD, which only a verification of the same points rewrites.

@@ -274,10 +274,10 @@ def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) 
     irradiances: traced irradiance (rows, columns) per target; () if not traced.  The arrays of the second target are
     target_2, irradiance_2, reachable_2, and so on.  reachable (rows, columns) is 1 in the pixels that light can reach;
     it is absent if light can reach all bright pixels.
-    Transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), mm on the target, and transport_back
-    or transport_entrance (c, r, 2), the points x, y (mm) where the light for (transport_x, transport_y) meets the last
-    tailored face (the back; the front if only the front is tailored, or for a mirror behind glass), or the plane z =
-    const through the vertex of the first face.
+    Transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), the positions of c columns and r rows
+    of points on the target (mm), and transport_back or transport_entrance (c, r, 2), x and y (mm) where the light for
+    each of these points meets the last tailored face (the back; the front if only the front is tailored, or for a
+    mirror behind glass), or the plane z = const through the vertex of the first face.
     """
     lens, sent = design.lens, design.transport
     (m, n), front = lens.back_net.shape, lens.front

@@ -96,7 +96,7 @@ class DesignState:
     first: Stage1State | None = None  # state of stage 1; None: it has not begun, or it has ended
     followed: Stage1Result | None = None  # result of stage 1; None: it has not ended
     second: Stage2State | None = None  # state of stage 2 or 3; None: it has not begun, or it has ended
-    best: RatedLens | None = None  # best lens at the end of a part of stage 2 or 3 so far; None: no part has ended
+    best: RatedLens | None = None  # best lens before stage 2 or 3 or after a part of it; None: as `second`, or preview
     lens: Parameters | None = None  # lens after stage 2 or 3; None: tailoring has not ended
     stopped: str = ""  # reason why tailoring ended; "": it has not ended
 
@@ -196,8 +196,9 @@ def task_of(scene: Scene, goals: Sequence[Goal], knobs: ResolvedTailoring, edge:
 
 
 def with_solution(scene: Scene, task: Task) -> Task:
-    """Return the task, for two freeform faces and several goals with the stated or better solution (`find_demand`).
+    """Return the task with the solution (convex or concave) of the scene, or else the better one, by `find_demand`.
 
+    Only a task with two freeform faces and several goals has a solution; others are returned unchanged.
     `task.progress` reports the angles and limits of the faces.  SceneError if the faces cannot make the pictures.
     """
     lens = scene.flat_lens(REACH_NET)

@@ -51,7 +51,7 @@ NET_SIZES = (MIN_SIDE, MAX_CONTROL_POINTS)  # range of the control points per si
 FIT_TOLERANCE = 1e-6  # mm; largest distance between a fitted net and its surface (a toroid, or a user's class)
 FIT_SIZES = (33, 65, 129, 257, 513, 1025)  # control points per side of a fitted net, tried in this order
 MAX_CELL_RATIO = 1.5  # ratio of length and width of a cell of the net above which a warning proposes another net
-MIN_ROUND_POINTS = 6  # fewest control points per side for a round lens, whose net extends two spans past the rim
+MIN_ROUND_POINTS = 6  # fewest control points per side for a round lens, whose net ends two pitches past the rim
 
 Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 
@@ -61,7 +61,7 @@ Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 
 @dataclass(frozen=True)
 class FileNet(FileContent):
-    """A B-spline surface with its vertex at z = 0; the scene contains its heights, so that a design can be repeated."""
+    """A B-spline surface with its vertex at z = 0; a Scene contains its heights, so that a design can be repeated."""
 
     name = NET_FILE
     shape: tuple[int, int]  # control points along x and along y
@@ -359,7 +359,7 @@ class NetFront(_Front):
     def complaints(self, outline: Outline) -> Iterator[str]:
         """Yield the faults: no file and not tailored, or a net of a lens with another outline.
 
-        A net may end two spans outside the outline, or at the sides of a rectangle.
+        A net may end two control-point spacings outside the outline (net_extent), or at the sides of a rectangle.
         """
         if self.reflect and not self.optimise:
             yield "reflect: the face that reflects must be tailored; add optimise = true"
@@ -431,11 +431,11 @@ def fit_net(surface: Surface, outline: Outline) -> BSplineSurface:
 
 
 def net_extent(outline: Outline, net: Sides) -> tuple[float, float]:
-    """Return half the width of a net in x and y (mm), so that it extends two spans past the rim of the lens.
+    """Return half the width in x and y (mm) of a net that extends two control-point spacings past the rim of the lens.
 
-    Then x is linear in the spline parameter t inside the rim.  In the end spans x(t) is quadratic; d/dx of the slope
-    z'(t) / x'(t) grows eightfold inwards across 1.5 net spacings, for any heights.  With light there, the edge of the
-    picture would be too bright, with a dark line beside it.  A net of 5 control points per side ends at the rim.
+    Then x is linear in the spline parameter t inside the rim.  In the end spans, which are 1.5 spacings wide, x(t) is
+    quadratic, and d/dx of the slope z'(t) / x'(t) grows eightfold inwards, for any heights.  With light there, the edge
+    of the picture would be too bright, with a dark line beside it.  A net of 5 control points per side ends at the rim.
     """
     reach = ((m - 1) / (m - 5) if m > 5 else 1.0 for m in as_pair(net))
     half_x, half_y = (factor * half for factor, half in zip(reach, outline.half_extent, strict=True))
@@ -448,7 +448,7 @@ def net_complaints(outline: Outline, points: Sides | None) -> Iterator[str]:
     if outline.is_round and m != n:
         yield f"a round lens (lens.outline) needs a square net, not {m} x {n} control points; give one number"
     if outline.is_round and m < MIN_ROUND_POINTS:
-        few = f"{m} is too few for a round lens, whose net extends two spans past its rim"
+        few = f"{m} is too few for a round lens, whose net extends two control-point spacings past its rim"
         yield f"{few}; give {MIN_ROUND_POINTS} or more"
 
 
@@ -487,7 +487,7 @@ class Back(Record):
     def net(self) -> Sides:
         """Control points per side, or along x and along y if these differ; SceneError if they are not given."""
         if self.control_points is None:
-            raise SceneError("lens.back.control_points: missing, and not chosen; use bstcad.design, or give a number")
+            raise SceneError("lens.back.control_points: missing; give a number, or use bstcad.design, which chooses it")
         return simplified(self.control_points)
 
 

@@ -185,7 +185,7 @@ class LightPath:
         return any(element.kind == "mirror" for element in self.behind)
 
     def complaints(self) -> Iterator[str]:
-        """Yield the faults of each element, of their order along the light, and of targets seen in their mirrors."""
+        """Yield the faults of each element, of the elements' order, and of targets that the lens sees in mirrors."""
         for name, elements in (("before", self.before), ("behind", self.behind)):
             for k, element in enumerate(elements):
                 key = f"{name}[{k}]"

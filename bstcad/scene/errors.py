@@ -53,7 +53,7 @@ def with_target_key(sentence: str, key: str) -> str:
 
 
 def nearest(word: str, known: list[str], otherwise: str) -> str:
-    """Return "did you mean …?" for a misspelt word, or else a list of all known words.
+    """Return "did you mean …?" for a misspelt word, or else all known words after the words `otherwise`.
 
     For a word of NOT_BUILT, "… not built yet" precedes the list.  Words are compared by difflib's ratio: twice the
     number of letters that they share in order, divided by the number of all letters.

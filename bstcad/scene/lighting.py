@@ -50,7 +50,7 @@ def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:
 
 
 def order_complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
-    """Yield complaints about a source not before the lens along z or not above a mirror, and a mirror's front."""
+    """Yield complaints about a source not before a lens or not above a mirror, and keys for a mirror's unlit front."""
     front, back = lens.front.z + lens.front_sags[0], lens.back.z
     key, start = f"source.{source.start_key}", source.nearest_z(upwards=lens.passes.sense > 0)
     if lens.passes.sense > 0:
@@ -61,9 +61,9 @@ def order_complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
     elif not start > back:
         yield f"{key}: the light starts at z = {start:g}, not above the mirror at z = {back:g}; move one of them"
     if "front" not in lens.passes.faces and lens.front.outline is not None:
-        yield "lens.front.outline: no light meets the front of a mirror, the rear of its plate; remove it"
+        yield "lens.front.outline: no light meets the front of a mirror, the rear of its plate; remove this key"
     if "front" not in lens.passes.faces and not lens.front.fixed:
-        yield "lens.front.optimise: no light meets the front of a mirror, the rear of its plate; remove it"
+        yield "lens.front.optimise: no light meets the front of a mirror, the rear of its plate; remove this key"
 
 
 def unlit_complaints(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator[str]:

@@ -145,7 +145,7 @@ class Flange(Record):
         Key("Further holes [x, y, diameter].", "mm", *COORDINATES, example=[[14.0, 0.0, 3.2]]),
     ] = ()
     draft: Annotated[float, Key("Draft of the outer walls; the plate narrows upwards.", "degrees", 0.0, 45.0)] = 0.0
-    bevel: Annotated[float, Key("Height of both bevels (45 degrees) of the outer walls.", "mm", 0.0, 1e5)] = 0.0
+    bevel: Annotated[float, Key("Height of each of two bevels (45 degrees) of the outer walls.", "mm", 0.0, 1e5)] = 0.0
 
     def all_holes(self) -> list[tuple[float, float, float]]:
         """Return (x, y, diameter) of the screw holes and of the further holes, mm."""
@@ -292,7 +292,7 @@ def _depth(shape: Round | Box, x: float, y: float) -> float:
 
 
 def _steepest_descent(front: Surface, rim: Outline) -> float:
-    """Return the steepest descent of a front inwards from the rim (mm per mm)."""
+    """Return the steepest descent of a front at the rim, in the direction inwards (mm per mm)."""
     x, y = rim.rim_points()
     m_x, m_y = rim.inset_direction(x, y)
     _, z_x, z_y = sampled(front, x, y)

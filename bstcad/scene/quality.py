@@ -33,7 +33,7 @@ VERIFICATION_DRAW = 1 << 12  # number of the set of these points; each further s
 
 
 class Tailoring(Record):
-    """The effort of tailoring; a setting that is None has the value of `quality` in PRESETS."""
+    """The effort of tailoring; a setting of PRESETS that is None has its value for `quality`, adapted by `resolved`."""
 
     quality: Annotated[Literal["draft", "standard", "fine", "paper"], Key("Effort; fine has the smallest error.")] = (
         "standard"
@@ -52,7 +52,7 @@ class Tailoring(Record):
         int | None, Key("Maximum number of iterations of the transport map.", "", 1, 100_000, example=100)
     ] = None
     rays: Annotated[int | None, Key("Rays or flux tubes along each side of the light.", "", 16, 16_384)] = None
-    stage1_iterations: Annotated[int | None, Key("Adam steps per net (stage 1).", "", 0, 1_000_000, example=300)] = None
+    stage1_iterations: Annotated[int | None, Key("Steps of method adam per net.", "", 0, 1_000_000, example=300)] = None
     rounds: Annotated[
         int | None, Key("Maximum number of rounds of transport map and slope fit in stage 1.", "", 1, 100, example=10)
     ] = None
@@ -70,7 +70,7 @@ class Tailoring(Record):
     ] = None
     accuracy: Annotated[float | None, Key("RRMSD at which tailoring ends.", "", 1e-6, 10.0, example=0.05)] = None
     max_time: Annotated[
-        float | None, Key("Maximum time until the report; stage 1 is always completed.", "s", 1.0, 1e7, example=60.0)
+        float | None, Key("Maximum time, report included; stage 1 is always completed.", "s", 1.0, 1e7, example=60.0)
     ] = None
 
     @property
@@ -87,7 +87,7 @@ class Tailoring(Record):
         """Return the settings with all values set; net: control points per side of the back, or along x and along y.
 
         Levels of an oblong net are pairs, with cells in the same proportions.  Defaults: at least two rays per cell of
-        the net along x and along y (a draft: two in all per cell); a map of at most twice the net's cells per side.
+        the net along x and along y (draft: two per cell in all); a map of at most twice the net's cells per side.
         """
         levels = tuple(level if isinstance(level, tuple) else coarser(net, level) for level in self.levels or ())
         preset = dict(PRESETS[self.quality], levels=levels or coarse_to_fine(net))
