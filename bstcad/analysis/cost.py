@@ -1,7 +1,7 @@
 """The cost and the remaining error of a finished design.
 
 - `ending`: the end of the convergence curve, fitted by a power law;
-- `remaining`: the squared error by parts of the target and by octaves of its cosine transform;
+- `remaining`: the squared error, divided into parts of the target and into octaves of spatial frequency;
 - `unlit` and `lifted`: lit parts of a target that stay dark, and dark parts that get light;
 - `ControlCells`: the cells of a control net that light each pixel, and the lower bound of the error that they allow.
 """
@@ -44,7 +44,7 @@ class ConvergenceEnd:
     last_tenth: float  # `last_tenth_seconds` divided by the time from the start to the end of the curve
     power: float | None  # exponent p, zero if the curve does not fall; None: too few points
     fit: float | None  # R² of the fit in logarithms; None: too few points
-    halving: float | None  # factor 2^(1/p) of the time; None: the fit is poor, or the factor exceeds MAX_HALVING
+    halving: float | None  # factor 2^(1/p) of the time; None: no or a poor fit, or the factor exceeds MAX_HALVING
 
 
 def ending(history: History, stages: StageResults, since: float = 0.0) -> ConvergenceEnd | None:
@@ -107,9 +107,9 @@ TONE_QUANTILE = 0.1  # quantile of the irradiance below which a pixel is dark; b
 
 
 def remaining(picture: np.ndarray, target: np.ndarray, per_unit: tuple[float, float]) -> dict[str, Any]:
-    """Return the squared error of a picture (rows, columns) by parts and octaves of a target of the same sum.
+    """Return the fractions of the squared error in parts of the target and in octaves of spatial frequency.
 
-    per_unit: pixels along x and y per unit of the receiver.
+    picture, target: (rows, columns), of the same sum.  per_unit: pixels along x and y per unit of the receiver.
     parts: [{name: name in `masks`, error: fraction of the squared error, pixels: fraction of the target's pixels}].
     octaves: see `_octaves`.
     """
@@ -125,8 +125,8 @@ def remaining(picture: np.ndarray, target: np.ndarray, per_unit: tuple[float, fl
 def masks(target: np.ndarray) -> dict[str, np.ndarray]:
     """Return the pixels (rows, columns) of each part; a pixel belongs to the first part whose condition it meets.
 
-    rim: the outermost 1/64 of the side, at least one pixel, at all four sides.  edges: the tenth of all pixels where
-    the gradient (central differences) is largest, if it is at least 2 % of the brightest pixel per pixel.
+    rim: a strip of at least one pixel along each side, as wide as 1/64 of the target.  edges: the tenth of all pixels
+    where the gradient (central differences) is largest, if it is at least 2 % of the brightest pixel per pixel.
     darkest, brightest: a tenth of all pixels each, more if pixels are equal.  rest: all others.
     """
     steep = np.hypot(*np.gradient(target))

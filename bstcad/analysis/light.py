@@ -42,16 +42,16 @@ GRID_LINES = 33  # number of grid lines in each direction in `ray_map`
 
 
 def fan(source: Emitter, lens: Lens, plane: Receiver) -> np.ndarray:
-    """Return polylines (rays, k, 3) in mm, from the source via each surface to the plane, of rays in y = 0."""
+    """Return polylines (rays, points, 3) in mm, from the source via each surface to the plane, of rays in y = 0."""
     half = clear_window(source, lens).width / 2
     x = torch.linspace(-0.98 * half, 0.98 * half, FAN_RAYS, dtype=torch.float64)
     return _polylines(source.rays(x, torch.zeros_like(x), lens.entrance.z, 1.0), lens, plane)[0]
 
 
 def bundle(source: Emitter, lens: Lens, plane: Receiver, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return polylines (rays, k, 3) in mm of rays through n x n cells of the beam, and their flux (rays,) on arrival.
+    """Return polylines (rays, points, 3) in mm of rays through n x n cells of the beam, and flux (rays,) on arrival.
 
-    Each ray carries the flux of its cell; the total flux of the source is 1.
+    Each ray starts with the flux of its cell; the total flux of the source is 1.  Rays that do not arrive are omitted.
     """
     area = clear_window(source, lens)
     x, y = (p.reshape(-1).to(torch.float64) for p in sampling.grid(area, n))
@@ -59,7 +59,7 @@ def bundle(source: Emitter, lens: Lens, plane: Receiver, n: int) -> tuple[np.nda
 
 
 def _polylines(rays: Rays, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.ndarray]:
-    """Return polylines (rays, k, 3) in mm of the rays that arrive at the plane, and their flux there."""
+    """Return polylines (rays, points, 3) in mm of the rays that arrive at the plane, and their flux there."""
     stops = _at_interfaces(rays, lens)
     stops.append(landed := plane.to(stops[-1]))
     corners = torch.stack([torch.stack([*stop.position[:2], stop.above(0.0)]) for stop in stops])
@@ -68,9 +68,9 @@ def _polylines(rays: Rays, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.
 
 
 def ray_map(source: Emitter, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.ndarray]:
-    """Return a grid on the vertex plane of the first surface, and where its rays meet `plane`, (k, k, 2) mm each.
+    """Return (start, end): grid points on the vertex plane of the first surface, and where their rays meet `plane`.
 
-    The values are NaN where there is no light, and where the ray is lost.
+    Both are x and y in mm, (GRID_LINES, GRID_LINES, 2), and NaN where there is no light or the ray is lost.
     """
     area = clear_window(source, lens)
     line = torch.linspace(-0.499, 0.499, GRID_LINES, dtype=torch.float64)
@@ -206,7 +206,7 @@ class Margins:
     """Worst cases of a trace over all rays that carry light to the back."""
 
     tir_margin_deg: float | None  # critical angle minus angle of incidence (degrees), < 0: reflected; None: no ray
-    newton_slope_min: float | None  # smallest |F'(t)| from the first net on, divisor of Newton's steps; 0: grazing
+    newton_slope_min: float | None  # smallest |F'(t)| from the first net on, Newton's divisor; 0: grazing; None: no ray
     non_finite: int  # number of control points, hits and landing points that are not finite
 
 

@@ -43,7 +43,7 @@ FIELD_CELLS = 24  # cells per side of the target, in which the fields are averag
 FIELD_SMOOTHING = (0.8, 2.0, 6.0, 24.0)  # standard deviations of the smoothing (cells), wider where light is scarce
 MIN_CELL_FLUX = 1e-4  # smoothed flux of a cell / mean, below which a field needs wider smoothing
 MIN_LIGHT_SHIFT = 1e-6  # largest shift that counts as zero (pixels)
-HALF_SHARP_WIDTH = 1.3  # measured width of a control cell's light (pixels) at which edges are half as sharp as at best
+HALF_SHARP_WIDTH = 1.3  # width of a control cell's light (pixels) at which edges are half as sharp as at best, measured
 MAX_SHARPNESS = 0.75  # fraction of the jump at an edge that the finest cells reproduce, measured
 MAX_SAMPLED_PIXELS = 1 << 19  # largest number of sampled pixels: of a larger picture only some rows are used
 PADDING = 4  # dark pixels around a picture, within which the ringing of its spline ends
@@ -125,7 +125,7 @@ class Reference:
         return Change(float(changed.sum() / before.sum() - 1), difference(changed, before), math.sqrt(8 * variance))
 
     def _fields(self, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
-        """Return shift δ (2, …) in pixels and relative transmission w (…) of a channel, in cells of the target."""
+        """Return shift δ (2, …) in pixels and relative transmission w (…) of a channel, for each cell of the target."""
         landed, _ = _trace_through(self.lens, channel, self.screen, self.points)
         arrives = landed.alive.numpy()
         share = self._over_cells(np.where(arrives, _transmission(landed) / self.through, 0.0), self.flux)
@@ -198,9 +198,9 @@ class Reference:
 class Spline:
     """Picture as a function of x and y, for shifts by fractions of a pixel.
 
-    A picture that jumps from pixel to pixel changes in proportion to a small shift; a picture as smooth as a cubic
-    spline changes with the square of a small blur.  If the control cells of a lens light less than a pixel, the lens
-    reproduces most of a jump; if they light several pixels, none.  `sharp` is the weight of the jumps.
+    A small blur changes a picture that jumps from pixel to pixel in proportion to the width of the blur, and a picture
+    as smooth as a cubic spline in proportion to the square of this width.  If a control cell of a lens lights less than
+    a pixel, the lens reproduces most of a jump; if it lights several pixels, none.  `sharp` is the weight of the jumps.
     """
 
     padded: np.ndarray  # picture with a dark margin, (rows, columns)
@@ -221,7 +221,7 @@ class Spline:
         return picture[self.chosen]
 
     def moved(self, shift: np.ndarray) -> np.ndarray:
-        """Return the sampled rows of the picture after its light is moved by `shift` (2, …) pixels, a field in cells.
+        """Return the sampled rows of the picture after its light is moved by `shift` (2, …) pixels, per cell.
 
         Light that leaves the picture is lost.
         """
@@ -238,7 +238,7 @@ class Spline:
 
 
 def to_pixels(field: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Interpolate a field in cells of the target linearly to pixels, (rows, columns)."""
+    """Interpolate a field, given for each cell of the target, linearly to its pixels, (rows, columns)."""
     for axis, pixels in enumerate(shape):
         cells = field.shape[axis]
         at = ((np.arange(pixels) + 0.5) / pixels * cells - 0.5).clip(0, cells - 1)

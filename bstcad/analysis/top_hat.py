@@ -9,7 +9,7 @@ E(x, y) is the irradiance, on any scale, and η a level between 0 and 1.  Pixels
 
 E_max             maximum; here of the running median over 3 x 3 pixels, so that neither a hot pixel nor noise
                   determines it.  The median preserves plateaus and straight edges, lowers the peak of a Gaussian of
-                  1/e² radius w by 2 to 5 h² / w² for pixels of side h, and is raised by 1.6 σ for noise of σ per pixel
+                  1/e² radius w by 2 to 5 h² / w² of its height (pixels of side h), and rises by 1.6 σ for noise of σ
 A_η               clip-level irradiation area: all pixels of the unfiltered picture with E > η E_max
 P_η               clip-level power, ∫ E dA over A_η
 f_η = P_η / P     fractional power, P = ∫ E dA over the picture

@@ -38,7 +38,7 @@ Purpose = dict[str, Any]  # description of the checkpoint's design: numbers, tex
 
 
 def write(path: Path, purpose: Purpose, state: Any) -> None:
-    """Write a checkpoint to `path`: description of the design (`purpose`) and state.  OSError: the old file stays."""
+    """Write a checkpoint: description of the design (`purpose`) and state.  On an OSError the old file stays."""
     arrays: dict[str, np.ndarray] = {}
     tree = json.dumps([purpose, state], default=partial(_packed, arrays))
     with files.atomic_file(path) as file:  # without a copy of the state in memory

@@ -52,7 +52,7 @@ class Machines(Protocol):
 
 @contextlib.contextmanager
 def connect(scheduler: str | None, workers: int | None = None) -> Iterator[Cluster | None]:
-    """Yield a Cluster of the scheduler at an address, or of `workers` local processes until the block ends; or None."""
+    """Yield a Cluster of the scheduler at an address or of `workers` temporary local processes; None for neither."""
     check(scheduler, workers)
     with contextlib.ExitStack() as stack:
         address = scheduler

@@ -43,10 +43,10 @@ DENSITY_TUBES = 256  # flux tubes per side for the flux density
 # Coefficients of the error bound (ControlCells.floor) of the net, and of a net with half as many cells per side.
 FLOOR_FACTOR, HALVED_FACTOR = 0.68, 0.43
 QUALITY_TERMS = {"draft": (1.5, 0.012), "standard": (1.0, 0.002), "fine": (0.7, 0.004)}  # (factor, offset) of the RRMSD
-MIN_SEAM_SHIFT = 7.0  # seam shift (pixels) below which cells are finer than the tool can use
+MIN_SEAM_SHIFT = 7.0  # seam shift (pixels) below which cells are too fine for the tool
 # Cells per pixel above which finer nets reduce the RRMSD further by at most a factor, and this factor.
 SUFFICIENT_CELLS, MAX_FURTHER_GAIN = 5.0, 1.4
-MIN_RRMSD_RATIO = 0.43  # smallest observed RRMSD with a finer net / RRMSD: portrait with 1025 and 513 points
+MIN_RRMSD_RATIO = 0.43  # smallest observed RRMSD with a finer net / with a coarser one: portrait, 1025 and 513
 MIN_RELATIVE_FLUX = 1e-3  # flux of a tile / mean flux below which the mean density is used
 
 
@@ -58,7 +58,7 @@ class Candidate:
     rrmsd: float  # estimated RRMSD
     seconds: float  # time on two cores of pace 1
     memory_gb: float  # peak memory of the two processes (GB)
-    seam_shift: float = math.inf  # shift by the narrowest valley (pixels), see the function `seam_shift`
+    seam_shift: float = math.inf  # result of the function `seam_shift` (pixels)
 
     def relative_to(self, other: Candidate) -> tuple[float, float]:
         """Return (RRMSD, time) divided by those of another candidate; the ratios are more accurate than the values."""
@@ -175,10 +175,10 @@ def _affordable(scene: Scene, candidates: list[Candidate]) -> tuple[tuple[Candid
 
 
 def seam_shift(scene: Scene) -> float:
-    """Return the shift (pixels) of light on the target across one cell of the narrowest valley; inf: no tool radius.
+    """Return the distance (pixels) on the target between light from the two ends of a cell in the narrowest valley.
 
-    It is p L (n - 1) / R with the width p of a cell, the throw L and the tool radius R; a mirror deflects by twice its
-    slope.  At a seam, where light separates, the tool limits the width of the valley, whatever the cells.
+    It is p L (n - 1) / R with the width p of a cell, the throw L and the tool radius R; infinite without a tool radius;
+    a mirror deflects by twice its slope.  At a seam, where light separates, the tool limits the width of the valley.
     """
     radius, target = scene.lens.tool_radius, scene.target
     if radius is None:

@@ -41,7 +41,7 @@ def plan(scene: Scene, text: str = "", keys: Sequence[str] = (), tick: Tick = la
     unreachable: part of the target that light cannot reach (optics.reach.unreached); None: none, or a tailored front.
 
     blur: width (in the target's unit and in pixels) of the image of an extended source through the coarse lens, and the
-    RRMSD of the target convolved with this image; None: a point or no divergence, or no light passes.
+    RRMSD of the target convolved with this image; None: a source without extent, or no light passes.
 
     caveat: sentence that states how the lens of the estimates differs from the scene's; only if it differs.
 

@@ -75,7 +75,10 @@ def grade_limit(kind: Kind, grade: ToleranceGrade, setup: Setup) -> float:
 
 
 def graded_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[Tolerance, ...]:
-    """Return a table with `grade`, then the scene's tables without their general grade; None: default, then all."""
+    """Return a table with `grade`, then the scene's tables without their general grade.
+
+    grade None: a table with DEFAULT_GRADE, then the scene's tables unchanged.
+    """
     if grade is None:
         return Tolerance(grade=DEFAULT_GRADE), *table
     if grade not in GRADES:

@@ -134,8 +134,8 @@ class Perturbation:
     def sigma(self) -> float:
         """Standard deviation σ, in the unit of the kind.
 
-        normal: truncated at the limit L = a s, a = 2, so that σ² = s² (1 - 2 a φ(a) / (2 Φ(a) - 1)).  field: one mode
-        of a random field, normal and not truncated.
+        normal: standard deviation s before truncation at the limit L = a s, a = CUTOFF_SIGMAS; after it,
+        σ² = s² (1 - 2 a φ(a) / (2 Φ(a) - 1)).  field: one mode of a random field, normal and not truncated.
         """
         cut = 1 - 2 * CUTOFF_SIGMAS * norm.pdf(CUTOFF_SIGMAS) / (2 * norm.cdf(CUTOFF_SIGMAS) - 1)
         ratios = {"uniform": 1 / math.sqrt(3), "field": 1.0, "normal": math.sqrt(cut) / CUTOFF_SIGMAS}
@@ -189,7 +189,7 @@ MOTIONS = (  # (error, words, axis, True for a rotation)
 
 
 def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
-    """Return all errors of a setup with one amount, except errors whose effect is zero or cannot be computed."""
+    """Return by name all kinds of error, except form, ripple, and kinds whose effect is zero or cannot be computed."""
     every_kind = (*_motions(setup), *_shapes(setup, material), *_lights(setup), *_alignments(setup.lens))
     return {kind.name: kind for kind in every_kind}
 
@@ -444,7 +444,7 @@ def _require_resolution(surface: BSplineSurface, length: float, words: str) -> N
     if length < least:
         raise ValueError(
             f"{words} of {length:g} mm is too fine for {size_text(surface.shape)} control points, which can represent "
-            f"{least:.3g} mm or more; give a longer one, or raise lens.back.control_points"
+            f"{least:.3g} mm or more; give a longer one, or raise control_points of this face"
         )
 
 

@@ -101,8 +101,8 @@ class TargetPictures:
 class Wavefronts:
     """Wavefront errors of a setup with errors, in waves of the main wavelength, which the first channel has.
 
-    The OPD of a ray, as a function of its position before the lens, is nearly linear in the errors, and its RMS is a
-    norm.  Hence the model that superposes pictures also superposes wavefronts.  The required wave is fixed in the room.
+    The OPD of a ray that starts at a given position is nearly linear in the errors, and the RMS of the OPDs is a norm.
+    Hence the model that superposes pictures also superposes wavefronts.  The required wave is fixed in the room.
     Piston and tilt are removed for each lens separately, so that a lens may deflect its light as a whole.
     """
 
