@@ -126,7 +126,7 @@ def tent_average(target: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class TentMerit:
-    """RRMSD² (Wang et al. 2023, Eq. 15) of all channels by tent binning of rays, plus overshoot term of merit.py."""
+    """RRMSD² (Wang et al. 2023, Eq. 15) of all channels by tent binning, plus the overshoot term of merit.py."""
 
     channels: tuple[Channel, ...]  # channels of the light
     screen: Screen  # screen of the target
@@ -139,7 +139,7 @@ class TentMerit:
         return cls(channels, screen, tent_average(target / total(target)), overshoot)
 
     def __call__(self, landed: tuple[Landed, ...]) -> tuple[Tensor, Tensor]:
-        """Return (merit, RRMSD against the tent-binned target) of the landed rays of each channel."""
+        """Return (merit, RRMSD against the tent-binned target); landed: rays on the target, by channel."""
         flux = weighted_sum(self.channels, (total(landed_flux(rays).double()) for rays in landed))
         images, outside_parts = zip(*(collect(rays, self.screen) for rays in landed), strict=True)
         image, outside = weighted_sum(self.channels, images), weighted_sum(self.channels, outside_parts)

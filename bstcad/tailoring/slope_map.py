@@ -315,8 +315,8 @@ def map_to_target(source: Emitter, lens: Lens, goal: Goal, n: int, solver: Solve
     """Return the transport map of the paper, from the vertex plane of the first surface (mm) to the target (mm).
 
     The map is solved on n x n cells, for the light that passes all faces.  A tilted target is projected from the vertex
-    of the front onto the plane z = const through its centre: in the coordinates of the target the map would not be
-    close to a gradient.
+    of the front onto the plane z = const through its centre: in the coordinates of the target, the map that a surface
+    can realise is not close to a gradient.
     """
     picture, screen = goal.picture, image_screen(lens, goal.receiver)
     area = clear_window(source, lens)

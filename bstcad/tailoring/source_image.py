@@ -154,7 +154,7 @@ def _biquadratic(points: Sequence[tuple[float, float]]) -> Tensor:
 
 
 def blurs(extended: ExtendedSource, lens: Lens, screen: Screen) -> tuple[BlurOperator, ...]:
-    """Return B for each channel of a source and a lens, all with one border."""
+    """Return the operators B of a source behind a lens, one per spectral line, all with the same border."""
     extent = extended.source.extent
     unit = Circle(1.0) if extent is not None and extent.is_round else Rectangle(2.0, 2.0)
     dots = _biquadratic(point_pairs(unit, IMAGE_PAIRS))

@@ -183,7 +183,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
 
     The face is fitted to slopes, while the paper minimises |P_i^t - P_i|².  A ray keeps its aim while the sag changes.
     So these slope fits converge even if the slopes needed at fixed points of the back depend strongly on the sag: in
-    strong lenses near the source, and in glass of low index.  The part of the map that is not a gradient is lost.
+    strong lenses near the source, and in glass of low index.  The part of these slopes that is not a gradient is lost.
     """
     knobs, goal, z = task.knobs, task.goals[0], lens.back.z
     for number in range(AIM_ROUNDS):
@@ -199,7 +199,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
 def aimed_rays(
     source: Emitter, lens: Lens, goal: Goal, n: int, side: int, iterations: int
 ) -> tuple[Rays, Tensor, Mapping]:
-    """Return side x side rays over the front, their aims on the target (mm), and the map on n x n cells."""
+    """Return side x side rays in the `clear_window`, their aims on the target (mm), and the map on n x n cells."""
     mapping = slope_map.map_to_target(source, lens, goal, n, solver=Solver(iterations))
     area = clear_window(source, lens)
     x, y = (t.to(lens.like) for t in sampling.grid(area, side))

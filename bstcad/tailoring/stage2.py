@@ -116,7 +116,7 @@ class TubeRound:
     def run(
         self, problem: Problem, variables: NetVariables, position: SearchPosition, total: int, state: TubeSearch | None
     ) -> Iterator[tuple[Iterate, StageStep]]:
-        """Yield (iterate, step) of one run of the minimiser from a lens or a saved state, until RRMSD `goal_by_tubes`.
+        """Yield (iterate, step) of a minimisation from a lens or a saved state, until the RRMSD is `goal_by_tubes`.
 
         total: evaluations of all rounds.
         """

@@ -138,7 +138,7 @@ def front_map(
 ) -> SlopeMap:
     """Return the map of the front that sends the light to its points on the back, by optimal transport.
 
-    lens: lens with only its front free.  grid: `square_grid` of its lit `window`.  picture: (r, c) flux of the tube
+    lens: only its front is freeform.  grid: `square_grid` of its lit `window`.  picture: (r, c) flux of the tube
     between each four rays, row 0 = y max.  b: (3, c + 1, r + 1) points where these rays meet the back (mm).  q: points
     where they meet the front (mm) in the last round; None: by the inverse affine map.  The result contains the new q.
     """
