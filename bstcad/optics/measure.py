@@ -420,7 +420,7 @@ def _compare(
 
 
 def tubes_of(lens: Lens, pixels: int = 0) -> int:
-    """Return the tubes per side for a lens: two per control point, at least MIN_TUBES; pixels: of the screen, per side.
+    """Return the tubes per side for a lens: two per control point, at least MIN_TUBES; pixels: screen pixels per side.
 
     A lens with two nets gets twice as many, since light deflected by the first net varies within the cells of the
     second.  If a cell of the net lights several pixels, two tubes per pixel are used, at most four per cell.  Five more

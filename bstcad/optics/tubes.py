@@ -2,8 +2,8 @@
 
 The corners of a grid of tubes are traced to the screen.  A tube of flux F lands on two triangles.  Each carries F / 2,
 spread uniformly over its area, and each pixel receives the part inside it.  The picture has no noise: its error is that
-of linear interpolation between the corners and falls as the square of their distance.  The picture is differentiable in
-the landing points, whereas the number of rays in a pixel is not.
+of linear interpolation between the corners and falls nearly as the square of their distance.  The picture is
+differentiable in the landing points, whereas the number of rays in a pixel is not.
 """
 
 from __future__ import annotations
