@@ -50,7 +50,7 @@ class PreviewSize:
     net: int  # control points along the longer side; small prime factors make the cosine transforms fast
     tubes: int  # flux tubes per side
     rounds: int  # rounds of stage 1
-    evaluations: int  # evaluations of stage 2, for a point source
+    evaluations: int  # evaluations of stage 2, for a point source or parallel light
     blurred: int  # evaluations of stage 3, for an extended source; each takes twice the time
 
 

@@ -239,7 +239,7 @@ def _sample(lens: Lens, face: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarr
 def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> Figure:
     """Draw the section of the lens at y = 0 with rays projected on x-z: the lens close up, and the whole path.
 
-    rays: (n_rays, n_points, 3) in mm.  Screens are projected too if there are several, or one not in a plane z = const.
+    rays: (n_rays, n_points, 3) in mm.  A single screen in a plane z = const is not drawn; all others are.
     """
     figure = new_figure(11.0, 3.4)
     close, whole = figure.subplots(1, 2, width_ratios=(1, 1.9))

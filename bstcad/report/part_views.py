@@ -518,7 +518,7 @@ def _section(paper: Paper, views: Views, which: int, scale: float, *, left: floa
 def _thicknesses(
     views: Views, which: int, at: PaperFrame, reach: float
 ) -> Iterator[tuple[tuple[float, float], float, tuple[float, float]]]:
-    """Yield dimensions along z, of edge, flange, part and axis, as (ends in z, level, feet); see Paper.dimension."""
+    """Yield (ends in z, level, feet) of dimensions of edge, flange, part and centre along z; see Paper.dimension."""
     cut, flange, (front, back) = views.cuts[which], views.mount.flange, views.vertices
     middle, top, foot = at.y, at.y + reach, at.y - reach
     if flange is None:

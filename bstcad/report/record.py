@@ -523,7 +523,7 @@ class Report:
     """
 
     contents: Contents
-    irradiances: tuple[np.ndarray, ...]  # irradiance (rows, columns) on each target, row 0 = y max, with its sum
+    irradiances: tuple[np.ndarray, ...]  # irradiance (rows, columns) on each target, row 0 = y max, scaled to its sum
     # made part of this verification: facts, outliers (n, 3), predicted irradiances, and the deviation map with x, y and
     # form (rows y, columns x; mm, + out of the glass, NaN outside); None: no part was measured
     measured: Any = None
