@@ -285,7 +285,7 @@ class FaceNumbers(NamedTuple):
 
 @njit(inline="always")
 def _basis(u, m):
-    """Return (k, B_k, B_{k+1}, B_{k+2}) at u; u, m and k as in bspline.basis, copied since numba caches per file."""
+    """Return (k, B_k, B_{k+1}, B_{k+2}) at u, as bspline.basis does; repeated here, since numba caches per file."""
     if u < 1.5:
         k, s = 0, 2.0 - math.sqrt(4.0 - 2.0 * u)
     elif u > m - 2.5:
@@ -359,7 +359,7 @@ METRES_PER_MM = 1e-3  # unit conversion for glTF, which is in metres
 VERTEX_XML = b'<vertex x="%.10g" y="%.10g" z="%.10g"/>\n'
 TRIANGLE_XML = b'<triangle v1="%d" v2="%d" v3="%d"/>\n'
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-MAX_PROBES = 4096  # largest number of occupied slots that a corner may meet in the hash table, which is half free
+MAX_PROBES = 4096  # largest number of occupied slots that a corner may meet in the hash table, at least half free
 STL_HEADER = b"bstcad, binary STL, lengths in mm"  # header, which must not start with "solid"
 MAX_LINE_BYTES = 90  # upper bound of the length of a line of a 3MF model (bytes)
 CLEAR_RGBA, MIRROR_RGBA = "#A9D3EE80", "#C9CED4FF"  # sRGB and opacity of clear material and of a mirror
@@ -401,7 +401,8 @@ def read_stl(path: str | Path) -> Mesh:
     count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
     if len(data) != 84 + STL_TRIANGLE.itemsize * count or not count:
         raise ValueError(
-            f"{path.name}: is not a binary STL of {max(count, 0)} triangles: it has {len(data)} bytes; write it again"
+            f"{path.name}: is empty or not a complete binary STL: it states {max(count, 0)} triangles and has "
+            f"{len(data)} bytes; write it again"
         )
     corners = np.frombuffer(data, STL_TRIANGLE, offset=84)["corners"].reshape(-1, 3)
     if not np.isfinite(corners).all():

@@ -226,7 +226,7 @@ def image(patch: Patch, curve: RailCurve) -> Geom2d_Curve:
     ends, fraction = found[[0, -1]], t[:, None] / piece.end
     if np.abs(ends[0] + fraction * (ends[1] - ends[0]) - found).max() <= tolerance:
         return patches.bspline_curve_2d(ends, np.array([0.0, 0.0, piece.end, piece.end]))
-    if piece.turn > 0:  # u + iv = centre + arm exp(it)?
+    if piece.turn > 0:  # is the image a circle, u + iv = centre + arm exp(it)?
         start, end = ends @ (1, 1j)
         arm = (end - start) / (cmath.exp(1j * piece.end) - 1)
         centre = start - arm

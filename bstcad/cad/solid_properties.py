@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 Coordinates = tuple[float, float, float]
 
-STRAIGHT_POINTS = 2  # number of Gauss points along v if r and ∂r/∂u are linear in v, so that r (r · n) is cubic
+STRAIGHT_POINTS = 2  # number of Gauss points along v on a face that is straight along v
 STRAIGHT_KINDS = (Kind.GeomAbs_Plane, Kind.GeomAbs_Cylinder, Kind.GeomAbs_Cone, Kind.GeomAbs_SurfaceOfExtrusion)
 # Number of Gauss points along v for each kind of face; only rounding errors remain.
 GAUSS_POINTS_V = dict.fromkeys(STRAIGHT_KINDS, STRAIGHT_POINTS)
@@ -65,7 +65,7 @@ def whole_part(reread: StepLens, properties: MassProperties | None) -> WholePart
 
 
 def of_solid(solid: cadquery.Shape | TopoDS_Shape) -> MassProperties | None:
-    """Return area, volume and centroid of a part with lens axes along z; None if a face is damaged or unknown."""
+    """Return area, volume and centroid of a part with lens axes along z; None: a face is damaged or of unknown kind."""
     shape: TopoDS_Shape = getattr(solid, "wrapped", solid)
     vertex = TopoDS.Vertex_s(parts_of(shape, TopAbs_VERTEX)[0])
     z_ref = BRep_Tool.Pnt_s(vertex).Z()  # origin of the sums, near the part: errors due to gaps grow with the distance
@@ -88,9 +88,9 @@ def _of_face(face: TopoDS_Face, z_ref: float) -> Sums:
 
 
 def _in_parameters(face: TopoDS_Face, surface: BRepAdaptor_Surface, z_ref: float) -> Sums:
-    """Integrate over a face: ∫∫ g du dv = -∮ G du, G = ∫ g dv from a fixed v to the border; n dA = ∂r/∂u x ∂r/∂v du dv.
+    """Integrate over a face: ∫∫ g du dv = -∮ G du, where G = ∫ g dv from a fixed v to the border.
 
-    A face that OCC has reversed has a reversed border as well, which reverses n.
+    g is computed from position r and n dA = ∂r/∂u x ∂r/∂v du dv.  A face that OCC has reversed has a reversed border.
     """
     u, v, du = (each[:, None] for each in _concatenate(_edge_in_parameters(edge, face) for edge in _edges(face)))
     spline = surface.GetType() == Kind.GeomAbs_BSplineSurface

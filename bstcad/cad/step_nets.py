@@ -52,7 +52,7 @@ class LargeNet:
 
 
 def with_placeholders(shape: TopoDS_Shape) -> tuple[TopoDS_Shape, list[LargeNet]]:
-    """Return a copy of the shape with a placeholder for each large net (itself if it has none), and these nets."""
+    """Return a copy of the shape with a placeholder for each large net (the shape if it has none), and the nets."""
     nets: list[LargeNet] = []
     data = b""
     for face in parts_of(shape, TopAbs_FACE):
@@ -99,7 +99,7 @@ def placeholder_numbers(model: StepData_StepModel, count: int) -> list[int]:
 
 
 def fill_in_nets(text: bytes, placeholders: Sequence[int], nets: Sequence[LargeNet]) -> Iterator[bytes]:
-    """Yield the text of a STEP file, in parts, with the nets in place of their placeholders."""
+    """Yield pieces of a STEP file's text, with nets in place of placeholders; placeholders: their entity numbers."""
     end = text.rindex(b"ENDSEC;")
     # OCC numbers entities from 1 without gaps, so that the numbers of the points continue those of the file
     number = int(text[text.rindex(b"\n#", 0, end) + 2 : end].split(b"=", 1)[0]) + 1

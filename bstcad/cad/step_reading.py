@@ -139,7 +139,7 @@ def in_own_frame(solid: TopoDS_Solid) -> tuple[TopoDS_Solid, Placement]:
     """Return the solid of a lens in the frame of the lens, and the placement of that frame in the file.
 
     The frame of the lens is the frame in which the file defines the solid, if the back is a height z(x, y) there.
-    Otherwise, it is the frame of the back's net.  A solid without such a net keeps the frame of its definition.
+    Otherwise, it is the frame of the back's net.  A solid without a freeform back keeps the frame of its definition.
     """
     stated = _placement(solid.Location())
     defined = TopoDS.Solid_s(solid.Located(TopLoc_Location()))

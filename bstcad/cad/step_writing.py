@@ -110,11 +110,11 @@ def encode(
     faces: Sequence[str] = (),
     properties: MassProperties | None = None,
 ) -> Iterator[bytes]:
-    """Yield parts of the text of a shape's STEP file, with one product called `name`.
+    """Yield pieces of the text of a shape's STEP file, with one product called `name`.
 
     part: schema, number, author, colour, material and density, and the tolerances of the faces "back" and "front".
     faces: names of all faces, in the order of shape.Faces(); (): no names.
-    properties: area, volume and centroid, with which a reader of the file can check the shape.
+    properties: area, volume and centroid, with which a reader of the file can check the shape; None: not stated.
     """
     writer = STEPCAFControl_Writer()  # OCC's process-wide variables exist only after a writer is made
     with _settings(schema=SCHEMAS[part.schema]), quiet_occ():
@@ -224,8 +224,7 @@ def _correct_units(model: StepData_StepModel) -> None:
 def _add_properties(model: StepData_StepModel, properties: MassProperties) -> None:
     """Add area, volume and centroid as geometric validation properties of the part.
 
-    Their names follow "Recommended Practices for Geometric and Assembly Validation Properties" of the CAx
-    Interoperability Forum.
+    Their names follow the CAx-IF "Recommended Practices for Geometric and Assembly Validation Properties".
     """
     part = _first_entity(model, StepRepr_ProductDefinitionShape)
     context = _first_entity(model, StepShape_ShapeDefinitionRepresentation).UsedRepresentation().ContextOfItems()

@@ -2,11 +2,11 @@
 
 An upright wall is a plane, a cylinder or the extrusion of a cubic.  A wall with draft, or a bevel, is a plane, a cone
 or a ruled surface.  Each edge is built once for the two faces that meet in it.  In space and in the parameter planes,
-an edge has the parameter of its piece of the rim: length on a level line, angle on an arc, a net's own on its boundary.
+an edge has the parameter of its piece of the rim: length on a level line, angle on an arc, u or v on a net's boundary.
 
 Walls with draft begin on a parting line, the rim at one height, and lean inwards down to the front.  If the rim shrinks
 by an offset o, its point p moves to p + o m, where m is the inward normal; on a straight side m is linear between the
-mitres at the two corners.  Of the front, only height and slope are needed.
+mitres at its two corners.  Of the front, only height and slope are needed.
 """
 
 from __future__ import annotations
@@ -334,7 +334,7 @@ class LeaningPiece:
         depth, smallest = np.zeros(len(start)), np.ones(len(start))
         for _ in range(MAX_NEWTON_STEPS):
             height, *slopes = sampled(self.front, *(start + tangent * depth[:, None] * inwards).T)
-            closing = 1 + tangent * (np.stack(slopes, axis=1) * inwards).sum(axis=1)  # d(gap)/d(depth), mm per mm
+            closing = 1 + tangent * (np.stack(slopes, axis=1) * inwards).sum(axis=1)  # -d(gap)/d(depth), mm per mm
             smallest = np.minimum(smallest, closing)
             step = (z - depth - height) / np.maximum(closing, MIN_CLOSING)
             depth = depth + step

@@ -91,7 +91,7 @@ def wire_loop(given: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list
 
 
 def shape_in(given: Any) -> tuple[Any, str]:
-    """Return a shape, or the only object of a Workplane, and its type's name; for another number, None and words."""
+    """Return (shape or only object of a Workplane, name of its type), otherwise (None, number of objects in words)."""
     values = given.vals() if hasattr(given, "vals") else [given]
     if len(values) != 1:
         return None, f"a Workplane of {len(values)} objects"
@@ -239,7 +239,7 @@ def fit_spline(points: Locus, t: np.ndarray, tolerance: float, smooth: bool = Fa
         if np.abs(spline(even) - values).max() <= tolerance:
             return spline.c, spline.t
     max_parts = max(MAX_INTERVALS, len(t) << MAX_HALVINGS)
-    limit = tolerance / 2  # the error may be larger between those three points
+    limit = tolerance / 2  # the error may be larger between the centre and the quarters
     while True:
         quarters = np.append((t[:-1, None] + np.diff(t)[:, None] * np.arange(4) / 4).ravel(), t[-1])
         values = points(quarters)

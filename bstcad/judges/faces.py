@@ -24,7 +24,7 @@ from bstcad.optics.unfolding import per_radian
 
 PARAMETER_STEPS = 6  # steps of Newton's method for a parameter; the first guess has an error of at most half a span
 GRID_CELLS = 512  # number of cells per side of the grid over a face without knots
-PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # ring radii / rim radius; slim triangles leak light
+PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # radii / rim radius; many, as slim triangles leak light
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class Revolved:
     half: tuple[float, float]  # half extents along x and y (mm)
 
     def lines(self, parts: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return x and y (mm) of the lines of a uniform grid over the face; parts: refinement, none for a plane."""
+        """Return x and y (mm) of the lines of a uniform grid over the face; parts: refinement (ignored on a plane)."""
         cells = GRID_CELLS * parts if self.curvature else 64
         x, y = (np.linspace(-half, half, cells + 1) for half in self.half)
         return x, y

@@ -40,7 +40,7 @@ SCALE_PATCHES = 16  # assumed number of patches with independent form errors tha
 MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty from form errors, in half widths, above which a motion is not determined
 MIN_SENSITIVITY = 1e-7  # smallest change of distance per motion (mm per mm); smaller values are rounding errors
 RIM_MARGIN = 2e-3  # width, in half widths, of the rim that is ignored: points there may lie on the edge
-FACE_DISTANCE_FRACTION = 0.25  # largest distance of a point from the face, along z, in minimum thicknesses of the lens
+FACE_DISTANCE_FRACTION = 0.25  # largest distance along z of a point from the face, as a fraction of the thickness
 MOTION_NAMES = ("shift in x", "shift in y", "shift in z", "rotation about x", "rotation about y", "rotation about z")
 
 
@@ -237,8 +237,8 @@ def scale(face: BackFace, alignment: Alignment) -> tuple[float, float]:
 # --- outliers ---------------------------------------------------------------------------------------------------------
 
 NEIGHBOURS = 24  # number of nearest points with which each point is compared
-MIN_CLUSTER = 8  # number of neighbours within 50 % of a point's distance that make the point form, not an outlier
-OUTLIER_THRESHOLD = 6.0  # minimum deviation of an outlier, in standard deviations of neighbours or, if larger, of all
+MIN_CLUSTER = 8  # smallest number of neighbours with 50 to 150 % of a point's deviation that shows form, not an outlier
+OUTLIER_THRESHOLD = 6.0  # minimum deviation of an outlier, in standard deviations (the larger of neighbours' and all)
 MAD_TO_SIGMA = 1.4826  # ratio of standard deviation to median absolute deviation (MAD) of a normal distribution
 CAUCHY_SCALE = 2.0  # residual, in standard deviations, at which a neighbour's weight is one half
 REWEIGHTING_ROUNDS = 3  # iterations of the neighbours' weights
@@ -271,7 +271,7 @@ def _neighbour_planes(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compare the points with indices `part` with the planes through their neighbours, fitted with Cauchy weights.
 
-    Return the distance of each point from its plane, its neighbours' spread (mm), and how many are about as far off.
+    Return the distance of each point from its plane, its neighbours' spread (mm), and how many have a similar distance.
     """
     positions = tree.data[part]
     _, near = tree.query(positions, NEIGHBOURS + 1)
@@ -316,7 +316,7 @@ def first_pose(face: BackFace, cloud: np.ndarray) -> tuple[Pose, float]:
 
 
 def find_axis_exchange(face: BackFace, cloud: np.ndarray, original: float) -> tuple[np.ndarray, str] | None:
-    """Return an axis exchange (matrix (3, 3), words) after which a cloud is far nearer than `original` mm, or None."""
+    """Return an axis exchange (matrix (3, 3), words) after which the distance is far below `original` (mm), or None."""
     sample, fitting = _sample(cloud)[:: START_SAMPLE // AXES_SAMPLE], []
     for matrix, words in sorted(_axis_exchanges(), key=lambda exchange: _rarity(exchange[0])):
         turned = sample @ matrix.T

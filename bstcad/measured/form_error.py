@@ -1,9 +1,9 @@
 """Fit the form error of a made face as a spline, separate it from measurement noise, and state its figures.
 
-The deviation is modelled as a polynomial plus a random field.  The field is a spline on a net over the lens whose
-cosine amplitudes c_k are Gaussian with a variance S that depends only on the frequency; the points have white noise of
+The deviation is modelled as a polynomial plus a random field, a spline on a net over the lens.  The cosine amplitudes
+c_k of the net are Gaussian with a variance S that depends only on the frequency; the points have white noise of
 variance σ².  S (in bands of a quarter octave) and σ are estimated from the points.  The form error is the posterior
-mean, the linear estimate of heights, slopes and curvatures with the minimum error.  The posterior can be sampled.
+mean, the minimum-error linear estimate of heights, slopes and curvatures.  The posterior can be sampled.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class FormError:
     random_field: BSplineSurface = field(repr=False)
     spread: np.ndarray = field(repr=False)  # standard deviations (m, m) of the field's cosine amplitudes, mm
     noise: float  # RMS noise of the points, mm
-    motion: np.ndarray  # motion (6,) of fine relief beyond the alignment, which form errors bias; see BackFace.columns
+    motion: np.ndarray  # correction (6,) by fine relief, since form errors bias the alignment; see BackFace.columns
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return δz (mm) at (x, y) in mm, relative to the alignment by least squares."""
@@ -62,7 +62,7 @@ class FormError:
         return smooth + sag(self.random_field, x, y) + moved @ self.motion
 
     def add_to(self, surface: BSplineSurface) -> BSplineSurface:
-        """Return `surface` plus this form error, interpolated on its net, refined if the field's is finer."""
+        """Return `surface` plus this form error, on the net of `surface`, which is refined if the field's is finer."""
         sides = [
             own if count <= own else max(count, min(MAX_REFINEMENT * own, FIELD_NET_LIMITS[1]))
             for count, own in zip(self.random_field.shape, surface.shape, strict=True)
@@ -125,8 +125,8 @@ def _field(
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
     """Return the field's heights (m, m), standard deviations (m, m) of its amplitudes, the noise (mm) and motion (k,).
 
-    rows: basis functions (n, m²); off: deviations (n,), mm, and motions: their changes (n, k), without polynomials.
-    Generalised least squares gives the motion: the fit to `off` leaves σ² V⁻¹ off, V the covariance of field + noise.
+    rows: basis functions (n, m²).  off: deviations (n,), mm; motions: their changes (n, k); both without polynomials.
+    The motion is fitted by generalised least squares.  A fit of the field leaves σ² V⁻¹ off; V: its covariance + noise.
     """
     (m, _), n = net.shape, len(off)  # the net is square
     gram = (rows.T @ rows).tocsr()
@@ -170,8 +170,9 @@ def _motion_by_relief(
 
 
 def _variances(energy: np.ndarray, modes: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Return the variance (mm²) of the form per band; energy: relative to the variance `noise`; modes: cosines in each.
+    """Return the variance (mm²) of the form in each band.
 
+    energy: mean square of amplitudes relative to `noise`, their variance due to noise (mm²); modes: their number.
     Bands beyond the last detected one continue the last detected ones with a power law of the frequency, which polished
     and turned faces follow, but stay below the limit of detection.
     """
@@ -355,10 +356,10 @@ MAX_ZONE_ROUNDS = 30  # maximum number of linear programs
 def minimum_zone(face: BackFace, alignment: Alignment) -> tuple[float, Pose]:
     """Return width (mm) and pose of the narrowest zone between two envelopes of spheres centred on the design.
 
-    The width is twice the largest distance, minimised over the motions that the face determines (Chebyshev):
-    min t subject to |d_i + n_i · motion| <= t for all points, starting from the alignment by least squares.  Few points
-    are active: the linear program begins with the largest distances, and points outside its solution are added until
-    none lies outside by more than ZONE_TOLERANCE.
+    The width is twice the largest distance, minimised over the motions that the face determines (Chebyshev): min t
+    subject to |d_i + c_i · motion| <= t for all points i, with c_i as in BackFace.columns, starting from the alignment
+    by least squares.  Few points are active: the linear program begins with the largest distances, and points outside
+    its solution are added until none lies outside by more than ZONE_TOLERANCE.
     """
     columns = face.columns(alignment.points, alignment.normals) @ alignment.motions
     distances, motion = alignment.distances, np.zeros(alignment.motions.shape[1])

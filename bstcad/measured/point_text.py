@@ -220,7 +220,7 @@ class _Heading:
     columns: tuple[int, ...] = (0, 1, 2)  # indices of x, y and z in a line
     units: np.ndarray | float = 1.0  # size of the unit (mm), one for all columns or one for each
     fields: int = 3  # number of columns
-    actual_columns: str = ""  # names of the actual columns, if there are nominal ones, too
+    actual_columns: str = ""  # names of the columns that are read, if others also state x, y or z; else ""
 
 
 def _heading(lines: list[str]) -> _Heading:

@@ -173,7 +173,7 @@ def _frame(name: str, entities: Entities) -> Placement:
 def _axes(location: str, axis: str | None, reference: str | None, entities: Entities) -> Placement:
     """Return the placement with an origin, z direction and x direction; None: the z or x axis of the representation.
 
-    A tilted z without x is refused: ISO 10303-42 projects the x axis, but some readers choose another axis.
+    A z direction other than +z needs an x direction: ISO 10303-42 projects the x axis, some readers choose another.
     """
     z = Z_AXIS if axis is None else _direction(axis, entities)
     if reference is None and (z[0] or z[1] or not z[2] > 0):

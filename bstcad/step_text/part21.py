@@ -217,7 +217,7 @@ def _units(quantity: str, entities: Entities) -> dict[str, str]:
 
 
 def _unit_name(body: str, entities: Entities) -> str:
-    if "CONVERSION_BASED_UNIT" in body:  # an inch
+    if "CONVERSION_BASED_UNIT" in body:  # such as an inch
         index = required(re.search(r"CONVERSION_BASED_UNIT\('(\d+)'", body))[1]
         name = one_line(entities.strings[int(index)].lower()[:40])
         return f"{name} with a conversion factor" if "metre" in name or "radian" in name else name

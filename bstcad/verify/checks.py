@@ -95,7 +95,7 @@ class AtBound:
     """A bound of the scene that limits the tailored faces."""
 
     share: float | None  # fraction of the faces' area within 3 % of the bound; None for a bound of the thickness
-    tightest: str  # position nearest to the bound, "at (1, 2) mm"; "" for a thickness
+    tightest: str  # position where a face is nearest to the bound, "at (1, 2) mm"; "" for a thickness
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def _check_solids(path: Path, nominal: Nominal, part: Part, points: int, submit:
 
 
 def _read_text(path: Path, read: Future[Lens]) -> StepText:
-    """Read the text of lens.step, with more precise errors than OCC's.  read: job of OCC, which an error ends."""
+    """Read the text of lens.step, with more precise errors than OCC's.  read: OCC's job, ended after an error."""
     try:
         return part21.read_lens(path)
     except ValueError:
@@ -392,8 +392,8 @@ def _mesh_checks(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal)
     off_faces, rounding = meshes.vertex_error(mesh, lens), VERTEX_ROUNDING * size
     smallest = error * len(mesh.faces) / meshes.MAX_TRIANGLES  # the error is proportional to 1 / triangles
     where = (
-        f"a mesh cannot have more than {meshes.MAX_TRIANGLES} triangles, whose error is about {smallest:.1g} mm; "
-        "set output.mesh_tolerance to more than that"
+        f"a mesh has at most {meshes.MAX_TRIANGLES} triangles, and then an error of about {smallest:.1g} mm; "
+        "set output.mesh_tolerance to a larger value"
     )
     where = where if finest and error > tolerance else ""
     volume_error, distance = "STL: relative error of the volume", "STL: distance of vertices from the solid's faces"

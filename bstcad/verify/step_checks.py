@@ -172,7 +172,7 @@ def _edge_checks(reread: StepLens, lens: Lens, bare: bool = True) -> Iterator[Ch
 def _form_checks(
     reread: StepLens, face: BSplineSurface, tolerance: float, count: int, *, of: str = "back"
 ) -> Iterator[Check]:
-    """Check a face, evaluated by OCC at `count` Sobol points, against the design: distances (mm), angles of normals."""
+    """Check a face, evaluated by OCC at `count` Sobol points, against the design: coordinates (mm) and normals."""
     form = f"form: deviation of the {of} in the file from the designed one"
     if of == "front" and not reread.front.is_net:
         yield Check.true(form, False, "the file's front is not a net", id="form")
@@ -286,7 +286,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
 
 
 def _part_edge_check(wanted: Any, reread: Any, why: str) -> Check:
-    """Check the largest distance (mm) between edges of two solids; why: reason why `wanted` is None, if so."""
+    """Check the largest distance (mm) between edges of two solids; wanted: the mount's, None for the reason `why`."""
     name = f"{PART_FILE}: distance of edges from the mount's"
     if wanted is None:
         return Check.true(name, False, why, id="part-edges")

@@ -104,7 +104,7 @@ def _largest_difference(read: np.ndarray, designed: np.ndarray, name: str) -> tu
 def measure_checks(
     stated: ValidationProperties, shape: MassProperties | None, outline: Outline, name: str = SOURCE
 ) -> Iterator[Check]:
-    """Check stated measures against `shape` (None if none is stated); outline: scales the tolerance of the centroid."""
+    """Check stated measures against the faces', `shape` (None: none stated); outline: scales a centroid's tolerance."""
     if stated.of_shape:
         assert shape is not None
         measures = ("area", "mm²", stated.areas, shape.area), ("volume", "mm³", stated.volumes, shape.volume)
@@ -166,7 +166,7 @@ def part_checks(text: StepText, part: Part, name: str = SOURCE) -> Iterator[Chec
 
 
 def _worst_value(values: Sequence[Numbers], own: Numbers, who: str, unit: str) -> tuple[float, str]:
-    """Return the largest error of the stated values, infinite for an unreadable one, and the difference in words."""
+    """Return the largest error of stated values (unreadable: infinite) and a sentence; who: its words before `own`."""
     off = [math.dist(each, own) for each in values]
     worst, stated = max((math.inf if math.isnan(by) else by, each) for by, each in zip(off, values, strict=True))
     return worst, f"the file states {_words(stated, unit)}, but {who} {_words(own, unit)}"

@@ -14,7 +14,7 @@ VERDICTS = ("passed", "passed with remarks", NO_LIMIT, "failed")
 class Check:
     """One check of a verdict."""
 
-    name: str  # statement that is true if the check passes, or name of the quantity, in English; may change
+    name: str  # statement that is true if the check passes, or name of the quantity, in English; not stable (use `id`)
     value: float | bool | None  # measured value; None: could not be measured
     limit: float | bool | None  # limit; None: the value is stated, but not judged
     unit: str  # unit of value and limit; empty: a pure number

@@ -154,7 +154,7 @@ def test_a_damaged_stl_is_refused(make_lens, tmp_path):
     data = path.read_bytes()
     for damaged in (b"", data[:-1], data + b"x", data[:84]):
         path.write_bytes(damaged)
-        with pytest.raises(ValueError, match="not a binary STL"):
+        with pytest.raises(ValueError, match="not a complete binary STL"):
             mesh.read_stl(path)
     path.write_bytes(data[:100] + np.float32(np.nan).tobytes() + data[104:])
     with pytest.raises(ValueError, match="not finite"):

@@ -108,7 +108,7 @@ FILES = {  # changes of a file of the folder, and the sentence of the refusal
     "a STEP file of gigabytes": (lambda f: hole(f / "lens.step", 2 * GIGABYTE), r"lens\.step: .*larger than 600 MB"),
     "an archive of gigabytes": (lambda f: hole(f / "design.npz", 3 * GIGABYTE), r"is larger than 3\.\d+ MB"),
     "an STL that claims 2 GB": (
-        lambda f: altered(f / "lens.stl", 80, np.uint32(2 * GIGABYTE // 50).tobytes()), "not a binary STL of 42949672",
+        lambda f: altered(f / "lens.stl", 80, np.uint32(2 * GIGABYTE // 50).tobytes()), "binary STL: it states 4294967",
     ),
     "a bomb of half a GB": (lambda f: net(f, npy("<f8", (33, 33, 3), bytes(GIGABYTE // 2))), "has 5368709"),
     "a claim of 8 TB": (lambda f: net(f, npy("<f8", (10**12,))), SHAPE),
