@@ -149,7 +149,7 @@ def ghost(effects: Effects) -> GhostTracer | None:
 
 
 def losses(effects: Effects, lens: LensBlank, wavelength: float) -> Losses | None:
-    """Return the losses at a wavelength (nm); None without loading optics.losses if there are none.
+    """Return the losses at a wavelength (nm), or None (without loading optics.losses) if the scene has no losses.
 
     Raises ValueError, in one sentence, if the data of the material do not suffice.
     """

@@ -99,7 +99,7 @@ class Plate:
         return self.magnification * self.side / self.light.pixels
 
     def source_image(self, distance: float) -> float:
-        """Return the image size (mm) of a source of size s at distance L (mm): lamp s L / before, sun 2 L tan(s/2)."""
+        """Return the source's image width (mm) on a wall at L (mm); source size s: s L / before, or 2 L tan(s/2)."""
         if self.before:
             return self.light.size * distance / self.before
         return 2 * distance * math.tan(math.radians(self.light.size / 2))

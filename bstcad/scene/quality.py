@@ -56,7 +56,9 @@ class Tailoring(Record):
     rounds: Annotated[
         int | None, Key("Maximum number of rounds of transport map and slope fit in stage 1.", "", 1, 100, example=10)
     ] = None
-    stage2_iterations: Annotated[int | None, Key("Evaluations in stage 2 or 3.", "", 0, 1_000_000, example=120)] = None
+    stage2_iterations: Annotated[
+        int | None, Key("Evaluations of the merit in stage 2 or 3.", "", 0, 1_000_000, example=120)
+    ] = None
     overshoot: Annotated[
         float | None, Key("Weight of light beside the target, per pixel² of distance.", "", 0.0, 1e3, example=0.03)
     ] = None
@@ -91,7 +93,7 @@ class Tailoring(Record):
         """
         levels = tuple(level if isinstance(level, tuple) else coarser(net, level) for level in self.levels or ())
         preset = dict(PRESETS[self.quality], levels=levels or coarse_to_fine(net))
-        # With fewer than two rays per cell and direction a checkerboard grows in the net; a draft ends before it does.
+        # With fewer than two rays per cell and direction a checkerboard grows in the net, slowly enough for a draft.
         rays_per_cell = 2**0.5 if self.quality == "draft" else 2
         preset["rays"] = max(preset["rays"], math.ceil(rays_per_cell * side(net)))
         if self.method == "integration":
@@ -168,7 +170,7 @@ Name = Literal[
 ]  # fmt: skip
 FORM, RIPPLE = ("back.form", "front.form"), ("back.ripple",)
 FACE_ERRORS = {"correlation_length": FORM, "period": RIPPLE, "pattern": RIPPLE}  # key -> errors that can have this key
-TWO_FACE_ERRORS = ("front.", "lens.wedge")  # prefixes of errors of one face; zero unless named in a table
+TWO_FACE_ERRORS = ("front.", "lens.wedge")  # prefixes of errors of one face relative to the other; zero unless named
 NONE = "none"  # grade of an error that is always zero
 
 

@@ -62,15 +62,13 @@ class Accept(Record):
     form: Annotated[float, Key("Maximum distance of lens.step from the tailored surface.", "mm", 1e-12, 1.0)] = 1e-6
     efficiency: Annotated[
         float | None,
-        Key(
-            "Minimum fraction of flux behind the lens that is on the target.", "", 0.0, 1.0, example=0.9, of_light=True
-        ),
+        Key("Minimum fraction of flux behind the lens that hits the target.", "", 0.0, 1.0, example=0.9, of_light=True),
     ] = None
     light_on_target: Annotated[
-        float | None, Key("Minimum fraction of flux at the lens that is on the target.", "", 0.0, 1.0, of_light=True)
+        float | None, Key("Minimum fraction of flux at the lens that hits the target.", "", 0.0, 1.0, of_light=True)
     ] = None
     leak: Annotated[
-        float | None, Key("Maximum fraction of flux on the target that is on dark pixels.", "", 0.0, 1.0, of_light=True)
+        float | None, Key("Maximum fraction of flux on the target that hits dark pixels.", "", 0.0, 1.0, of_light=True)
     ] = None
     decentre: Annotated[float | None, Key("Maximum decentre of a measured part.", "mm", 1e-6, 1e3)] = None
     wavefront: Annotated[
