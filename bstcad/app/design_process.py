@@ -57,13 +57,13 @@ class ProgressFile:
     """Progress function that appends lines of JSON to a file: [seconds since 1970, stage, done, total, text]."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("a", encoding="utf-8")
+        self._path = path
+        path.touch()
 
     def __call__(self, stage: str, done: int, total: int, text: str) -> None:
-        """Append one line."""
-        with contextlib.suppress(OSError):  # a full disk must not end a design
-            self._file.write(json.dumps([round(time.time(), 3), stage, done, total, text]) + "\n")
-            self._file.flush()
+        """Append one line, unless the disk is full: a design goes on without it."""
+        with contextlib.suppress(OSError), self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps([round(time.time(), 3), stage, done, total, text]) + "\n")
 
 
 class LightSnapshot:

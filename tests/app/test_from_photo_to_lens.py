@@ -74,7 +74,6 @@ def test_plate_and_picture_take_the_proportions_of_a_photo_that_is_there(own, cr
     assert own.ask("/api/scene/small/photo.png").status == 400
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a process would end with its file
 @pytest.mark.parametrize(("light", "size"), [("laser", (80, 120)), ("lamp", (120, 80))])
 def test_a_photo_is_a_verified_lens_in_four_requests(own, light, size, tmp_path):
     name = with_scene(own, light, size)

@@ -210,7 +210,7 @@ def test_many_parts_of_one_design_are_judged_beside_it(small_design, nominal, tm
     assert rows[:, 2].reshape(off.shape) == pytest.approx(off, rel=1e-8, nan_ok=True)
     assert rows[1, 0] - rows[0, 0] == pytest.approx(x[1] - x[0], abs=2e-6) and rows[1, 1] == rows[0, 1]
     for wrong, sentence in (
-        (["-o", str(place)], "give the part's points with --measured"),
+        (["-o", str(place)], "give its points with --measured"),
         (["--measured", str(given), "-o", str(folder)], "contains files that are not a made part's"),
     ):
         assert cli.run(["verify", str(folder), *wrong]) == 2 and sentence in capsys.readouterr().err
