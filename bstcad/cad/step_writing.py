@@ -224,7 +224,7 @@ def _correct_units(model: StepData_StepModel) -> None:
 def _add_properties(model: StepData_StepModel, properties: MassProperties) -> None:
     """Add area, volume and centroid as geometric validation properties of the part.
 
-    Their names follow the CAx-IF "Recommended Practices for Geometric and Assembly Validation Properties".
+    Names as in "Recommended Practices for Geometric and Assembly Validation Properties" (CAx Interoperability Forum).
     """
     part = _first_entity(model, StepRepr_ProductDefinitionShape)
     context = _first_entity(model, StepShape_ShapeDefinitionRepresentation).UsedRepresentation().ContextOfItems()

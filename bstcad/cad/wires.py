@@ -199,7 +199,7 @@ class RailCurve:
 
 
 def breaks(surface: Surface, *pieces: LoopPiece) -> np.ndarray:
-    """Return parameters between which each piece lies over one smooth part of a surface; the pieces share t."""
+    """Return the t, from 0 to the end, between which each piece lies over one smooth part of a surface; all share t."""
     t = np.linspace(0.0, pieces[0].end, MIN_INTERVALS + 1)
     if is_net(surface):  # smooth between its knot lines
         t = np.unique(np.concatenate([t, *(_crossings(surface, piece) for piece in pieces)]))
@@ -249,7 +249,7 @@ def fit_spline(points: Locus, t: np.ndarray, tolerance: float, smooth: bool = Fa
             return poles, knots
         if len(t) > max_parts:
             raise ValueError(
-                f"the rim bends too sharply for a curve of {len(t)} parts (error {off.max():.1e} mm); "
+                f"the rim bends too sharply for a curve of {len(t) - 1} parts (error {off.max():.1e} mm); "
                 "move the rim, round its corners, or give the lens fewer control points"
             )
         t = np.union1d(t, (t[:-1] + t[1:])[off > limit] / 2)

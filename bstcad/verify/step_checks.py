@@ -228,7 +228,7 @@ def _properties(path: Path, stamp: object) -> MassProperties | None:
 
 @one_sentence
 def whole_part(path: Path) -> tuple[Lens, WholePart | None]:
-    """Read the lens of a part, with an arbitrary refractive index, and the part around it; None for a bare lens."""
+    """Read the lens of a part, with an arbitrary refractive index, and the part around it (None: a bare lens)."""
     reread = step_reading.read(path, _part(path, _stamp(path))[1])
     return step_reading.lens(reread, index=1.5), solid_properties.whole_part(reread, _properties(path, _stamp(path)))
 
