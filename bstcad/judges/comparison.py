@@ -210,9 +210,9 @@ def _scale_to(picture: np.ndarray, total: float) -> np.ndarray:
 
 
 def coarse_screen(screen: Screen) -> Screen:
-    """Return the screen with nearly square pixels, on the longer side at most as many as now and MAX_COMPARED_PIXELS.
+    """Return the screen with nearly square pixels, at most MAX_COMPARED_PIXELS and no more than now on its longer side.
 
-    Of the numbers above half this limit, the one with the most nearly square pixels is chosen, the largest of equals.
+    Of the numbers above half of this limit, that with the most nearly square pixels is chosen, the largest of equals.
     """
     width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
     ratio = min(width, height) / max(width, height)

@@ -43,7 +43,7 @@ NO_DATA = (
 NON_NUMERIC = re.compile(r"[a-df-zA-DF-Z#*]|-(?![\d.])")  # character that no plain number contains
 NO_DATA_FIELD = re.compile(rf"(?<![^\s,;\"])(?:{NO_DATA})(?![^\s,;\"])", re.IGNORECASE)
 NUMBER_WITH_COMMA = r"[+-]?\d*,\d+(?:[eEdD][+-]?\d+)?"
-EMPTY_FIELD = re.compile(r';[ ]*[;\n]|"[ ]*"|^[ ]*(?=;)', re.MULTILINE)  # empty field between semicolons
+EMPTY_FIELD = re.compile(r';[ ]*[;\n]|"[ ]*"|^[ ]*(?=;)', re.MULTILINE)  # empty field or quotes
 FORTRAN_EXPONENT = re.compile(r"(?<=[\d.])[dD](?=[+-]?\d)")  # exponent letter of 1.0D-03
 QUOTED_COMMA = re.compile(r'"\s*([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)\s*"')
 

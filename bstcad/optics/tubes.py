@@ -423,8 +423,8 @@ def _pieces(start: Tensor, end: Tensor, sizes: tuple[int, int]) -> tuple[Tensor,
     """Return (edge, s at its start, s at its end, column, row) of each piece of an edge between pixel borders.
 
     s runs from 0 to 1 along the edge.  Outside the screen (columns, rows) edges are not split.  The pixel of a piece
-    follows from the borders crossed before it.  The midpoint of the piece would fail: where an edge meets the corner of
-    a pixel a piece has no length, and rounding would select its pixel, although the derivatives of its ends count.
+    follows from the borders crossed before it.  Its midpoint would not do: at the corner of a pixel a piece has length
+    0, but its ends have derivatives, and rounding could give these to another pixel.
     """
     edges = torch.arange(start.shape[1], device=start.device)
     parts = [(edges, torch.zeros_like(start[0]), torch.full_like(edges, -1))]  # edges, starts s, axes of the borders

@@ -53,7 +53,7 @@ SOURCE_FLOOR = 0.02  # smallest irradiance of the map's source picture, relative
 # Standard deviations (pixels) of the blur of the source picture, solved in this order.  For a portrait with dark parts
 # beside bright ones, Newton's method ends at a mass error of 0.06 to 0.25 without this blur, and at 0.003 with it.
 SOURCE_BLURS = (4.0, 2.0, 1.0)
-FINE_FACTOR = 2  # cells per side of the last map, relative to the transport grid: letters get the light of large areas
+FINE_FACTOR = 2  # cells per side of the last map, relative to the transport grid: few cells light a thin letter
 # Solver with floors under the map's target picture, relative to its mean, used one after another
 TARGETS_SOLVER = Solver(floors=(0.1, 0.03, 0.01, 0.003))
 CONTRAST_RATIO = 1.5  # ratio of contrasts above which rays pass through pixel corners of the higher-contrast picture

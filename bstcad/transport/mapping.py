@@ -184,7 +184,7 @@ def _forward(sx, sy, points, out):
 
 @njit(cache=True, nogil=True)
 def _residual(sx, sy, x, y, p, q):
-    """Return the residual (x, y) - S(p, q), and ∂S_x/∂p, ∂S_x/∂q, ∂S_y/∂p and ∂S_y/∂q."""
+    """Return (x, y) - S(p, q) and ∂S_x/∂p, ∂S_x/∂q, ∂S_y/∂p, ∂S_y/∂q; S: (sx, sy), bilinear at array indices p, q."""
     i, j = min(int(p), sx.shape[0] - 2), min(int(q), sx.shape[1] - 2)
     a, b = p - i, q - j
     ex, ey = sx[i + 1, j] - sx[i, j], sy[i + 1, j] - sy[i, j]

@@ -76,7 +76,7 @@ def _row(net, at, b0, b2, q0, q2):
 
 @njit(inline="always")
 def sag(net, m, n, u, v):
-    """Return (h, ∂h/∂u, ∂h/∂v) as sums over differences of neighbouring heights; net (m, n) flattened (bspline)."""
+    """Return (h, ∂h/∂u, ∂h/∂v) from differences of heights; net: flattened (m, n); u, v in spacings (bspline.py)."""
     i, a0, a2, p0, p2 = basis(u, m)
     j, b0, b2, q0, q2 = basis(v, n)
     at = np.uint64(i * n + j)  # unsigned, so that no negative index is tested for
