@@ -222,4 +222,4 @@ class TestCommand:
         far = ["--set", "source.aperture.radius=1e-3", "--set", "target.x=[9000.0, 9400.0]"]
         assert cli.run(["plan", str(THU), *far]) == 2
         out, err = capsys.readouterr()
-        assert "source: none of its rays" in err and err.splitlines()[-1].startswith("bstcad: ") and out == ""
+        assert "source: no ray reaches" in err and err.splitlines()[-1].startswith("bstcad: ") and out == ""
