@@ -34,7 +34,7 @@ from bstcad.optics.surfaces import Surface
 
 DEGREE = 2  # degree of the basis functions (order 3)
 SPANS_AT_A_TIME = 1 << 14  # spans evaluated at a time, so that their values stay in the cache
-# Positions in a span, including both end knots, at which slope and curvature of the back are limited and reported.
+# Positions in a span, including both end knots, at which slope and curvature of a net are limited and reported.
 QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
@@ -282,7 +282,7 @@ class BSplineSurface(Surface):
         return replace(self, heights=torch.from_numpy(heights).to(self.heights))
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Return the minimum and maximum of zero and of the control heights over z0 (mm) acting inside the outline."""
+        """Return (min, max) over 0 and the heights (mm above z0) of all control points that act inside the outline."""
         (pitch_x, pitch_y), net = self.pitch, self.control_points()
         x, y = (np.maximum(np.abs(net[..., i]) - 2 * pitch, 0.0) for i, pitch in enumerate((pitch_x, pitch_y)))
         heights = self.heights.detach().cpu()[outline.contains(torch.from_numpy(x), torch.from_numpy(y))]
@@ -422,7 +422,7 @@ def _mean(w: Sequence[Tensor], values: Sequence[Tensor] | Tensor) -> Tensor:
 
 
 def span_points(surface: BSplineSurface, i: Tensor, j: Tensor, s: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """Return x (k, 1, spans) and y (1, k, spans) (mm) of positions s x s in spans (i, j)."""
+    """Return x (k, 1, spans) and y (1, k, spans) (mm) of the k x k positions s x s in each span (i, j)."""
     at = torch.tensor(list(s), dtype=torch.float64, device=i.device)[:, None]
     u, v = (position(index + at, count) for index, count in zip((i, j), surface.shape, strict=True))
     pitch_x, pitch_y = surface.pitch

@@ -1,6 +1,6 @@
 """Channels: the light as a weighted sum of parts, each of which is traced separately.
 
-A channel is one sample point of the source at one wavelength, with the refractive index of each medium for it.
+A channel is one sample point of the source at one wavelength, with the index of each medium at this wavelength.
 Irradiance, merit function and flux ledger are sums over channels, E = Σ_k w_k E_k with Σ_k w_k = 1.  A scene without an
 extended source and without a spectrum has one channel of weight 1.
 
@@ -115,6 +115,6 @@ def _lines(channels: Sequence[Channel]) -> list[list[int]]:
 
 
 def weighted_sum(channels: Sequence[Channel], values: Iterable[Any]) -> Any:
-    """Return Σ_k w_k v_k of values v_k (tensors or numbers), one per channel; exactly v_1 for one of weight 1."""
+    """Return Σ_k w_k v_k of values v_k (tensors or numbers), one per channel; exactly v_1 if there is one channel."""
     first, *others = (channel.weight * value for channel, value in zip(channels, values, strict=True))
     return sum(others, first)

@@ -19,8 +19,8 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, tilt_of
 
-WIDTHS_BEFORE_LENS = 4.0  # distance from lens to aperture of a rotated beam without z, in diagonals of the aperture
-MAX_INCLINATION = 89.0  # degrees, largest angle of parallel light to the axis of the lens
+WIDTHS_BEFORE_LENS = 4.0  # distance from lens to aperture of a rotated beam without z, in diagonals of its bounding box
+MAX_INCLINATION = 89.0  # limit of the angle between light and the axis of the lens, degrees
 
 
 @dataclass(frozen=True)
@@ -85,8 +85,8 @@ class Collimated(Emitter):
     def moved(self, motion: Motion, entrance: float) -> Collimated:
         """Return the simple beam after a motion; entrance: z of the plane through the first vertex (mm).
 
-        The aperture stays in a plane z = const when the light is rotated, and is too wide by the factor 1 / cos: by
-        1.5e-6 of its size at 0.1 degrees.
+        The aperture keeps its size in a plane z = const when the light is rotated, so the beam gets too narrow across
+        its direction: light along z, rotated by θ, by the factor cos θ, or 1.5e-6 of its size at 0.1 degrees.
         """
         if not (motion.rotates or self.tilted):  # light along z has the same irradiance on all planes
             x, y = (p + d for p, d in zip(self.centre or (0.0, 0.0), motion.shift, strict=False))
@@ -101,7 +101,7 @@ class Collimated(Emitter):
 
     @property
     def extent(self) -> Circle | None:
-        """Disc of direction cosines across the axis that the cone fills; None: all rays are parallel."""
+        """Disc that the cone fills in the direction cosines along e_x and e_y; None: all rays are parallel."""
         return Circle(math.sin(math.radians(self.divergence / 2))) if self.divergence else None
 
     @property

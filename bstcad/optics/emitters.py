@@ -183,7 +183,7 @@ class Emitter(ABC):
 
     @property
     def axes(self) -> Frame:
-        """Axes (e_x, e_y, n) of the source in space; the light goes along n, or along -n to a lens below it."""
+        """Axes (e_x, e_y, n) of the source in space; the light goes along n, or along -n to a lens below the source."""
         return axes(self.tilt or (0.0, 0.0))
 
     def beam(self, z: float) -> Beam | None:

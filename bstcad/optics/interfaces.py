@@ -4,8 +4,8 @@ An interface is a surface, the outline inside which it lies, and a law: refracti
 `cross` moves rays to an interface and through it.  The laws are implemented here once in plain torch; a lens is an
 ordered sequence of interfaces (lens.py), and every trace walks that sequence.
 
-A ray meets a spline at the root of F(s) = z(s) - sag(x(s), y(s)) (mm), s the path along the ray (mm).  `first_root` is
-written for light along +z, which comes from below the face, where F < 0; for light along -z (`Rays.sense`) F, d_z and
+A ray meets a spline at the root of F(s) = z(s) - sag(x(s), y(s)) (mm), s the path along the ray (mm).  The signs are
+those of light along +z, which comes from below the face, where F < 0; for light along -z (`Rays.sense`) F, d_z and
 all heights change their sign.  F' = d_z - ∇sag · (d_x, d_y), and no slope of the face exceeds that of the steepest leg
 of its control net.  If this bound keeps F' positive, the ray crosses the face once, and Newton's method finds the
 crossing.  Any other ray is *steep* to the face and may cross it several times.  Light leaves the glass at the first

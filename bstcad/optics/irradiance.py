@@ -177,7 +177,7 @@ class Leak:
 def leak(irradiance: np.ndarray, target: np.ndarray) -> Leak | None:
     """Return the leak of a picture E (rows, columns) of any scale; None if the target has no dark pixel.
 
-    The share is linear in E: noise of zero mean does not change its expectation.
+    For a fixed sum of E the share is linear in E, so that noise of zero mean does not change its expectation.
     """
     dark = target <= MAX_DARK_VALUE * target.max()
     if not dark.any():

@@ -13,13 +13,13 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Key:
-    """Meaning, unit and range of a field; the range applies to all numbers of a list, to the first of an inner list."""
+    """Meaning, unit and range of a field; the range applies to all numbers of a list (in inner lists, to the first)."""
 
     meaning: str  # meaning, one sentence
     unit: str = ""  # unit; "": a pure number or a word
     minimum: float | None = None  # lower end of the range; None: the field contains no number
     maximum: float | None = None
-    example: Any = None  # example value, for a key that every scene must state
+    example: Any = None  # example value of a key without a default, for reference and messages; None: no example
     remedy: str = ""  # advice for a number out of range; "": "choose a value in between"
     of_light: bool = False  # True for a limit on the light; a verdict on the light requires at least one such limit
 

@@ -31,7 +31,7 @@ class Lens:
     """A solid in air between two surfaces, its sides parallel to the axis, with interfaces before and behind it.
 
     A lens refracts: light travels along +z, enters through the front and leaves through the back.  A mirror reflects
-    at its back: light comes from above, along -z, and leaves along +z; its front is the rear of the plate and dark.
+    at its back: light comes from above, along -z, and leaves along +z; its front, the rear of the plate, gets no light.
     A second-surface mirror reflects at its front, and light crosses its back twice.
     `passes` states which face acts on the light in which order; a face that light meets twice is two interfaces.
     Rays are traced through `interfaces`; the surfaces that tailoring shapes are those of `freeform`.

@@ -187,7 +187,7 @@ class Losses:
     def _at(self, k: int, interface: Interface, index: float) -> tuple[Loss, ...]:
         inside = (self.absorption,) if self.absorption and k > 0 else ()  # glass lies behind the first interface
         own = (loss for loss in self.own if k > 0 or not loss.in_glass)
-        return (*inside, *own, *((self.fresnel.of(interface, index),) if self.fresnel else ()))  # trace needs this last
+        return (*inside, *own, *((self.fresnel.of(interface, index),) if self.fresnel else ()))  # last: trace.ghost
 
 
 def _amplitudes(n_in: float, n_out: float, cos_in: Tensor, cos_out: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ integral along its edges,
 so each edge is followed from pixel border to pixel border.  A piece of it adds to the pixel it crosses and, as one
 number, to all pixels below; a running sum down the columns completes the picture.  The two triangles beside an edge
 traverse it in opposite senses, so it is followed once, with the difference of their densities.  Some triangles are not
-followed: one that lies in one pixel or has no area gives its flux to a pixel, and one outside the screen or with an
+followed: one that lies in one pixel or is too thin gives its flux to a pixel, and one outside the screen or with an
 invalid corner gives none.  Their edges get the density 0, so that they do not affect their neighbours.
 
 With L the merit function, G = ∂L/∂I and H(x, y) = ∫_y^∞ G dy, the adjoint needs for each edge Φ = ∫ H dx (for ∂L/∂A)
@@ -34,7 +34,7 @@ from bstcad.optics.kernels.compiling import compiled
 
 MAX_DISTANCE = 1e15  # largest |x| + |y| of a corner (pixels); farther away, rounding approaches a pixel
 NO_BORDER = 1e300  # s of the next border of an edge that crosses no more borders along an axis
-MAX_WIDTH = 1e6  # width of a row of tubes (pixels) above which rounding may reach any column
+MAX_WIDTH = 1e6  # extent in x of a part's corners (pixels) above which rounding may reach any column
 ROWS_PER_STRIP = 16  # rows of tubes whose gradient one thread computes at a time
 
 ON, OUT_OF_RANGE = 0, 16  # state of a corner: on the screen; outside MAX_DISTANCE or not a number
@@ -79,7 +79,7 @@ def in_one_cell(a, b, c):
 
 @inlined
 def misses_screen(a, b, c):
-    """Return True if three corners lie outside one side of the screen, or one of them is invalid."""
+    """Return True if three corners lie outside the same side of the screen, or one of them is invalid."""
     return (a[4] & b[4] & c[4]) | ((a[4] | b[4] | c[4]) & OUT_OF_RANGE) != 0
 
 

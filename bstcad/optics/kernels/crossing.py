@@ -3,12 +3,12 @@
 Rays are processed in blocks (forward.py).  The forward pass stores each ray's path to the face; the adjoint computes
 hit and slopes from this path again.
 
-With the ray x + t d, the face's normal n = (-p, -q, 1) of its slopes p and q, and F(t) = z - sag, the hit X moves by
+With the ray x + t d, the face's slopes p and q and normal n = (-p, -q, 1), the hit X (where z = sag) moves by
 
-    dX = dx + t dd + d dt,   dt = (dsag - n · (dx + t dd)) / (n · d),   dp = S_xx dX_x + S_xy dX_y, dq likewise,
+    dX = dx + t dd + d dt,   dt = (δsag - n · (dx + t dd)) / (n · d),   dp = δp + S_xx dX_x + S_xy dX_y, dq likewise,
 
-S_xx … the sag's second derivatives.  The direction behind the face is e = η d + s n, s(p, q, n · d) by the law.  The
-adjoint is the transpose of this map. It is computed for the net, and for x and d where these need a gradient.
+δ the change by the heights at fixed x and y, S_xx … the sag's second derivatives.  The direction behind the face is
+e = η d + s n, s(p, q, n · d) by the law.  The adjoint is the transpose of this map, for the net and, if needed, x, d.
 """
 
 from __future__ import annotations
@@ -136,8 +136,8 @@ def _at_level(faces, at, e, h, gx, gy):
 def _at_tilted(faces, tilted, at, e, h, gx, gy):
     """Return the gradients of `_at_level` for a tilted screen.
 
-    The landing moves by u · (dP - e (n · dP) / (n · e)) along each axis u of the screen, dP = dX + far de (far: path
-    to the screen).
+    The landing moves by u · (dP - e (n · dP) / (n · e)) along each axis u of the screen, n its normal,
+    dP = dX + far de (far: path to the screen).
     """
     ex, ey, ez = e
     n_x, n_y, n_z = tilted.n_x, tilted.n_y, tilted.n_z
@@ -186,9 +186,9 @@ def _chain(faces, tilted, lands, count, work, path, d_rays, first):
         else:
             (g_ex, g_ey, g_ez), g_hit, g_t = _at_tilted(faces, tilted, at, e, h, work[G_X + r], work[G_Y + r])
         g_s = g_ez - p * g_ex - q * g_ey
-        # ∂s/∂p with N = norm: ∂cos_in/∂p = -N dx - p N² cos_in, ∂cos_out/∂p = η² cos_in / cos_out ∂cos_in/∂p
+        # ∂s/∂p with N = norm: in_p = -∂cos_in/∂p = N dx + p N² cos_in, ∂cos_out/∂p = η² cos_in / cos_out ∂cos_in/∂p
         in_p, in_q = norm * dx + p * norm2 * cos_in, norm * dy + q * norm2 * cos_in
-        if faces.reflects:  # s = -2 (d · N) N_z does not depend on cos_out
+        if faces.reflects:  # s = -2 N² along does not depend on cos_out
             turn, s_p, s_q, fall = 0.0, 0.0, 0.0, 2.0 * norm2
         else:
             turn, fall = eta * eta * cos_in / max(cos_out, min_cos), eta * norm2
@@ -258,13 +258,13 @@ class Crossing(NamedTuple):
     """Parameters of a crossing besides the net and the rays."""
 
     faces: Faces  # numbers of the face; the fields of the front are unused
-    tilted: TiltedScreen | None  # tilted screen; None: level
+    tilted: TiltedScreen | None  # tilted screen; None: a level screen, or none
     lands: bool  # True if rays land on the screen, False if they go on behind the face
     lossy: bool  # True if the face has losses, which need path and angle of incidence
 
     @property
     def arguments(self) -> tuple[Faces, TiltedScreen | None, bool | None]:
-        """Arguments of the kernels; None is a type of its own in numba, which compiles no branch for it."""
+        """Arguments of the kernels; `lands` is True or None: for the type of None numba compiles no unused branch."""
         return self.faces, self.tilted, True if self.lands else None
 
 

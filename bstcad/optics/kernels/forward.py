@@ -2,7 +2,7 @@
 
 Each part (see reductions.py) traces rows of cells in blocks through the steps of the plain torch form, which is the
 reference: launch, front face, back face, screen, pixel.  A block stays in the first-level cache (`work` contains BLOCK
-numbers of each quantity, from the offset of its name on).  Steps without a table run in vector registers.  In the
+numbers of each quantity, from the offset of its name on).  Steps that evaluate no spline are vectorised.  In the
 search for the back face all rays of a block take a Newton step in turn, so that the steps of different rays overlap.
 Arithmetic is float64 for every precision of the net; memory is a pair of pictures per part.
 """
@@ -121,7 +121,7 @@ def start_search(net, faces, count, work):
 
 @njit(error_model="numpy")
 def to_net(faces, count, work):
-    """Move rays to the plane of the net's heights; store the path in Z, u and v, and ∂u/∂s and ∂v/∂s along the ray."""
+    """Move rays to the plane of the net's heights; store the path to it in Z, and u, v, ∂u/∂s and ∂v/∂s."""
     for r in range(count):
         dx, dy = work[DX + r], work[DY + r]
         start = (faces.gap - work[Z + r]) / work[DZ + r]
@@ -355,7 +355,7 @@ def _trace(net, beam, faces, tilted, losses, count, work, active):
     to_net(faces, count, work)
     search(net, faces, count, work, active)
     at_back(faces, count, work)
-    if losses.present:  # the direction in the glass is a unit vector: the path is the rise divided by its z
+    if losses.present:  # the direction in the glass is a unit vector: the path is the rise divided by d_z
         for r in range(count):
             rise = faces.gap + work[S + r] * work[DZ + r] - work[PATH + r]
             work[PATH + r] = rise / work[DZ + r]
@@ -472,7 +472,7 @@ SeededLight = tuple[float, Emitter, Lens, int, Rectangle]  # weight, source, len
 
 
 def simulate(lights: Sequence[SeededLight], screen: Screen, n: int) -> tuple[Tensor, Tensor, dict[str, float], int]:
-    """Return (box picture, tent picture, ledger, number of rays) by n x n stratified rays of each light.
+    """Return (box picture, tent picture, ledger, number of rays) from n x n stratified rays of each light.
 
     Flux is a fraction of the flux of all sources, whose weights sum to 1.
     """

@@ -27,7 +27,7 @@ from bstcad.optics.receivers import Receiver
 TRANSMISSION_NODES = 4097  # nodes of a table of a face's transmission
 TABLE_SIDES = 65, 129, 257, 513  # control points per side of a table of light, tried in this order
 IRRADIANCE_TOLERANCE = 1e-5  # largest RMS of a table's relative error in the irradiance, far below errors of pictures
-MIN_IRRADIANCE = 1e-4  # irradiance relative to its maximum, below which the error counts relative to this value
+MIN_IRRADIANCE = 1e-4  # fraction of the maximum irradiance that is added to the divisor of the relative error
 SLOPE_TOLERANCE = 1e-8  # largest RMS of a table's error in the slopes of rays
 PEAK_TO_RMS = 100.0  # largest error at a point of a table divided by the RMS tolerance: the outermost spans are worst
 MAX_LIGHT_TABLES = 16  # tables of light in the cache
@@ -47,7 +47,7 @@ def faces(
     """Return (Faces of a net, with front and screen if given; TiltedScreen, or None for a level screen or no screen).
 
     The kernels trace light along +z.  If light comes along -z (sense -1), all numbers describe the scene reflected by
-    z -> -z, as the heights and the rays must (crossing.reflect_z).  start: `Rays.z`, or z of the first vertex (mm).
+    z -> -z; the caller reflects heights and rays (crossing.reflect_z).  start: `Rays.z`, or z of the first vertex (mm).
     """
     surface, law = interface.net, interface.law
     conic = (front.surface.curvature, front.surface.conic_constant) if front else (0.0, 0.0)
@@ -99,7 +99,7 @@ def beam(source: Emitter, lens: Lens, tables: bool = True) -> Beam | None:
 @functools.lru_cache(maxsize=MAX_LIGHT_TABLES)  # at most 6 MB each
 @torch.no_grad()
 def _table_of_light(source: Emitter, window: Rectangle, z: float) -> Beam | None:
-    """Return the coarsest table of the light that is accurate midway between its points; None: none of TABLE_SIDES is.
+    """Return the coarsest table of the light that is accurate midway between its points; None: no table is accurate.
 
     The table contains splines through the source's irradiance and ray slopes at points of the plane z (mm).
     """
@@ -129,7 +129,7 @@ def _table_of_light(source: Emitter, window: Rectangle, z: float) -> Beam | None
 
 
 def _tilted(plane: Receiver | None, before: int, behind: int) -> records.TiltedScreen | None:
-    """Return a tilted plane as numbers, None for a level one; before, behind: sense of the light at the net."""
+    """Return a tilted plane as numbers, None for a level one; before, behind: sense of light at the net."""
     if plane is None or plane.is_level:
         return None
     assert plane.axes is not None  # no kernel traces to other receivers

@@ -52,7 +52,7 @@ class Beam(NamedTuple):
     fall: float = 0.0  # coefficient of the exponent (1/mm²); without unit for a tilted point source
     power: int = 0  # power of the distance d of a point source: 0, 3 or 4
     distance: float = 0.0  # distance of a point source from the plane (mm); 0: collimated, or a table
-    start: float = 0.0  # distance from the plane at which rays start (mm)
+    start: float = 0.0  # distance from this plane to the plane from which rays start (mm)
     tilted: int = 0  # 1: the axis of the light is n or given by a table; 0: (0, 0, 1)
     n_x: float = 0.0  # axis n of the source, in the frame in which light starts along +z
     n_y: float = 0.0

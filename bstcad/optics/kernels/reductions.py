@@ -70,7 +70,7 @@ def elementary(function: Callable[[Tensor], Tensor], t: Tensor) -> Tensor:
 
 
 def dot(a: Tensor, b: Tensor) -> float:
-    """Return Σ a b of two vectors in float64, without gradient."""
+    """Return Σ a b of two vectors without gradient: summed in float64 by the kernel, else in their precision."""
     fast = ops.kernel("reductions.dot", a)
     return fast(a, b) if fast else float(total(a * b))
 

@@ -2,7 +2,7 @@
 
 They are several times faster than the plain forms, because each point's nine products stay in registers and the adjoint
 adds to one net per part instead of nine index_put passes.
-`largest_bending` gives the largest slope and curvatures of a back (analysis/shape.py); its plain form is `bspline.Jet`.
+`largest_bending` gives the largest slope and curvatures of a net (analysis/shape.py); its plain form is `bspline.Jet`.
 """
 
 from __future__ import annotations
