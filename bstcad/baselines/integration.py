@@ -96,10 +96,10 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
 
 @torch.no_grad()
 def march(coming: Rays, aim: Tensor, plane: Receiver, law: Law, z: float, first: First = "x") -> SurfacePoints:
-    """Return points of a face that sends rays (n, n), n odd, to aims (2, n, n) mm, from z (mm) on the middle ray.
+    """Return points of a face that sends rays (n, n), n odd, to aims (2, n, n) mm on the receiver `plane`.
 
-    coming: rays on the way to the face; first: axis of the first line, across which all others run.  A ray that is
-    lost, or that is parallel to the face, ends its line.  SceneError if the middle ray is lost.
+    coming: rays on the way to the face.  z: z (mm) of the point on the middle ray.  first: axis of the first line,
+    across which all others run.  A lost ray, or one parallel to the face, ends its line.  SceneError: no middle ray.
     """
     middle = aim.shape[-1] // 2
     if not bool(coming.alive[middle, middle]):
@@ -173,7 +173,7 @@ class _Grid:
 
 
 def _outwards(grid: _Grid, position: Tensor, reached: Tensor, plane: Receiver, law: Law) -> SurfacePoints:
-    """Integrate lines of points outwards from the middle ray, with its `position` (3, 1, lines) mm and `reached`."""
+    """Integrate lines outwards from their points on the middle ray, `position` (3, 1, lines) mm and `reached`."""
     middle = grid.alive.shape[0] // 2
     points, all_reached = torch.zeros_like(grid.origin), torch.zeros_like(grid.alive)
     points[:, [middle]], all_reached[[middle]] = position, reached

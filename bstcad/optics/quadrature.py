@@ -24,7 +24,7 @@ FINE_POINTS = 2  # Gauss points in each part of a chord or of an edge of a net o
 CHORD_POINTS = 96  # Gauss points of a chord over a smooth face; exact to rounding on a sphere to 0.95 of its radius
 END_PARTS = 12  # minimum parts of an end span, where h(x) is not a polynomial; gives volumes to 1e-12
 BORDER_POINTS_PER_STRIP = 512  # border points evaluated at a time
-MIN_RELATIVE_DX = 1e-14  # largest |dx| / ds of border points that are left out, since they add nothing
+MIN_RELATIVE_DX = 1e-14  # |dx| / ds up to which border points are left out, since they add nothing
 EDGE_PARTS = 256  # minimum number of parts of an edge's curve
 
 gauss_rule = functools.cache(np.polynomial.legendre.leggauss)  # points and weights on [-1, 1], by their number
@@ -166,7 +166,7 @@ def _points(face: BSplineSurface) -> int:
 
 
 def _smooth_parts(face: BSplineSurface, axis: int, parts: int) -> np.ndarray:
-    """Return breaks (mm) along an axis of a net, between which heights are nearly polynomial: knots and others."""
+    """Return breaks (mm) along an axis of a net: knots and divisions, between which heights are nearly polynomial."""
     (first, last), pitch = (face.x, face.y)[axis], face.pitch[axis]
     lines = np.concatenate([[first], first + pitch * (np.arange(1, face.shape[axis] - 2) + 0.5), [last]])
     ends = [np.linspace(low, high, END_PARTS + 1) for low, high in (lines[:2], lines[-2:])]
@@ -197,7 +197,7 @@ class MassProperties:
 def of_lens(lens: Lens) -> MassProperties:
     """Return the properties of a bare lens to 1e-9; OCC needs minutes for a large net and has errors of 1e-5."""
     lens, total = lens.plain(), Sums()
-    z_ref = lens.front.z  # near origin of the heights, which limits rounding
+    z_ref = lens.front.z  # origin of z in the sums: a near one limits rounding
     for face, sign in ((lens.back, 1), (lens.front, -1)):
         rim, raised = face.around, face.around.z - z_ref
         border = outline_border(lens.outline, rim)

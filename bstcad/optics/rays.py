@@ -122,7 +122,7 @@ def clocked(frame: Frame, angle: float) -> Frame:
 
 
 def clocking_of(frame: Frame) -> float:
-    """Return the angle (degrees) by which `axes` of the frame's tilt are `clocked` to give the frame."""
+    """Return the angle (degrees) by which `clocked` rotates the `axes` of the frame's tilt to give the frame."""
     e_x, e_y, _ = axes(tilt_of(frame[2]))
     along, across = (sum(p * q for p, q in zip(frame[0], e, strict=True)) for e in (e_x, e_y))
     return math.degrees(math.atan2(across, along))

@@ -96,7 +96,7 @@ class Receiver(ABC):
         return Landed(torch.stack(tuple(found)), rays.flux, status, rays.taken)
 
     def to(self, rays: Rays) -> Rays:
-        """Move rays along their direction to the receiver ahead of them; rays that lead away from it are lost."""
+        """Move rays along their lines, forwards or backwards, to the receiver; rays that miss it stay and are lost."""
         path, status = self.path(rays)
         return replace(rays, position=rays.position + path * rays.direction, status=status)
 
@@ -123,7 +123,7 @@ class Receiver(ABC):
         return self.throw(z)
 
     def areas(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray | None:
-        """Return areas or solid angles, relative to their mean, of (rows, columns) cells of x by y; None: all equal."""
+        """Return areas or solid angles of (rows, columns) cells over x and y, relative to their mean; None: equal."""
         return None
 
     def to_level_plane(self, x: Array, y: Array, eye: float) -> tuple[Array, Array]:

@@ -33,20 +33,20 @@ def side(net: Sides) -> int:
 
 
 def scaled(net: Sides, share: float) -> Sides:
-    """Return a net with `share` times the spans of `net` along each side, at least MIN_SIDE control points."""
+    """Return a net with `share` times the point spacings of `net` on each side, at least MIN_SIDE control points."""
     x, y = (max(round(share * (points - 1)) + 1, MIN_SIDE) for points in as_pair(net))
     return simplified((x, y))
 
 
 def in_proportion(net: Sides, of: Sides, to: Sides) -> Sides:
-    """Return `to` with its spans multiplied in each direction by the ratio of the spans of `net` to those of `of`."""
+    """Return `to` with its number of point spacings multiplied, on each side, by the ratio of `net` to `of`."""
     each = zip(as_pair(net), as_pair(of), as_pair(to), strict=True)
     x, y = (max(round((m - 1) * (t - 1) / (o - 1)) + 1, MIN_SIDE) for m, o, t in each)
     return simplified((x, y))
 
 
 def coarser(net: Sides, longer: int) -> Sides:
-    """Return `net` with `longer` control points on its longer side and the same ratio of spans; it is never refined."""
+    """Return `net` coarsened in proportion to `longer` control points on its longer side, unchanged if it has fewer."""
     longest = max(as_pair(net))
     return net if longer >= longest else scaled(net, (longer - 1) / (longest - 1))
 

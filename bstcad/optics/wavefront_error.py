@@ -136,7 +136,7 @@ class OpdSize:
 
 @dataclass(frozen=True, eq=False)
 class WavefrontError:
-    """Wavefront behind a lens relative to the goal; one wave is the source's main wavelength (nm, as stated)."""
+    """Wavefront behind a lens relative to the goal; one wave is the main wavelength that the source states."""
 
     z: float  # plane of the comparison, mm
     wavelength: float  # main wavelength, nm
@@ -145,7 +145,7 @@ class WavefrontError:
     tilt: tuple[float, float]  # tilt removed, µrad: inclination of the light towards +x and +y relative to the goal
     angle_rms: float  # RMS angle between rays and goal rays, weighted by flux, tilt included, µrad
     angle_max: float  # largest angle between rays and goal rays, µrad
-    floor: float  # rounding error of the RMS, waves
+    floor: float  # bound of the rounding error of the OPD, and so of the RMS, waves
     flux: float  # fraction of the source's flux that is compared
     rays: int  # number of rays compared
     x: np.ndarray = field(repr=False)  # (k,) x of the columns of the map, mm
