@@ -203,7 +203,7 @@ MARGIN_RAYS = 512  # rays per side for `margins`
 
 @dataclass(frozen=True)
 class Margins:
-    """Worst cases of a trace over all rays that carry light to the back."""
+    """Worst cases of a trace over all rays that carry light to the faces from the first net on."""
 
     tir_margin_deg: float | None  # critical angle minus angle of incidence (degrees), < 0: reflected; None: no ray
     newton_slope_min: float | None  # smallest |F'(t)| from the first net on, Newton's divisor; 0: grazing; None: no ray

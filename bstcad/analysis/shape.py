@@ -127,10 +127,10 @@ class Ripple:
 def ripple(face: BSplineSurface) -> Ripple:
     """Return the ripple of a face: the part of its highest octave that a smooth net does not have.
 
-    The octaves are those of the net times a Hann window, sin² from rim to rim.  (Without it the cosine transform sees a
-    kink along the rim of a smooth net, and its highest octave may have some hundred µrad.)  With E the slope energy of
-    the highest octave and E' that of the octave below, the fraction 1 - SMOOTH_RATIO E' / E counts as ripple.  The mean
-    squares over the face follow from the overlaps of the basis functions of degree 2 and of their slopes.
+    The octaves are those of the net, minus its best cubic polynomial, times a Hann window, sin² from rim to rim.
+    (Without the window the kink of a smooth net along its rim may give the highest octave some hundred µrad.)  With E
+    the slope energy of the highest octave and E' that of the octave below, the fraction 1 - SMOOTH_RATIO E' / E is the
+    ripple.  Mean squares over the face follow from overlaps of the basis functions of degree 2 and of their slopes.
     """
     fading = np.outer(*(np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2 for count in face.shape))
     rest = _without_cubic(face)
@@ -155,8 +155,8 @@ def slope_octaves(face: BSplineSurface) -> np.ndarray:
     """Return the slope energy of the control net by octaves of frequency, coarse to fine (mm², squared differences).
 
     It is Σ λ |ĥ|² over the cosine transform ĥ of the net minus its best cubic polynomial (the even continuation of a
-    tilt has kinks), λ the eigenvalue of the negative Laplacian.  Octave k has the frequencies whose larger index is in
-    (m / 2^(k+1), m / 2^k], m the number of control points along the longer side; the other indices are scaled to m.
+    tilt has kinks), λ the eigenvalue of the negative Laplacian.  Octave k, 0 the finest, has the frequencies whose
+    larger index is in (m / 2^(k+1), m / 2^k], m the control points of the longer side; the other index is scaled to m.
     """
     energy, octave = _energy(face, scipy.fft.dctn(_without_cubic(face), norm="ortho")), _octave(face)
     return np.array([energy[octave == k].sum() for k in reversed(range(int(np.log2(max(face.shape)))))])

@@ -9,7 +9,7 @@ E(x, y) is the irradiance, on any scale, and η a level between 0 and 1.  Pixels
 
 E_max             maximum; here of the running median over 3 x 3 pixels, so that neither a hot pixel nor noise
                   determines it.  The median preserves plateaus and straight edges, lowers the peak of a Gaussian of
-                  1/e² radius w by 2 to 5 h² / w² of its height (pixels of side h), and rises by 1.6 σ for noise of σ
+                  1/e² radius w by 2 to 5 h² / w² of its height (pixels of side h); noise of RMS σ raises E_max by 1.6 σ
 A_η               clip-level irradiation area: all pixels of the unfiltered picture with E > η E_max
 P_η               clip-level power, ∫ E dA over A_η
 f_η = P_η / P     fractional power, P = ∫ E dA over the picture
@@ -140,7 +140,7 @@ class FlatTop:
     flatness: float  # F_0.9: mean divided by maximum, where the light is above 0.9; 1 if uniform
     fractional_power: float  # f_0.9: fraction of the light on the target that is above 0.9
     edge_steepness: float  # s: fraction of the area above 0.1 that is not above 0.9; 0 if vertical
-    efficiency: float  # fraction of the source's flux inside the profile (of a super-Gaussian: where it is above 0.9)
+    efficiency: float  # fraction of the source's flux inside the profile (super-Gaussian: where this exceeds 0.9)
 
     @classmethod
     def of(

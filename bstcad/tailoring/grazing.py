@@ -49,7 +49,7 @@ class Grazing:
 
     @classmethod
     def of(cls, edge: Edge, lens: Lens) -> Grazing:
-        """Make the penalty for the light of an edge at the last tailored face of a lens."""
+        """Make the penalty at the last tailored face of a lens; edge: the light, and the angle θ'_max."""
         own_lens = edge.light.through(lens)
         source, net = edge.light.source, own_lens.nets[-1]
         window = lit_window(source, own_lens)

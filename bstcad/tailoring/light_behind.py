@@ -46,12 +46,12 @@ from bstcad.tailoring.slope_map import centroid, pixel_corners, resample_picture
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Points, Solver, grid_coordinates, solve
 
-MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds; cells per side in all except the last: max(n/4, 64)
+MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds; cells per side before the last one: max(n / 4, 64)
 MAX_WAVE_ITERATIONS = 40  # largest number of iterations for the point of a wave that sends a ray to a given point
 WAVE_TOLERANCE = 1e-9  # change (mm) below which the iterations for a point of the wave have converged
 SOURCE_FLOOR = 0.02  # smallest irradiance of the map's source picture, relative to its mean: black would leave holes
-# Standard deviations (pixels) of the blur of the source picture, solved in this order.  For a portrait with dark parts
-# beside bright ones, Newton's method ends at a mass error of 0.06 to 0.25 without this blur, and at 0.003 with it.
+# Standard deviations (pixels) of the blur of the source picture; maps are computed in this order.  For a portrait with
+# dark parts beside bright ones, Newton's method ends at a mass error of 0.06 to 0.25 without, and at 0.003 with it.
 SOURCE_BLURS = (4.0, 2.0, 1.0)
 FINE_FACTOR = 2  # cells per side of the last map, relative to the transport grid: few cells light a thin letter
 # Solver with floors under the map's target picture, relative to its mean, used one after another
@@ -69,7 +69,7 @@ class LightBehind:
 
     position: np.ndarray  # (3, c + 1, r + 1) points of the rays in space (mm), for c columns and r rows of pixels
     direction: np.ndarray  # (3, c + 1, r + 1) unit vectors along the rays
-    picture: np.ndarray  # (r, c) flux of the tube between each four rays, row 0 = y max
+    picture: np.ndarray  # (r, c) flux of each tube, between four neighbouring rays, row 0 = y max
 
     def reversed(self) -> LightBehind:
         """Return the same rays, numbered backwards along both axes of the arrays."""
@@ -131,7 +131,7 @@ class LightBehind:
 
     @property
     def _flux(self) -> np.ndarray:
-        """Flux of the tube between each four rays, (c, r), x first."""
+        """Flux of each tube, between four neighbouring rays, (c, r), x first."""
         return self.picture[::-1].T
 
 
@@ -272,7 +272,7 @@ def without_crossings(light: LightBehind, screen: Screen, surface: Surface, n: i
 
 
 def _inverted(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return True for each quad of a grid of points that is inverted, (m - 1, n - 1)."""
+    """Return True for each inverted quad of a grid of points (m, n), (m - 1, n - 1)."""
     return (x[1:, 1:] - x[:-1, :-1]) * (y[:-1, 1:] - y[1:, :-1]) - (x[:-1, 1:] - x[1:, :-1]) * (
         y[1:, 1:] - y[:-1, :-1]
     ) <= 0

@@ -49,8 +49,8 @@ HALVINGS = 10  # number of bisection steps between a lens that exceeds the bound
 def place_back(lens: Lens, z: float, least: float, bounds: Bounds | None = None) -> Lens:
     """Return the lens with the plane of its back at `z` (mm), or as far above as a thickness of `least` mm requires.
 
-    With bounds, the minimum thickness at the rim and the maximum thickness are met too.  If these are incompatible, the
-    thickness violates the minimum and the maximum by equal lengths.
+    With bounds, the minimum thickness at the rim and the maximum thickness are met too, the latter also by a plane
+    below `z`.  If the bounds are incompatible, the thickness violates minimum and maximum by equal lengths.
     """
     x, y = thickness_points(lens)
     relative = lens.back.relative_sag_and_slope(x, y)[0]

@@ -68,7 +68,7 @@ from bstcad.optics.wavefront_error import path_from_reference
 from bstcad.tailoring.source_image import BlurOperator, ExtendedSource, blur_error, blurred, blurs, with_border
 
 LAPLACIAN_POWER = 0.5  # power of the Laplacian in `SobolevVariable`
-COARSE_LAPLACIAN_POWER = 0.75  # power of the Laplacian in `CoarseVariable`, whose knot spans are wider than a pixel
+COARSE_LAPLACIAN_POWER = 0.75  # power of the Laplacian in `CoarseVariable`, whose net has about one cell per pixel
 TARGET_BLUR = 1.0  # standard deviation of the blur of the target before the local weight is computed (pixels)
 WEIGHT_SMOOTHING = 1.5  # standard deviation of the smoothing of the weight's logarithm (control points)
 MAX_LOCAL_WEIGHT = 4.0  # largest local weight; the smallest is 1 / MAX_LOCAL_WEIGHT, before division by the leverage
@@ -220,7 +220,7 @@ class Merit:
 
 
 def _from_source(lens: Lens, wave: Wave | None) -> Lens:
-    """Return the lens, with its tubes launched from the source if a wavefront goal needs optical paths."""
+    """Return the lens; for a wavefront goal, marked so that tubes start at the source, as optical paths require."""
     if wave is None or lens.freeform[0] == 0:
         return lens
     return replace(lens, shaped=(0, *lens.freeform))

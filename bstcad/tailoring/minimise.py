@@ -25,7 +25,7 @@ class Best:
     """Best evaluation so far, and the counts of evaluations."""
 
     merit: float = math.inf
-    figure: float = math.nan  # figure that the problem returns beside the merit: RRMSD, or the largest excess
+    figure: float = math.nan  # figure that the problem returns beside the merit, such as RRMSD or the largest excess
     latest: float = math.nan  # figure of the last evaluation
     parameters: tuple[Tensor, ...] = ()  # parameters of the best evaluation; () if no value was finite
     evaluations: int = 0
@@ -66,8 +66,8 @@ class Iterate:
 def minimise(problem: Objective, method: Method, evaluations: int, best: Best = Best()) -> Iterator[Iterate]:
     """Answer the queries of a method until it ends or the evaluations are used up; yield the state after each.
 
-    An evaluation that is not finite is counted as skipped.  evaluations: limit of their number, including those of
-    `best`, the best evaluation before the method's state.
+    An evaluation that is not finite is counted as skipped.  best: best evaluation before the method's state.
+    evaluations: limit of their number, including those that `best` counts.
     """
     if best.evaluations >= evaluations:
         return

@@ -38,7 +38,7 @@ from bstcad.optics.trace import across, behind
 from bstcad.tailoring.merit import CoarseVariable, SobolevVariable, control_point_axes
 from bstcad.transport.mapping import grid_coordinates
 
-SCALE_FRACTION = 0.2  # ratio, by measurement, of f to the scale at which both blocks move the pictures equally far
+SCALE_FRACTION = 0.2  # measured best ratio of f to the scale at which both blocks move the pictures equally far
 # Standard deviation of the smoothing of q(b), in control points of the back.  In a gap between two parts of the light,
 # where few rays fall and some cross, q(b) jumps: without smoothing R causes ripples of 0.07 mm between the tubes.
 POSITION_SMOOTHING = 3.0
@@ -82,9 +82,9 @@ def _multiply(matrix: csr_array, t: Tensor, like: Tensor) -> Tensor:
 def along_light(source: Emitter, lens: Lens, goals: Sequence[Goal]) -> tuple[csr_array, float]:
     """Return R and f for a lens with two nets.
 
-    f is SCALE_FRACTION times the scale at which both blocks move the pictures equally far, by the paraxial shifts
-    T / (n m_b) and d_k / m_k of the light from q.  T is the thickness, d_k the distance from the back to plane k, and
-    m_b and m_k are the magnifications of b(q) and of picture k.
+    f is SCALE_FRACTION times the scale at which both blocks move the pictures equally far: the RMS over k of d_k / m_k,
+    divided by T / (n m_b), which are paraxial shifts of the light from q.  T is the thickness, d_k the distance from
+    the back to plane k, and m_b and m_k are the magnifications of b(q) and of picture k.
     """
     front, back = lens.nets
     q_x, q_y = torch.meshgrid(*control_point_axes(front), indexing="ij")

@@ -107,7 +107,7 @@ class Edge:
 class Task:
     """Data of a design that its stages use: light, goals, settings and bounds."""
 
-    channels: tuple[Channel, ...]  # light of the source; for a source of finite size, of its centre
+    channels: tuple[Channel, ...]  # light of the source, or of the centre of a source of finite size
     goals: tuple[Goal, ...]  # targets; stage 1 with one freeform face uses only the first
     knobs: ResolvedTailoring  # settings of the scene's [tailoring]
     min_thickness: float = 0.0  # minimum thickness of the glass everywhere (mm)
@@ -273,7 +273,7 @@ class Driver:
     """Driver of the stages of one design: keeps the time, the record and the best lens.
 
     limit: seconds for all runs of the design, including the work after tailoring, which takes `reserve` seconds on a
-    machine of pace 1.  record: record of the earlier runs of a resumed design.
+    machine of pace 1.  began: start of this run by `clock`; None: now.  record: earlier runs of a resumed design.
     """
 
     def __init__(

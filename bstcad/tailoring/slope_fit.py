@@ -47,8 +47,8 @@ def fit_slopes(
 ) -> BSplineSurface:
     """Return the surface after `fit.steps` steps that minimise Σ w |∇h - (z_x, z_y)|² / Σ w plus a bending energy.
 
-    The bending energy is that of the change after the polynomial of the fit is added to the surface.  Conjugate
-    gradients start from no change, in the variable of `Spectrum`.  x, y (mm), slopes z_x, z_y and weights are (n,).
+    Conjugate gradients start from the surface plus the polynomial of the fit, in the variable of `Spectrum`; only the
+    change from this start has bending energy.  x, y (mm), slopes z_x, z_y and weights are (n,).
     """
     pitch_x, pitch_y = surface.pitch
     u, v = surface.along_net(x, y)

@@ -49,7 +49,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, blocks, fit_slopes
 from bstcad.transport.density import Density, resample_flux
 from bstcad.transport.mapping import Frame, Mapping, Points, TransportMap, nodes, solve
-from bstcad.transport.mapping import Solver as Solver  # exported to rooms that may not import transport
+from bstcad.transport.mapping import Solver as Solver  # exported to packages that may not import transport
 
 SUBCELLS = 2  # samples of the light per axis in a transport cell, since a rim may cross the cell
 SUBPIXELS = 8  # parts of pixels per axis in a transport cell; a pixel has at least one part

@@ -39,15 +39,15 @@ from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import point_pairs
 
 IMAGE_NODES = 5  # nodes per side; the outermost lie on the edges of the screen
-IMAGE_GRID = 32  # points per side on the back through which the images of the source are traced
+IMAGE_GRID = 32  # cells per side of the back through which the images of the source are traced
 POINT_DISTANCE = 0.7  # spacing of the 3 x 3 points of the source along each axis, in half widths of the source
 IMAGE_PAIRS = 256  # pairs of source points that represent an image
 PIXEL_PARTS = 5  # parts of a pixel per axis in the images; odd
-ERROR_RAYS = 1448  # square root of the number of rays in each of the two sets that measure the error of the blur
+ERROR_RAYS = 1448  # square root of the rays per spectral line in each of the two sets for the error of the blur
 ERROR_POINTS = 256  # source points in each of the two sets of rays that measure the error of the blur
 ERROR_SMOOTHING = 0.15  # standard deviation of the smoothing of the blur error / reach of the images (border - 2)
 MAX_TRANSFORM_BYTES, VALUE_BYTES = 2 << 30, 8  # largest size of the transforms of all images, size of one value (bytes)
-MIN_BORDER = 16  # smallest border around the screen (pixels)
+MIN_BORDER = 16  # border (pixels) allowed whatever MAX_TRANSFORM_BYTES and the size of the screen
 ERROR_SEED_OFFSET = 500_009  # offset of the seed of the rays of ERROR_RAYS: independent of the verification's rays
 
 
@@ -154,7 +154,7 @@ def _biquadratic(points: Sequence[tuple[float, float]]) -> Tensor:
 
 
 def blurs(extended: ExtendedSource, lens: Lens, screen: Screen) -> tuple[BlurOperator, ...]:
-    """Return the operators B of a source behind a lens, one per spectral line, all with the same border."""
+    """Return the operators B for a source, a lens and a screen, one per spectral line, all with the same border."""
     extent = extended.source.extent
     unit = Circle(1.0) if extent is not None and extent.is_round else Rectangle(2.0, 2.0)
     dots = _biquadratic(point_pairs(unit, IMAGE_PAIRS))
@@ -216,8 +216,8 @@ def blur_error(by_images: Tensor, draw: Draw, lens: Lens, screen: Screen, *, bor
 
     by_images: the picture B E_0, divided by the transmitted flux.  border: border of B (pixels).
 
-    The differences d_i = E_i - B E_0 of the two sets have an equal error and independent noise.  Their smoothed mean is
-    therefore scaled by d_1 · d_2 / |(d_1 + d_2) / 2|².
+    The smoothed differences d_i of E_i and B E_0 in the two sets have an equal error and independent noise.  Their mean
+    is therefore scaled by d_1 · d_2 / |(d_1 + d_2) / 2|².
     """
     picture, errors = by_images.cpu(), []
     for k in range(2):

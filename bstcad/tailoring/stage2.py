@@ -51,7 +51,7 @@ DENSE_ROUNDS = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08))  # rounds if the last
 # then distort the net between the tubes, and the last one has to correct this.  (1025 control points, two tubes per
 # cell: the portrait ends at an RRMSD of 0.018, and at 0.020 with DENSE_ROUNDS in the same time.)
 SPARSE_ROUNDS, DENSE_TUBES = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25)), 2.5
-# Rounds for a picture and a wavefront: two nets can distort between the tubes, and so need more of them.
+# Rounds for a picture and a wavefront: two nets can distort between the tubes, and so need more tubes.
 WAVEFRONT_ROUNDS = ((2 / 3, 0.45), (1.0, 0.35), (4 / 3, 0.2))
 # Rounds for several pictures, and the number of control points per side above which the evaluations grow in proportion:
 # with LAPLACIAN_POWER = 0.5, the Hessian in the Sobolev variable still contains a power of the Laplacian.  (Letters
@@ -68,7 +68,7 @@ LARGE_PIXELS, FAR_OFF_RRMSD = 16, 0.04
 # since no coarse round can follow it: a stage must not end with few pixels.  (Draft of a plate with at most 2 mm of
 # glass: RRMSD 0.264 with a factor of 1.5, 0.236 with 3, but 0.408 if 60 evaluations on 64 pixels come last.)
 EVALUATION_FACTOR, SINGLE_ROUND_FACTOR = 1.5, 3.0
-IMAGE_POSITIONS, SECOND_MOMENT_POINTS = 16, 8  # cells per side of the back, source points: for the image width
+IMAGE_POSITIONS, SECOND_MOMENT_POINTS = 16, 8  # cells per side of the back, and source points, for the image width
 MIN_EVALUATIONS = 30  # evaluations below which stage 2 has a single round and stage 3 gets twice as many
 COMPARED_NET = 65  # largest number of control points per side in `compare_precisions`, for speed
 COMPARED_TUBES = 128  # tubes per side in `compare_precisions`
@@ -381,7 +381,7 @@ class Stage3State:
 def with_stage3(before: Stage | None, task: Task, lens: Lens, state: Any = None) -> Steps:
     """Yield the steps of stage 3, from its start or from a saved state.
 
-    before: stage that runs first, for the centre of the source; its lens is rated with the whole source; or None.
+    before: stage that runs first, for the centre of the source; its lens is rated with the whole source.  None: none.
     """
     if before is not None and not isinstance(state, Stage3State):
         for last in before(task, lens, state):

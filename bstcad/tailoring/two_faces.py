@@ -138,8 +138,8 @@ def front_map(
 ) -> SlopeMap:
     """Return the map of the front that sends the light to its points on the back, by optimal transport.
 
-    lens: only its front is freeform.  grid: `square_grid` of its lit `window`.  picture: (r, c) flux of the tube
-    between each four rays, row 0 = y max.  b: (3, c + 1, r + 1) points where these rays meet the back (mm).  q: points
+    lens: only its front is freeform.  grid: `square_grid` of its lit `window`.  picture: (r, c) flux of each tube,
+    between four rays, row 0 = y max.  b: (3, c + 1, r + 1) points where these rays meet the back (mm).  q: points
     where they meet the front (mm) in the last round; None: by the inverse affine map.  The result contains the new q.
     """
     lit = slope_map.lit_corners(picture)

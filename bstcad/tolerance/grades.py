@@ -36,7 +36,7 @@ class ToleranceGrade:
     wavelength: float  # difference from the design wavelength, nm
     source: float  # size and cone angle of the source, relative
     form: float  # form error, mm RMS
-    form_length: float  # correlation length of the form error relative to the width of the lens
+    form_length: float  # correlation length of the form error / smaller of width and height of the lens
     ripple: float  # ripple, mm RMS
     period: float  # period of the ripple, mm
 

@@ -126,7 +126,7 @@ class Perturbation:
     """One kind of error with its distribution about zero."""
 
     kind: Kind
-    limit: float  # limit (±) in the unit of the kind; of a random field: standard deviation of its amount
+    limit: float  # limit (±) in the unit of the kind; for a random field, standard deviation of its amount
     distribution: Literal["normal", "uniform", "field"] = "normal"
     cost: float = 1.0  # cost of keeping the limit, relative to the other errors
 
@@ -189,7 +189,7 @@ MOTIONS = (  # (error, words, axis, True for a rotation)
 
 
 def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
-    """Return by name all kinds of error, except form, ripple, and kinds whose effect is zero or cannot be computed."""
+    """Return all kinds of error by name, except form, ripple, and kinds whose effect is zero or cannot be computed."""
     every_kind = (*_motions(setup), *_shapes(setup, material), *_lights(setup), *_alignments(setup.lens))
     return {kind.name: kind for kind in every_kind}
 

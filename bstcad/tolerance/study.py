@@ -421,7 +421,7 @@ def loosest_limits(study: Study, wanted: float, others: Sequence[Study] = ()) ->
 
     To keep error i within u_i times its limit costs c_i / u_i and adds q_i u_i² to the mean square change of the
     pictures, summed over the goals, each relative to its limit.  For a given sum Σ q_i u_i² the cost is minimal at
-    u_i ∝ (c_i / q_i)^(1/3).  A common factor is then chosen such that the model has the yield.
+    u_i ∝ (c_i / q_i)^(1/3).  A common factor is then chosen such that the model has the yield; u_i is at most WIDEST.
     """
     perturbations, goals = study.perturbations, (study, *others)
     added = sum(
