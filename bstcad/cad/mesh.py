@@ -1,6 +1,6 @@
 """Closed triangle mesh of a lens on a structured grid, measures of any closed mesh, and mesh files; lengths in mm.
 
-Every vertex lies on the lens, and the faces share the nodes of the rim, so that the mesh is closed by construction.
+Every vertex lies on the lens, and the wall joins the rim nodes of both faces, so that the mesh is closed.
 The chordal error falls with the square of the node spacing; the grid is refined until the error meets the tolerance.
 
 Files: STL, which states no unit (its user must set mm), 3MF, which states millimetres, and previews for web pages and
@@ -32,7 +32,7 @@ from bstcad.optics.surfaces import MIN_COS2, Recess, Surface, sag, sampled
 from bstcad.runs import files
 from bstcad.scene.scene import FLOAT32_ROUNDING
 
-MIN_MESH_CELLS = 16  # smallest number of grid cells per side
+MIN_MESH_CELLS = 16  # number of grid cells per side of the first mesh that `fit_mesh` tries
 DEFAULT_MAX_TRIANGLES = 2_000_000  # largest number of triangles by default: 100 MB of STL
 MAX_TRIANGLES = 32_000_000  # largest number of triangles if a scene states a tolerance: 1.6 GB of STL
 GOAL_FRACTION = 0.95  # goal of the chordal error, as a fraction of the tolerance, because float32 rounds vertices
@@ -316,7 +316,7 @@ def _sag(face, x, y):
 
 @njit(cache=True, nogil=True)
 def _distance_from_face(a, b, c, parts, face):
-    """Return the largest distance along z (mm) of a face from the triangle a b c, with 2 `parts` steps per edge."""
+    """Return the largest distance along z (mm) of a face from the triangle a b c, with 2 * parts steps per edge."""
     n = 2 * parts
     worst = abs(_sag(face, (a[0] + b[0] + c[0]) / 3, (a[1] + b[1] + c[1]) / 3) - (a[2] + b[2] + c[2]) / 3)
     for i in range(n):
@@ -333,7 +333,7 @@ def _chordal_error(vertices, faces, max_parts, radius, back, front):
     """Return the largest distance (mm) of the lens from triangles, along the triangles' normals.
 
     A triangle whose unit normal has |z| <= WALL_NORMAL_Z belongs to the wall: a cylinder of the given radius, or planes
-    (radius 0).  Each edge is sampled in two steps per smooth part of the face, at most 2 `max_parts`.
+    (radius 0).  Each edge is sampled in two steps per smooth part of the face, at most 2 * max_parts.
     """
     worst = 0.0
     for k in range(len(faces)):
@@ -359,7 +359,7 @@ METRES_PER_MM = 1e-3  # unit conversion for glTF, which is in metres
 VERTEX_XML = b'<vertex x="%.10g" y="%.10g" z="%.10g"/>\n'
 TRIANGLE_XML = b'<triangle v1="%d" v2="%d" v3="%d"/>\n'
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-MAX_PROBES = 4096  # largest number of occupied slots that a corner may meet in the hash table, at least half free
+MAX_PROBES = 4096  # largest number of occupied slots that a corner may meet in the hash table (at least half is free)
 STL_HEADER = b"bstcad, binary STL, lengths in mm"  # header, which must not start with "solid"
 MAX_LINE_BYTES = 90  # upper bound of the length of a line of a 3MF model (bytes)
 CLEAR_RGBA, MIRROR_RGBA = "#A9D3EE80", "#C9CED4FF"  # sRGB and opacity of clear material and of a mirror

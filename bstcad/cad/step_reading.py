@@ -47,7 +47,7 @@ CIRCLE_TOLERANCE = 1e-6  # largest deviation (mm) of an edge from its circle or 
 LEVEL_TOLERANCE = 1e-7  # largest distance (mm) of the plane around a front from the front's edge
 APERTURE_DECIMALS = 9  # decimals of a clear aperture (mm); further ones are rounding errors of the coordinates
 POINTS_PER_EDGE = 129  # number of points sampled along each edge of a face
-POINTS_PER_SPAN = 4  # number of points sampled on an edge per knot span; a wrong pole affects at least three spans
+POINTS_PER_SPAN = 4  # number of points sampled on an edge per knot span of a net, so that a wrong pole is detected
 
 OccFace = tuple[TopoDS_Face, BRepAdaptor_Surface]
 
@@ -128,7 +128,7 @@ def is_valid(solid: TopoDS_Solid) -> bool:
 
 
 def gaps(solid: TopoDS_Solid) -> float:
-    """Return the largest tolerance (mm) of edges and vertices; OCC's reader increases it until curves meet faces."""
+    """Return the largest tolerance (mm) in a solid; OCC's reader raises tolerances until curves meet faces."""
     return ShapeAnalysis_ShapeTolerance().Tolerance(solid, 1)
 
 

@@ -26,10 +26,10 @@ WIRE_TOLERANCE = 1e-7  # largest deviation (mm) of a wire from its plane z = con
 MIN_CLEARANCE = 1e-6  # distance (mm) below which wires are said to touch
 POLYGON_SIDES = 400  # number of sides of the polygon that represents a loop in checks
 MIN_INTERVALS = 64  # smallest number of intervals of a spline over a piece
-MAX_INTERVALS, MAX_HALVINGS = 1 << 14, 4  # limits of a cubic: number of intervals, or of halvings if these give more
+MAX_INTERVALS, MAX_HALVINGS = 1 << 14, 4  # a cubic has at most MAX_INTERVALS intervals, or 16 times the first ones
 QUINTIC_INTERVALS = 256  # intervals of a quintic; along half a circle on a sphere or conic its error is 1e-12 mm
 MIN_BREAK_DISTANCE = 1e-7  # smallest distance of two breaks, relative to the length of the piece
-ONE_SIDED_SLOPE = np.array([-25, 48, -36, 16, -3]) / 12  # weights of 5 values at unit spacing in the slope at the first
+ONE_SIDED_SLOPE = np.array([-25, 48, -36, 16, -3]) / 12  # weights of 5 values (spacing 1) for the slope at the first
 CROSSING_BISECTIONS = 50  # number of bisections, which leave only rounding errors
 
 Locus = Callable[[np.ndarray], np.ndarray]  # function of t (n,) that returns points (n, k)
@@ -199,7 +199,7 @@ class RailCurve:
 
 
 def breaks(surface: Surface, *pieces: LoopPiece) -> np.ndarray:
-    """Return the t, from 0 to the end, between which each piece lies over one smooth part of a surface; all share t."""
+    """Return parameters t, from 0 to the end, between which each piece lies over one smooth part of a surface."""
     t = np.linspace(0.0, pieces[0].end, MIN_INTERVALS + 1)
     if is_net(surface):  # smooth between its knot lines
         t = np.unique(np.concatenate([t, *(_crossings(surface, piece) for piece in pieces)]))

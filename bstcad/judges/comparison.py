@@ -34,7 +34,7 @@ from bstcad.verify.verdict import Check
 JUDGES = {"batoid": "bstcad.judges.batoid", "mitsuba": "bstcad.judges.mitsuba"}
 JUDGE_RAYS = 1 << 24  # total number of rays of a judge on one target
 MAX_COMPARED_PIXELS = 128  # largest number of pixels along the longer side of the compared pictures
-OWN_EFFORT = Effort(accuracy=0.0, witness=False)  # effort of bstcad's picture: all rays, no second one by flux tubes
+OWN_EFFORT = Effort(accuracy=0.0, witness=False)  # effort of bstcad's picture: all rays, no picture by flux tubes
 OWN_SEED_OFFSET = 500_009  # difference between the seeds of bstcad's and the judge's rays
 AGREEMENT_FACTOR = 1.5  # largest ratio of the difference of pictures to its noise, for many pixels
 MIN_NOISE = 1e-9  # lower bound of the noise, relative to the target's RMS
@@ -64,7 +64,7 @@ class Judge:
     on_target_ours: float | None = None  # fraction of the source's light on the target, from bstcad's ledger
     heights_off: float | None = None  # RMS error of the judge's faces (mm)
     slopes_off: float | None = None  # RMS error of the slopes of the judge's faces (rad)
-    moved_by: float | None = None  # shift of light by these errors (pixels)
+    moved_by: float | None = None  # shift of light due to the slope error (pixels)
     seconds: float | None = None  # time of the judge (s)
 
     @property
@@ -212,7 +212,7 @@ def _scale_to(picture: np.ndarray, total: float) -> np.ndarray:
 def coarse_screen(screen: Screen) -> Screen:
     """Return the screen with nearly square pixels, at most MAX_COMPARED_PIXELS and no more than now on its longer side.
 
-    Of the numbers above half of this limit, that with the most nearly square pixels is chosen, the largest of equals.
+    Of the numbers above half this limit, the one with the most nearly square pixels is chosen; of equals, the largest.
     """
     width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
     ratio = min(width, height) / max(width, height)

@@ -68,7 +68,7 @@ class Freeform:
         return (x0, x1), (y0, y1)
 
     def lines(self, parts: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return x and y (mm) of grid lines, 2 `parts` per pitch, through all knots (at 1.5, 2.5, … pitches)."""
+        """Return x and y (mm) of grid lines, 2 * parts per pitch, through all knots (at 1.5, 2.5, … pitches)."""
         x, y = (
             np.linspace(*ends, 2 * parts * (m - 1) + 1) for ends, m in zip(self._ends, self.net.shape, strict=False)
         )
@@ -151,7 +151,7 @@ class FaceError:
     slope: float  # RMS angle between normals (rad)
 
     def shift(self, lens: Lens, screen: Screen) -> float:
-        """Return the shift of light on the screen due to this error, in the screen's unit."""
+        """Return the shift of light on the screen due to the error of the slope, in the screen's unit."""
         return self.slope * lens.deflection * abs(per_radian(lens, screen))
 
     @classmethod
@@ -250,7 +250,7 @@ def face_mesh(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Trime
 
 
 def _mesh_error(face: Face, shape: Shape, x: np.ndarray, y: np.ndarray, *, whole: np.ndarray) -> FaceError:
-    """Return the error of the mesh at the centres of the cells that are inside the rim (whole), on their diagonals."""
+    """Return the error of the mesh at the midpoints of the cells' diagonals; whole: True for cells inside the rim."""
     middle = face.on_grid((x[:-1] + x[1:]) / 2, (y[:-1] + y[1:]) / 2)
     between = shape.normals[:-1, :-1] + shape.normals[1:, 1:]
     between /= np.linalg.norm(between, axis=-1, keepdims=True)

@@ -76,7 +76,7 @@ def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
 def trace(
     lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int, reflections: int = 0
 ) -> Traced:
-    """Return the picture on a screen by about `rays` photons; reflections: largest number in the lens (ghost: 2)."""
+    """Return the picture on a screen by about `rays` photons; reflections: largest number in the lens (2: ghosts)."""
     _mitsuba().set_variant(variant := _variant())
     _mitsuba().logger().clear_appenders()  # no progress bar per render
     halves, photons = np.zeros((2, *screen.shape)), 0

@@ -3,7 +3,7 @@
 The residuals are the signed distances d of all points except outliers, along the face's normals n.  A small motion,
 with translation τ and rotation ω about the pivot c, changes the distance of a point q by n · τ + ((q - c) × n) · ω.
 These are six columns; rotations are measured in mm at the rim of the lens, so that they compare with translations.
-Motions that hardly change any distance (the rotation of a round face about its axis, the shift of a flat face) are not
+Motions that hardly change any distance (rotating a round face about its axis, shifting a plane along itself) are not
 determined and stay zero.
 
 The search starts from several poses, with a few thousand points and robust weights, so that points of the sides and of
@@ -238,7 +238,7 @@ def scale(face: BackFace, alignment: Alignment) -> tuple[float, float]:
 
 NEIGHBOURS = 24  # number of nearest points with which each point is compared
 MIN_CLUSTER = 8  # smallest number of neighbours with 50 to 150 % of a point's deviation that shows form, not an outlier
-OUTLIER_THRESHOLD = 6.0  # minimum deviation of an outlier, in standard deviations (the larger of neighbours' and all)
+OUTLIER_THRESHOLD = 6.0  # minimum deviation of an outlier, in standard deviations of neighbours or of all, if larger
 MAD_TO_SIGMA = 1.4826  # ratio of standard deviation to median absolute deviation (MAD) of a normal distribution
 CAUCHY_SCALE = 2.0  # residual, in standard deviations, at which a neighbour's weight is one half
 REWEIGHTING_ROUNDS = 3  # iterations of the neighbours' weights

@@ -29,7 +29,7 @@ class Cloud:
     path: Path
     sha256: str = ""  # hash of the file
     without_data: int = 0  # number of points of the file that lack a coordinate and are left out
-    columns: str = ""  # names of the columns that were read, for a Zygo file or if others also state x, y or z; else ""
+    columns: str = ""  # names of the columns read, for a Zygo file or if other columns state x, y or z too; else ""
 
 
 def load(path: Path, outline: Outline) -> Cloud:

@@ -30,7 +30,7 @@ POLYNOMIAL_DEGREE = 2  # degree of the polynomial in x and y
 NET_MARGIN = 0.2  # margin of the field's net beyond the lens's, relative to its side; cosines end with zero slope
 POINTS_PER_NET_CELL = 6.0  # mean number of points in a cell of the net
 FIELD_NET_LIMITS = (9, 513)  # minimum and maximum number of control points per side
-MAX_REFINEMENT = 4  # refinement per side of a lens's net before a finer field is added; the two nets are not nested
+MAX_REFINEMENT = 4  # refinement factor per side of a lens's net before a finer field is added; the nets are not nested
 BANDS_PER_OCTAVE = 4  # number of bands of the spectrum per octave of frequency
 SPECTRUM_ROUNDS = 8  # number of alternating estimates of field and spectrum
 FIRST_MOTION_ROUND = 3  # round, from 0, in which the motion is fitted; the spectrum is then good enough to weight it
@@ -126,7 +126,7 @@ def _field(
     """Return the field's heights (m, m), standard deviations (m, m) of its amplitudes, the noise (mm) and motion (k,).
 
     rows: basis functions (n, m²).  off: deviations (n,), mm; motions: their changes (n, k); both without polynomials.
-    The motion is fitted by generalised least squares.  A fit of the field leaves σ² V⁻¹ off; V: its covariance + noise.
+    Generalised least squares give the motion.  A fit of the field leaves σ² V⁻¹ off (V: covariance of field + noise).
     """
     (m, _), n = net.shape, len(off)  # the net is square
     gram = (rows.T @ rows).tocsr()

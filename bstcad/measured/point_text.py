@@ -54,7 +54,7 @@ class MeasuredPoints:
 
     positions: np.ndarray  # positions of the points (n, 3), mm, or in an unknown unit if the file states none
     without_data: int = 0  # number of points that lack a coordinate and were left out
-    columns: str = ""  # names of the columns that were read, for a Zygo file or if others also state x, y or z; else ""
+    columns: str = ""  # names of the columns read, for a Zygo file or if other columns state x, y or z too; else ""
 
 
 def make_points(positions: np.ndarray, where: Sequence[int] | None = None, columns: str = "") -> MeasuredPoints:
@@ -220,7 +220,7 @@ class _Heading:
     columns: tuple[int, ...] = (0, 1, 2)  # indices of x, y and z in a line
     units: np.ndarray | float = 1.0  # size of the unit (mm), one for all columns or one for each
     fields: int = 3  # number of columns
-    actual_columns: str = ""  # names of the columns that are read, if others also state x, y or z; else ""
+    actual_columns: str = ""  # names of the columns that are read, if other columns state x, y or z too; else ""
 
 
 def _heading(lines: list[str]) -> _Heading:

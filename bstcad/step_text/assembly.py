@@ -62,7 +62,7 @@ def _representations_and_links(solid: str, entities: Entities) -> tuple[list[str
 
 
 def _paths(home: str, links: dict[str, list[Link]], seen: frozenset[str]) -> list[list[Placement]]:
-    """Return the placements on each path to a representation without a parent, outermost first; stop at two paths."""
+    """Return at most two paths from `home` to representations without a parent, as placements, outermost first."""
     same = _equal_representations(home, links)
     if not same.isdisjoint(seen):
         raise damaged(f"representation #{home} is part of itself")

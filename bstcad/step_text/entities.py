@@ -36,7 +36,7 @@ TOKENS = re.compile(  # tokens without blanks: separators, references, numbers, 
     r"|[-+]?\d{1,99}+(?:\.\d{0,99}+(?:[Ee][-+]?\d{1,9}+)?)?(?=[,)])|\"[0-9A-F]*+\""
 )  # matching takes linear time: a failed match has a bounded length, or contains its first character only once
 LONG_NUMBER = re.compile(rf"(?<=[(,])[-+.\d][-+.\dEe]{{{MAX_NUMBER_LENGTH},}}")
-HUGE_NUMBER = re.compile(r"(?<=[(,])[-+]?\d++\.\d*+[Ee]\+?\d{3,}+")  # number whose exponent has three digits or more
+HUGE_NUMBER = re.compile(r"(?<=[(,])[-+]?\d++\.\d*+[Ee]\+?\d{3,}+")  # number with an exponent of 100 or more
 
 
 @dataclass(frozen=True)

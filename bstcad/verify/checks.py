@@ -332,8 +332,8 @@ def bound_checks(
 ) -> tuple[list[Check], dict[str, AtBound]]:
     """Check the bounds of a scene on its tailored faces, and return the bounds that the lens reaches, by key.
 
-    The bounds are tool_radius, max_slope and the thicknesses of [lens]; shape: dimensions of the re-read lens.
-    tool_radius and max_slope apply to each tailored face, seen from outside: a tool has to fit into its valleys.
+    asked: [lens] of the scene, with tool_radius, max_slope and thicknesses; shape: dimensions of the re-read lens.
+    tool_radius and max_slope apply to each tailored face: tool_radius to its valleys, or for a mould to its ridges.
     """
     checks: list[Check] = []
     found: dict[str, list[tuple[float, Extreme, str]]] = {}

@@ -286,7 +286,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
 
 
 def _part_edge_check(wanted: Any, reread: Any, why: str) -> Check:
-    """Check the largest distance (mm) between edges of two solids; wanted: the mount's, None for the reason `why`."""
+    """Check the largest distance (mm) between edges of two solids; wanted: the mount's; None: not built, see `why`."""
     name = f"{PART_FILE}: distance of edges from the mount's"
     if wanted is None:
         return Check.true(name, False, why, id="part-edges")

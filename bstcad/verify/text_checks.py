@@ -104,7 +104,7 @@ def _largest_difference(read: np.ndarray, designed: np.ndarray, name: str) -> tu
 def measure_checks(
     stated: ValidationProperties, shape: MassProperties | None, outline: Outline, name: str = SOURCE
 ) -> Iterator[Check]:
-    """Check stated measures against the faces', `shape` (None: none stated); outline: scales a centroid's tolerance."""
+    """Check stated measures against those of the faces, `shape` (None: none stated); outline: scales a tolerance."""
     if stated.of_shape:
         assert shape is not None
         measures = ("area", "mm²", stated.areas, shape.area), ("volume", "mm³", stated.volumes, shape.volume)
