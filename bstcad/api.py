@@ -45,7 +45,7 @@ from bstcad.tailoring.merit import PictureError
 from bstcad.tailoring.run import Hooks
 from bstcad.transport.mapping import TransportMap
 
-RELATIVE_TOLERANCE = 1e-9  # largest ignored difference of indices, relative, and of the ends of nets, in net widths
+RELATIVE_TOLERANCE = 1e-9  # largest ignored difference: of two indices, relative; of the ends of nets, in net widths
 PREVIEW_TUBES = 521  # flux tubes per side of the light, for the picture of a design that is not verified yet
 AnyPath = str | os.PathLike[str]  # path of a file or of a folder
 
@@ -175,8 +175,8 @@ class Design:
     ) -> Path:  # fmt: skip
         """Write the `solid` of these arguments as STEP, with named faces and the scene's [part]; return the path.
 
-        The control points have all digits; cadquery's own export would round them.  The file states area,
-        volume and centroid, unless the body has freeform faces, for which OCC would take minutes.
+        The control points have all digits; cadquery's own export would round them.  The file states area, volume and
+        centroid, unless the body has a face that bstcad cannot integrate, such as a freeform face of another program.
         """
         from bstcad.cad import solid_properties, step_writing
 
@@ -223,8 +223,8 @@ class Design:
     def export(self, *kinds: str, points: int | None = None) -> list[Path]:
         """Write additional files, by names such as "zemax", into the folder of the design; return their paths.
 
-        points: number of grid points along the wider side (default: number of control points; for "zemax", of
-        knots).  SceneError if a name is unknown or the design has not been written.
+        points: number of grid points along the wider side (default: number of control points; for "zemax", a grid
+        through the knots).  SceneError if a name is unknown or the design has not been written.
         """
         return commands.export(self._own_folder(), kinds, points).paths
 
@@ -314,7 +314,7 @@ class Design:
         return grey
 
     def _has_files(self) -> bool:
-        return self.folder is not None and (self.folder / "lens.step").exists()  # a kept design has none
+        return self.folder is not None and (self.folder / "lens.step").exists()  # absent if writing failed
 
     def _own_folder(self) -> Path:
         """Return the folder with the files of this design; SceneError if there is none."""
@@ -370,7 +370,7 @@ class Design:
 def _adapted(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
     """Return (scene, lens): the scene with the front and the net of a user's lens, and the lens in float64 on the CPU.
 
-    front: front of the current lens; for an equal front the scene keeps its own.  SceneError if the lens does not fit.
+    front: current front, which the scene keeps if the new front is equal.  SceneError if the lens does not fit.
     """
     if not (isinstance(lens, Lens) and isinstance(getattr(lens.back, "heights", None), torch.Tensor)):
         given = type(lens.back if isinstance(lens, Lens) else lens).__name__

@@ -1,6 +1,6 @@
 """The command line: options and output of the commands, whose work other modules of bstcad do.
 
-Exit codes: 0 passed, 1 a check failed or no lens, 2 wrong input, 70 fault of bstcad, 130 Ctrl-C, 128 + n signal n.
+Exit codes: 0 passed, 1 failed check or no lens, 2 wrong input or machine error, 70 bug, 130 Ctrl-C, 128 + n signal n.
 """
 
 from __future__ import annotations
@@ -251,7 +251,7 @@ Yield = option(float | None, "P", "Find the loosest tolerances with this yield (
 Seed = option(int, "N", "Seed of the random trials.", min=0)
 Trial = option(int | None, "N", "Write only the lens of this trial, as trial-N.step.", min=0)
 Kinds = option(str | None, "NAMES", f"Kinds of files, separated by commas: {EXPORT_NAMES}.", "--as")
-Points = option(int | None, "N", "Points along the longer side (default: number of control points; zemax: of knots).")
+Points = option(int | None, "N", "Points along the longer side (default: number of control points; zemax: at knots).")
 Png = path_option("FILE", "PNG file to write.", "--png", "-o")
 ReachPng = path_option("FILE", "PNG of the target and of the area that light can reach (target[1]: FILE_2).", "--png")
 Budget = option(
@@ -619,7 +619,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit code; an error of the input prints one sentence on stderr."""
+    """Run the command and return its exit code; an error of the input or the machine prints one sentence."""
     try:
         with signals.raise_terminated():
             code = app(args=arguments, prog_name="bstcad", standalone_mode=False) or 0

@@ -80,7 +80,7 @@ class ProofOptions:
     drawing: Drawing | None = None  # class that draws the figures of the report; None: Pictures
     checks: Sequence[OwnCheck] = ()  # additional checks
     sections: Sequence[OwnSection] = ()  # additional sections of report.html
-    limit: float | None = None  # largest time (s) from the design to its report, not for `verify`; None: no limit
+    limit: float | None = None  # largest time (s) from start of design to end of report; None: no limit, as in `verify`
 
 
 # --- generate ---------------------------------------------------------------------------------------------------------

@@ -96,7 +96,7 @@ class DesignState:
     first: Stage1State | None = None  # state of stage 1; None: it has not begun, or it has ended
     followed: Stage1Result | None = None  # result of stage 1; None: it has not ended
     second: Stage2State | None = None  # state of stage 2 or 3; None: it has not begun, or it has ended
-    best: RatedLens | None = None  # best lens before stage 2 or 3 or after a part of it; None: as `second`, or preview
+    best: RatedLens | None = None  # best lens before or during stage 2 or 3; None: the stage is not running, or preview
     lens: Parameters | None = None  # lens after stage 2 or 3; None: tailoring has not ended
     stopped: str = ""  # reason why tailoring ended; "": it has not ended
 

@@ -166,7 +166,7 @@ class Cluster:
 
 
 def answer(wanted: str, key: Any, work: Callable[..., Any], *arguments: Any) -> Answer:
-    """Return the Answer of work(*arguments) on a worker; a failure if its bstcad has another version than `wanted`."""
+    """Return the Answer of work(*arguments) on a worker; a failure if the worker's version is not `wanted`."""
     from distributed import get_worker
 
     with _one_at_a_time:

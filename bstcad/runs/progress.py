@@ -57,7 +57,7 @@ def _notebook() -> Callable[..., Any] | None:
     from IPython import get_ipython
     from IPython.display import display
 
-    return display if hasattr(get_ipython(), "kernel") else None  # IPython in a terminal has none
+    return display if hasattr(get_ipython(), "kernel") else None  # IPython in a terminal has no kernel
 
 
 @contextmanager

@@ -509,8 +509,8 @@ class Bounds:
 class LensBlank(Record):
     """The lens before tailoring: light enters through the front and leaves through the back.
 
-    A mirror is a plate whose back (the upper face) reflects, and whose front is its rear.  If the front reflects,
-    light crosses the back before and after the front.
+    A mirror is a plate whose back, the upper face, reflects; no light meets its front.  If the front reflects, light
+    crosses the back before and after the front.
     """
 
     material: Annotated[str | None, Key("Name on refractiveindex.info; or give the index.")] = None

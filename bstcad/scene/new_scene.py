@@ -112,10 +112,10 @@ class Plate:
         return detail_width(as_a_disc * self.source_image(distance), self.pixel)
 
     def expectation(self, blurred: float | None = None) -> str:
-        """Return a sentence on the finest detail; blurred: RRMSD of the picture blurred by the source's image."""
+        """Return sentences on the finest detail; blurred: RRMSD due to the source's image, None: no advice."""
         wide, detail = self.magnification * self.side, self.detail(self.distance)
         text = f"The finest detail on this wall is {detail:.2g} mm wide"
-        if self.light.square:  # image traced through a plate of 80 mm: 4.86 mm; through its centre: 5.77 mm
+        if self.light.square:  # image of the default LED as a disc: 4.86 mm through the whole plate, 5.77 at its centre
             text += " behind the centre of the plate, and less beside it, where the chip is seen at an angle"
         text += f", 1/{wide / detail:.0f} of the picture's {wide:.4g} mm"
         if blurred is None:

@@ -183,7 +183,7 @@ class Tolerance(Record):
     ] = None
     limit: Annotated[float | None, Key("Limit (±) in the error's unit; form, ripple: RMS.", "", 1e-12, 1e4)] = None
     distribution: Annotated[
-        Literal["normal", "uniform"] | None, Key("Distribution; normal: truncated at the limit, 2 σ before truncation.")
+        Literal["normal", "uniform"] | None, Key("Distribution; normal: truncated at ±2 σ, which is the limit.")
     ] = None
     cost: Annotated[float | None, Key("Relative cost of keeping the limit; 1 if absent.", "", 1e-6, 1e6)] = None
     correlation_length: Annotated[float | None, Key("Correlation length of a form error.", "mm", 1e-3, 1e4)] = None

@@ -263,7 +263,7 @@ class ColdRun(StoredRecord):
 def run_and_judge(
     contents: SceneFiles, point: Settings, limit: float, effort: Effort, tick: Tick = lambda: None
 ) -> ColdRun:
-    """Design a base scene (`contents`) with the settings `point` within `limit` seconds; measure time and RRMSD."""
+    """Design a scene (`contents`) with settings `point` in at most `limit` s; measure time, and RRMSD with `effort`."""
     start = time.perf_counter()
     unit = min(measure_seconds(calibration_kernel()) for _ in range(KERNEL_REPEATS))
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:

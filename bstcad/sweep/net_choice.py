@@ -46,8 +46,8 @@ QUALITY_TERMS = {"draft": (1.5, 0.012), "standard": (1.0, 0.002), "fine": (0.7, 
 MIN_SEAM_SHIFT = 7.0  # seam shift (pixels) below which cells are too fine for the tool
 # Cells per pixel above which finer nets reduce the RRMSD further by at most a factor, and this factor.
 SUFFICIENT_CELLS, MAX_FURTHER_GAIN = 5.0, 1.4
-MIN_RRMSD_RATIO = 0.43  # smallest observed RRMSD with a finer net / with a coarser one: portrait, 1025 and 513
-MIN_RELATIVE_FLUX = 1e-3  # flux of a tile / mean flux below which the mean density is used
+MIN_RRMSD_RATIO = 0.43  # smallest observed RRMSD of a finer net / RRMSD of a coarser one (portrait.toml, 1025 and 513)
+MIN_RELATIVE_FLUX = 1e-3  # flux of a tile / mean flux below which the mean area per flux is used
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Candidate:
 
     net: Sides  # control points per side, or along x and along y
     rrmsd: float  # estimated RRMSD
-    seconds: float  # time on two cores of pace 1
+    seconds: float  # time (s) on two cores of pace 1 (prediction.pace)
     memory_gb: float  # peak memory of the two processes (GB)
     seam_shift: float = math.inf  # result of the function `seam_shift` (pixels)
 
@@ -177,8 +177,8 @@ def _affordable(scene: Scene, candidates: list[Candidate]) -> tuple[tuple[Candid
 def seam_shift(scene: Scene) -> float:
     """Return the distance (pixels) on the target between light from the two ends of a cell in the narrowest valley.
 
-    It is p L (n - 1) / R with the width p of a cell, the throw L and the tool radius R; infinite without a tool radius;
-    a mirror deflects by twice its slope.  At a seam, where light separates, the tool limits the width of the valley.
+    It is p L D / R, with the width p of a cell, the throw L, the tool radius R, and the ratio D of deflection to slope
+    (Passes.deflection); infinite without R.  At a seam, where light separates, the tool limits the valley's width.
     """
     radius, target = scene.lens.tool_radius, scene.target
     if radius is None:

@@ -145,7 +145,7 @@ def _request_of(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[st
 def predict_qualities(scene: Scene, lenses: Sequence[Lens], tick: Tick = lambda: None) -> dict[str, Any]:
     """Return {predicted, not_predicted, finer, notes}: predictions for each quality, or the reason why there are none.
 
-    finer: predictions with about twice the control points per side.  lenses: a coarse lens for each target.
+    finer: {control_points, predicted} with twice the spans per side; None: above the limit.  lenses: one per target.
     """
     entries: dict[str, Any] = {"predicted": None, "not_predicted": None, "finer": None, "notes": []}
     try:
@@ -166,6 +166,6 @@ def _limit_notes(scene: Scene, predicted: Mapping[str, Mapping[str, tuple[float,
     """Yield remarks on limits of the scene that the predictions ignore."""
     max_time, accuracy = scene.tailoring.max_time, scene.tailoring.accuracy
     if max_time is not None and (exceeding := [q for q, each in predicted.items() if each["seconds"][1] > max_time]):
-        yield f"tailoring.max_time = {max_time:g} would end {' and '.join(exceeding)} earlier, with a larger error."
+        yield f"tailoring.max_time = {max_time:g} would end a {' or '.join(exceeding)} design early, with more error."
     if accuracy is not None and (early := [q for q, each in predicted.items() if each["rrmsd"][1] < accuracy]):
-        yield f"tailoring.accuracy = {accuracy:g} would end {' and '.join(early)} when it is reached, in less time."
+        yield f"tailoring.accuracy = {accuracy:g} would end a {' or '.join(early)} design early, at this RRMSD."

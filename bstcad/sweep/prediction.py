@@ -147,7 +147,7 @@ def blur_rrmsd(scene: Scene, lens: Lens) -> float:
 # --- predictions ------------------------------------------------------------------------------------------------------
 
 PILOT_EXPONENT = -0.6  # exponent of Pilot.factor in the ratio of the RRMSD of the full design to that of the pilot
-DETAIL_FACTORS = {"draft": 0.2, "standard": 0.02, "fine": 0.02}  # RRMSD due to detail that a pilot lacks / detail
+DETAIL_FACTORS = {"draft": 0.2, "standard": 0.02, "fine": 0.02}  # RRMSD due to detail that a pilot lacks / Pilot.detail
 FINE_RATIO = 0.7  # ratio of the RRMSD in fine to that in standard quality
 REMAINING_BLUR = 0.5  # fraction of the blur by an extended source that remains after stage 3
 

@@ -80,7 +80,7 @@ class Calibration(StoredRecord):
 
     @classmethod
     def of(cls, unit: Sequence[float]) -> Calibration:
-        """Return the record of the kernel's times `unit` (s); its values are null without any."""
+        """Return the record of the kernel's times `unit` (s); without times its values are null."""
         extremes: dict[str, Any] = {"lowest": min(unit, default=None), "highest": max(unit, default=None)}
         return cls(seconds=statistics.median(unit) if unit else None, **extremes)
 
@@ -108,13 +108,13 @@ class TradeoffTable(StoredRecord):
     versions: dict[str, str]  # versions of the libraries, by name
     reference: dict[str, Any]  # reference for the RRMSD: rays (numbers of rays, ascending), what (in words)
     calibration: Calibration  # time of the calibration kernel
-    runs: tuple[ColdRun, ...]  # runs that ended, then the others, each by importance, without PRIVATE_FIELDS
+    runs: tuple[ColdRun, ...]  # ended runs, then the others, both in order of importance; no PRIVATE_FIELDS
     knobs: tuple[TableKnob, ...]  # knobs that were varied
     front: tuple[StoredSettings, ...]  # settings of the runs on the Pareto front, the fastest first
     front_halving: float | None  # factor of the time that halves the error along the front
-    presets: tuple[Preset, ...]  # quality presets, each as a run
+    presets: tuple[Preset, ...]  # quality presets that were run
     seeds: dict[str, bool | None]  # true if another seed gives another lens, by method; null: not measured
-    history: tuple[HistoryPoint, ...]  # convergence of the run of the base scene, by the tubes used for tailoring
+    history: tuple[HistoryPoint, ...]  # convergence of the base run, measured with the tubes of its tailoring
 
     @property
     def runs_with_lens(self) -> list[ColdRun]:

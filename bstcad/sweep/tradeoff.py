@@ -157,7 +157,7 @@ def _adam_points(own: bool) -> Points:
 
 
 def _joint_points(*varied: tuple[str, Any, Sequence[float]]) -> Points:
-    """Return points that vary keys together; varied: (key, base value, factors).  A net is scaled by its spans."""
+    """Return points that vary keys together; varied: (key, base value, factors).  A net's factor scales its spans."""
     points = {}
     for multiples in zip(*(multiples for _, _, multiples in varied), strict=True):
         values = {
@@ -176,8 +176,8 @@ def _joint_points(*varied: tuple[str, Any, Sequence[float]]) -> Points:
 def run_order(scene: Scene, knobs: Sequence[Knob]) -> list[Settings]:
     """Return all runs, the most important first, so that any budget gives the most useful runs.
 
-    First come the presets draft and standard and the base, then neighbours of the base, fast runs with another seed
-    and the preset fine, then further points, and last the preset paper.
+    First come the preset draft, the base and the preset standard, then neighbours of the base, fast runs with another
+    seed and the preset fine, then further points, and last the preset paper.
     """
     presets = knobs[0].points
     single = [knob for knob in knobs[1:] if not knob.combines]
@@ -327,7 +327,7 @@ class _Sweep:
         failed: dict[str, Any] = {"status": cold_run.FAILED, "reason": answer.reason, "version": environment.version()}
         run = answer.value or ColdRun(settings=answer.key, **failed)
         self.runs[answer.key] = run.model_copy(update={"predicted_seconds": predicted, "where": answer.where})
-        real = (run for run in self.runs.values() if run.cost_seconds)  # runs that were never started are not stored
+        real = (run for run in self.runs.values() if run.cost_seconds)  # a run that a worker did not do is not stored
         cold_run.write_record(self._file, RunFile(runs=tuple(real)))
         self.table()
 
@@ -379,7 +379,7 @@ JUDGING_SECONDS = 2.0  # time to measure a lens's RRMSD with the reference (s)
 
 
 def predicted_work(scene: Scene, point: Settings) -> tuple[bool, float]:
-    """Return (True for the paper's procedure, seconds on a machine of pace 1); a refused run takes only its start."""
+    """Return (True for the paper's procedure, seconds at pace 1); for a refused run, the time to start and judge."""
     try:
         changed = scene.changed(dict(point))
     except SceneError:
@@ -392,7 +392,7 @@ def predicted_work(scene: Scene, point: Settings) -> tuple[bool, float]:
 
 
 def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: float = math.inf) -> TradeoffTable:
-    """Return the table of all runs: runs that have ended, then runs not yet done, each by importance."""
+    """Return the table of a sweep.  runs: ended runs, then runs not yet done, both in order of importance."""
     own, best = scene.lens.back.net, pareto_front(runs)
     comparable = {run.settings: run for run in runs if run.comparable}
     selected = comparable or {run.settings: run for run in runs if run.done}
