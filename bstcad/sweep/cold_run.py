@@ -205,9 +205,9 @@ StoredSettings = Annotated[Settings, BeforeValidator(_from_json), PlainSerialize
 
 
 class HistoryPoint(TypedDict):
-    """RRMSD of a design at one time, measured with the flux tubes used for tailoring."""
+    """RRMSD of a design at one time: from the light of its tailoring, or at the end of a stage from other rays."""
 
-    seconds: float  # time since the start of the design
+    seconds: float  # time since the start of the command
     rrmsd: float | None  # RRMSD; null: not finite
 
 

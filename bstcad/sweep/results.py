@@ -114,7 +114,7 @@ class TradeoffTable(StoredRecord):
     front_halving: float | None  # factor of the time that halves the error along the front
     presets: tuple[Preset, ...]  # quality presets that were run
     seeds: dict[str, bool | None]  # true if another seed gives another lens, by method; null: not measured
-    history: tuple[HistoryPoint, ...]  # convergence of the base run, measured with the tubes of its tailoring
+    history: tuple[HistoryPoint, ...]  # convergence of the run of the base scene
 
     @property
     def runs_with_lens(self) -> list[ColdRun]:
@@ -240,7 +240,7 @@ def draw_runs(axes: Axes, table: TradeoffTable) -> None:
         label = "standard error of the reference"
         axes.plot(*zip(*floors, strict=True), color=GREY, ls=(0, (5, 3)), label=label, **THIN_LINE)
     if points := [(point["seconds"], point["rrmsd"]) for point in table.history if point["rrmsd"]]:
-        label = "convergence of the base run (warm)"
+        label = "convergence of the base run"
         axes.plot(*zip(*points, strict=True), color="#b5b5b5", label=label, **THIN_LINE)
     for knob in table.knobs:
         if knob.key in KNOB_STYLES and len(knob.places) > (knob.key != "adam"):  # all others include the base

@@ -61,7 +61,7 @@ def test_the_figure_has_a_curve_a_knob_the_front_and_the_presets(swept):
     for knob in found.knobs:
         if knob.key != "quality" and len(knob.places) > 1:
             assert any(name.startswith(knob.title) for name in named)
-    assert {"Pareto front", "convergence of the base run (warm)", "standard error of the reference"} <= set(named)
+    assert {"Pareto front", "convergence of the base run", "standard error of the reference"} <= set(named)
     assert {"draft", "standard", "fine", "paper"} <= {text.get_text() for text in axes.texts}
     [above] = axes.child_axes
     assert [round(x * unit, 6) for x in above.get_xlim()] == [round(x, 6) for x in axes.get_xlim()]
