@@ -50,7 +50,7 @@ MAIN_FIELDS: tuple[Mapping[str, str], ...] = (
 FROM_FRONT = {"lens.back.z": "Thickness at the centre", "target.z": "Distance of the wall from the front face"}
 FROM_LAMP = {"lens.back.z": "Back face: position from the lamp (z)", "target.z": "Wall: position from the lamp (z)"}
 HELP = {  # help of main fields, instead of the description of the key
-    "target.z": "The front is the face that the light enters; the drawing shows the distance from the other face.",
+    "target.z": "The front is the face that the light enters; the drawing shows the distance from the back.",
     "target.x": "-30, 30 is a picture 60 mm wide, centred on the axis of the lens.",
     "target.y": "-20, 20 is a picture 40 mm high, centred on the axis of the lens.",
     "lens.outline.width": "Size from left to right.",

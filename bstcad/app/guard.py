@@ -1,8 +1,8 @@
 """The guard before every request, since any web page and any local program can talk to a server on loopback.
 
-A request is accepted on three conditions: its header Host names this server (a foreign name may point here); its header
-Origin, if any, names this server (another page may send a request); and it has the token of this start, in the address
-that the terminal prints or in the cookie that this address sets.  The size of a body is checked while it arrives.
+A request is accepted on three conditions: its header Host names this server (a foreign name may point here); its
+headers Origin and Sec-Fetch-Site, if any, show that no other page sent it; and it has the token of this start, in the
+address that the terminal prints or in the cookie that this address sets.  The size of a body is checked as it arrives.
 """
 
 from __future__ import annotations

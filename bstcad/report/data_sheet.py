@@ -45,7 +45,7 @@ class DataSheet:
 
     scene: Scene
     designed: Lens  # lens as designed, not cut to the rim of its mount
-    shape: Mapping[str, float | None]  # analysis.shape.describe of the lens inside its mount's rim; volume of lens.step
+    shape: Mapping[str, float | None]  # facts of analysis.shape.describe inside the mount's rim; volume of lens.step
     order: Order  # order for the shop; order.file is the STEP file that the sheet describes
     target: np.ndarray  # picture of the first target (rows, columns), row 0 at y max, column 0 at x min
     irradiance: np.ndarray  # irradiance on the first target, in the form and with the sum of `target`

@@ -2,8 +2,8 @@
 
 OpticStudio interpolates between the points of a grid by bicubic Hermite patches.  Except in the end spans, a net is one
 biquadratic polynomial in each knot span (optics/bspline.py), and the patch over the four corners of the span equals
-this polynomial.  A grid that includes all knots is exact there.  In the end spans x(t) is quadratic, and the net is not
-a polynomial in x; if they lie inside the rim, the grid is refined until the light moves by at most MAX_SHIFT.
+this polynomial.  A grid that includes all knots is exact there.  In the end spans x is quadratic in the parameter t, so
+the net is not a polynomial in x; if they lie inside the rim, the grid is refined until the shift is at most MAX_SHIFT.
 
 `Patches` is the surface that OpticStudio interpolates.  Rays through it and through the exact face give the shift.
 """
@@ -171,12 +171,12 @@ def axes(outline: Outline, points: int, least: int = 2) -> tuple[np.ndarray, np.
 def through_knots(face: BSplineSurface, outline: Outline, parts: int) -> tuple[np.ndarray, np.ndarray] | None:
     """Return x and y (mm) of a grid through all knots near the outline's bounding box, `parts` cells per knot span.
 
-    None: no such grid is possible.  A grid with one cell per span excludes the end spans, 1.5 pitches long; the
-    bounding box has to lie between them.
+    None: no such grid is possible.  The knot t lies t + 1/2 pitches inside the net.  A grid with one cell per span
+    excludes the end spans, 1.5 pitches long; the bounding box has to lie between them.
     """
     found = []
     for (low, _), pitch, m, half in zip((face.x, face.y), face.pitch, face.shape, outline.half_extent, strict=True):
-        places = np.arange(m - 3) + 1.5 if parts == 1 else np.arange(parts * (m - 1) + 1) / parts  # x(t) = t + 1/2
+        places = np.arange(m - 3) + 1.5 if parts == 1 else np.arange(parts * (m - 1) + 1) / parts  # pitches
         first = np.searchsorted(places, (-half - low) / pitch + RIM_ROUNDING, "right") - 1
         last = np.searchsorted(places, (half - low) / pitch - RIM_ROUNDING, "left")
         if first < 0 or last >= len(places) or not MIN_ZEMAX_POINTS <= last - first + 1 <= MAX_POINTS:
@@ -304,5 +304,6 @@ def table_note(lens: Lens, face: Surface, name: str, *, points: int, light: Grid
     by = shift_by_patches(lens, face, Patches.through(face, *axes(lens.outline, points)), light)
     if by is None:
         return f"{name}: no light reaches the target."
-    coarse = "; zemax-back.dat and lens.step are exact" if by.maximum > MAX_SHIFT * by.pixel else ""
+    side = "back" if face is lens.back else "front"
+    coarse = f"; zemax-{side}.dat and lens.step are exact" if by.maximum > MAX_SHIFT * by.pixel else ""
     return f"{name}: a bicubic spline through its heights moves the light on the target by {by}{coarse}."

@@ -3,7 +3,7 @@
 The prescription states every surface as it was designed, with source and target, with all digits.  It may differ
 from the scene, since tailoring may change a free radius and move the back.
 
-    lens:    front at its vertex, glass, back at its vertex (intersections with the axis)
+    lens:    front, glass, back; the vertex of a face is its intersection with the axis
     signs:   light travels along +z; a radius is positive if the centre of curvature is on the +z side of the vertex
 
 The order is one record for datasheet.pdf, report.html and report.json.  Its sizes, volume and mass are those of the

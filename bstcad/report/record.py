@@ -61,8 +61,8 @@ LEFT_OUT = {  # LeftOut.kind: name of the effect in the report
     "stray light": "stray light",
     "diffraction": "diffraction",
 }
-NEGLIGIBLE_CHANGE = 1e-4  # change of the flux (as a fraction) or of the RRMSD that the report shows as NEGLIGIBLE
-NEGLIGIBLE_BLUR = 5e-3  # blur (pixels) that the report shows as NEGLIGIBLE
+NEGLIGIBLE_CHANGE = 1e-4  # change of flux (as a fraction) or RRMSD below which the report shows NEGLIGIBLE
+NEGLIGIBLE_BLUR = 5e-3  # blur (pixels) below which the report shows NEGLIGIBLE
 NEGLIGIBLE, UNKNOWN_CHANGE = "≈ 0", "unknown"  # words for a negligible and for an unknown change
 
 # Key of a report that repeats a figure of the worst goal: name of this figure in GoalFigures.
@@ -89,7 +89,7 @@ class CurvePoint:
     """One point of the convergence curve."""
 
     seconds: Seconds  # time since the start
-    rrmsd: Rrmsd  # RRMSD computed with the flux tubes of the stage
+    rrmsd: Rrmsd  # RRMSD by the flux tubes of the stage; at the end of a stage, its final RRMSD by new rays
 
 
 class PrecisionTest(TypedDict):
@@ -180,8 +180,8 @@ class Contents:
     seed: int  # seed of every random choice
     version: str | None = None  # version of bstcad that wrote the report
     rrmsd_whole: Rrmsd | None = None  # RRMSD against the whole picture; None: light reaches all of it
-    # unreachable part of the target: area (fraction of the target), light (fraction of the picture), angle (degrees;
-    # largest deflection by one face of this index; None: a mirror); None: light reaches all of the target
+    # unreachable part of the target, by key: area (fraction of the target), light (fraction of the picture's light) and
+    # angle (largest deflection by a face of this index, degrees; None for a mirror).  None: all is reached
     unreachable: Mapping[str, Size | None] | None = None
     leak: Fraction | None = None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
     contrast: Size | None = None  # mean irradiance of lit divided by dark pixels; None: no dark pixels, or no leak
@@ -366,9 +366,8 @@ def extent(source: Emitter) -> Iterator[tuple[str, str]]:
 
 
 # --- remarks ----------------------------------------------------------------------------------------------------------
-# A remark names a request of the scene that the design does not fulfil, with its figure, whether a check judges it or
-# not.  A lens may be exact to a nanometre and still lose light, or be thicker than stated, because the scene allows
-# nothing better; a reader of "passed" should not have to search the tables for that.
+# A remark names a request of the scene that the design does not fulfil, with its figure, even if no check judges it.  A
+# lens may be exact to a nanometre and still lose light; a reader of "passed" should not have to search for that.
 
 
 def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: Sequence[np.ndarray]) -> list[Remark]:
@@ -485,7 +484,7 @@ def write_json(report: Contents, path: str | Path) -> None:
 
 
 def _rounded(value: Any, where: str) -> Any:
-    """Round floats to DIGITS, except in the prescription, which keeps designed numbers.  where: path of the value."""
+    """Round floats to DIGITS, except in the prescription, which keeps all digits.  where: path of the value."""
     if isinstance(value, dict):
         return {key: _rounded(part, f"{where}.{key}") for key, part in value.items()}
     if isinstance(value, list):
@@ -516,7 +515,7 @@ def _block(value: Any) -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Report:
-    """Result of a verification, traced through the geometry read back from lens.step, or with a mount from part.step.
+    """Result of a verification, traced through the geometry of lens.step or, with a mount, of part.step.
 
     Every key of report.json is an attribute, such as `rrmsd`, `checks` or `flux` (fields of Contents); `facts` are all
     of them as plain values.

@@ -1,6 +1,6 @@
 """Report of a design for people: report.html, a summary on the terminal, and report.junit.xml for build servers.
 
-Each shows the record of report.json (record.Contents) or the record of a plan, without any computation.
+They show the record of report.json (record.Contents); the terminal also shows the record of a plan or a STEP file.
 """
 
 from __future__ import annotations

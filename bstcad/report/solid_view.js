@@ -14,7 +14,7 @@ globalThis.solidView = (() => {
   const RAY_STEP = 2, RAY_REACH = 2; // close view: every second ray; length outside the lens, in diagonals of the lens
   const VISIBLE_REACH = 0.5, LAMP_REACH = 1.5; // diagonals: length of rays, and distance of a lamp, that the view includes
   const EYE_DISTANCE = 2.4; // distance of the eye from the centre of the whole path, in diagonals of the path
-  const MIN_OPACITY = 0.35, CLOSE_OPACITY = 0.75, PATH_OPACITY = 0.4; // rays without flux; close view; whole path
+  const MIN_OPACITY = 0.35, CLOSE_OPACITY = 0.75, PATH_OPACITY = 0.4; // opacity of rays: factor at zero flux; in the close view; in the whole path
   const SCREEN_OPACITY = 0.8; // opacity of a wall in front of another one
   const GLASS = [0.62, 0.75, 0.88], SHARP_COSINE = 0.82; // colour of glass; cosine of the smallest angle of an edge
   const RAY = 0, BORDER = 1, EDGE = 2, LAMP = 3; // kinds of lines: ray, border of a wall, edge of the lens, point source

@@ -1,6 +1,6 @@
 """tolerance.json as a record, its section of report.html and its table for the terminal.
 
-bstcad.tolerance computes the study.
+bstcad.tolerance computes the study.  A superposed picture is the designed one plus separately traced changes.
 """
 
 from __future__ import annotations

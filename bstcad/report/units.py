@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 Rows = list[tuple[str, str]]  # name, value
 DIGITS = 12  # significant digits to which a number is first rounded
-LADDERS = {  # unit: (smallest size, factor, unit as written), in descending order
+LADDERS = {  # unit: (smallest size in this unit, factor to the written unit, written unit), in descending order
     "mm": ((0.1, 1.0, "mm"), (1e-3, 1e3, "µm"), (1e-8, 1e6, "nm"), (0.0, 1e9, "pm")),
     "deg": ((0.01, 1.0, "°"), (0.0, 3600.0, "″")),
     "rad": ((0.1, 1.0, "rad"), (1e-4, 1e3, "mrad"), (0.0, 1e6, "µrad")),
@@ -27,7 +27,7 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float | bool | None) -> str:
-    """Return a number: three digits (0.0284), an integer in full (6 512), else as 3.2 × 10⁻⁷; or yes, no, none."""
+    """Return three digits (0.0284), an integer in full (6 512), 3.2 × 10⁻⁷ below 1e-3 or from 1e6 on; yes, no, none."""
     if value is None:
         return "none"
     if isinstance(value, bool | np.bool_):
@@ -97,7 +97,7 @@ def bound(check: Check) -> str:
 
 
 def amount(value: float, unit: str, signed: bool = False) -> str:
-    """Return an error in its unit, such as "deg" or "nm"; "mm", "mm RMS" and "deg" are scaled to suit its size."""
+    """Return an error with its unit, such as nm; "mm", "mm RMS" and "deg" change to a unit that suits `value`."""
     length, _, kind = unit.partition(" ")
     text = quantity(value, length) if length in ("mm", "deg") else f"{number(value)} {unit}".strip()
     text = f"{text} {kind}".strip() if length == "mm" else text

@@ -23,7 +23,7 @@ function put(x, y, width) {
 
 const middle = () => [(part[0] + part[2]) / 2, (part[1] + part[3]) / 2];
 
-// sides: width and height of the target, in the orientation of the photo; given: crop of the target, or null; changed(value): called after a drag.
+// sides: width and height of the target, in the orientation of the photo; given: crop of the target, or null; fills: true if the crop gets the target's proportions; changed(crop): called after a drag or a key press.
 export function show(address, { sides, given, fills }, changed) {
   take = changed;
   const begin = () => {
