@@ -381,7 +381,7 @@ class Stage3State:
 def with_stage3(before: Stage | None, task: Task, lens: Lens, state: Any = None) -> Steps:
     """Yield the steps of stage 3, from its start or from a saved state.
 
-    before: stage that runs first, for the centre of the source; its lens is rated with the whole source.  None: none.
+    before: earlier stage, for the centre of the source; None: no such stage.  Its lens is rated with the whole source.
     """
     if before is not None and not isinstance(state, Stage3State):
         for last in before(task, lens, state):
