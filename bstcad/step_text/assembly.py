@@ -62,7 +62,7 @@ def _representations_and_links(solid: str, entities: Entities) -> tuple[list[str
 
 
 def _paths(home: str, links: dict[str, list[Link]], seen: frozenset[str]) -> list[list[Placement]]:
-    """Return at most two paths from `home` to representations without a parent, as placements, outermost first."""
+    """Return the paths from `home` to representations without a parent, as placements, outermost first; stop at two."""
     same = _equal_representations(home, links)
     if not same.isdisjoint(seen):
         raise damaged(f"representation #{home} is part of itself")
