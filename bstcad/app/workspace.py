@@ -213,8 +213,8 @@ class Workspace:
     def adopt(self, design: str, folder: Path, written: Path | None = None) -> str:
         """Write a new scene file for the scene in a folder, with the files that it names; return the scene's name.
 
-        written: file with the original text of the scene.  Its comments are preserved if it describes the same
-        scene, or else those of the scene file with the design's name.
+        written: file with the original text of the scene.  The new file is a copy of `written` or, if that describes
+        another scene, of the scene file with the design's name; otherwise, of the folder's scene.toml.
         """
         text = self._text(folder / "scene.toml")
         loaded = self._loaded(folder / "scene.toml", text)

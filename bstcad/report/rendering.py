@@ -1,6 +1,6 @@
 """Three-dimensional pictures: the lens in clay, the lens with its rays, and a model that a reader can rotate.
 
-Without a display, EGL or OSMesa, VTK ends the whole process by a segmentation fault and writes its messages to the
+Without a display, EGL or OSMesa, VTK ends the whole process with a segmentation fault and writes its messages to the
 terminal.  To protect the design, this file runs itself as a script in another process.  The script reads arrays from a
 file and draws them into a PNG or a window.
 """
