@@ -112,6 +112,8 @@ def _demand(task: Task, solution: float, lens: Lens) -> tuple[Demand, LightBehin
     knobs = task.knobs.model_copy(update={"transport_grid": TRIAL_CELLS, "transport_iterations": TRIAL_ITERATIONS})
     task = replace(with_pixels(task, TRIAL_PIXELS), knobs=knobs, solution=solution, progress=no_progress)
     light = light_behind.light_for_task(task)
+    if task.wave is not None:  # the picture, resampled by means, has a sum below 1
+        light = replace(light, picture=light.picture / light.picture.sum())
     angle = np.degrees(np.arccos(light.direction[2].clip(-1, 1)))[lit_corners(light.picture)]
     crossed = light.crossed_fraction(lens.back)
     near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))

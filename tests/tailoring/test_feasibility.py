@@ -54,8 +54,9 @@ def test_light_runs_straight_through_the_glass_from_rim_to_rim(radius):
     assert len(said) == (1 if radius == 5.0 else 2) and not is_infeasible(demand)
 
 
-def test_light_that_would_leave_beside_the_lens_is_counted():
-    demand = demand_of(scene_of(10.0, [disc(10.0)], wavefront=PLANE))
+@pytest.mark.parametrize("pixels", [64, 256])  # the trial has at most 128
+def test_light_that_would_leave_beside_the_lens_is_counted(pixels):
+    demand = demand_of(scene_of(10.0, [disc(10.0) | {"pixels": pixels}], wavefront=PLANE))
     assert demand.outside == pytest.approx(1 - 100 / (math.pi * 100), abs=0.03) and is_infeasible(demand)
 
 
