@@ -65,8 +65,8 @@ class FileNet(FileContent):
 
     name = NET_FILE
     shape: tuple[int, int]  # control points along x and along y
-    x: tuple[float, float]  # ends along x, mm, in the frame of the lens
-    y: tuple[float, float]  # ends along y, mm
+    x: tuple[float, float]  # ends of the net along x, mm, in the frame of the lens
+    y: tuple[float, float]  # ends of the net along y, mm
     data: bytes = field(repr=False)  # heights of the control points above the vertex, (m, n), mm, float64
 
     @classmethod

@@ -173,8 +173,8 @@ def new_scene(
 ) -> Written:  # fmt: skip
     """Write NAME.toml to `folder`, a commented scene that loads; SceneError for an existing file.
 
-    The scene is a plate with a picture as large as its shadow on the wall, or a copy of a template.  light: a name of
-    LIGHTS.  size: size of the plate, mm: one number, width x height "80x60", or, with the proportions of the picture,
+    The scene is a plate with a picture as large as the plate's shadow on the wall, or a copy of a template.  light: a
+    name of LIGHTS.  size: plate size, mm: one number, width x height "80x60", or, with the picture's proportions,
     "photo" or "120xphoto".  distance: from plate to wall, mm.  picture: path, relative to `folder`; None: letters.
     """
     from bstcad.scene.picture import photo_size, read_picture, safe_name  # slow to load

@@ -33,7 +33,7 @@ VERIFICATION_DRAW = 1 << 12  # number of the set of these points; each further s
 
 
 class Tailoring(Record):
-    """The effort of tailoring; a setting of PRESETS that is None has its value for `quality`, adapted by `resolved`."""
+    """The effort of tailoring; a setting that is None has its value in PRESETS[quality], if any (see `resolved`)."""
 
     quality: Annotated[Literal["draft", "standard", "fine", "paper"], Key("Effort; fine has the smallest error.")] = (
         "standard"
@@ -89,7 +89,7 @@ class Tailoring(Record):
         """Return the settings with all values set; net: control points per side of the back, or along x and along y.
 
         Levels of an oblong net are pairs, with cells in the same proportions.  Defaults: at least two rays per cell of
-        the net along x and along y (draft: two per cell in all); a map of at most twice the net's cells per side.
+        the net along x and along y (draft: √2); a map of at most twice the net's cells per side (paper: any map).
         """
         levels = tuple(level if isinstance(level, tuple) else coarser(net, level) for level in self.levels or ())
         preset = dict(PRESETS[self.quality], levels=levels or coarse_to_fine(net))

@@ -145,7 +145,7 @@ def _request_of(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[st
 def predict_qualities(scene: Scene, lenses: Sequence[Lens], tick: Tick = lambda: None) -> dict[str, Any]:
     """Return {predicted, not_predicted, finer, notes}: predictions for each quality, or the reason why there are none.
 
-    finer: {control_points, predicted} with twice the spans per side; None: above the limit.  lenses: one per target.
+    finer: predictions for twice the spans per side; None: net too large.  lenses: a coarse one per target.
     """
     entries: dict[str, Any] = {"predicted": None, "not_predicted": None, "finer": None, "notes": []}
     try:
