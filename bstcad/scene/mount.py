@@ -207,7 +207,7 @@ class Mount(Record):
         """Return the largest distance (mm) by which draft and bevel move the edge of the front inwards.
 
         From (p, top), p on the rim, a line of the wall goes down to the front, and inwards (direction m) by tan(draft)
-        per mm of depth.  The bevel cuts it at 45 degrees.  Iteration finds the ends of cad.walls.LeaningPiece.ends.
+        per mm of depth.  The bevel cuts its end at 45°.  Iteration finds the ends of cad.walls.LeaningPiece.ends.
         """
         (x, y), tangent = rim.rim_points(), math.tan(math.radians(self.draft))
         m_x, m_y = rim.inset_direction(x, y)

@@ -56,7 +56,7 @@ class BatchEntry(StoredRecord):
     leak: float | None = None  # fraction of the light on the target that falls where the target is dark
     light_on_target: float | None = None  # fraction of the source's light that falls on the target
     checks_failed: tuple[str, ...] = ()  # names of the failed checks
-    seconds: float = 0.0  # time until the lens was verified, or until the design ended without a lens (s)
+    seconds: float = 0.0  # seconds_total of the report, or time until the design ended without a lens (s)
     report: str = ""  # path of report.html, relative to the batch's folder
     where: str = ""  # "here", or the address of a worker; "": not run
     reason: str = ""  # sentence that states why there is no lens; "": there is a lens
