@@ -284,7 +284,7 @@ def _report(row: BatchEntry, folder: Path) -> dict[str, Any]:
 
 
 def exit_code(rows: Sequence[BatchEntry]) -> int:
-    """Return 2 if a scene was refused, 1 if a check failed or there is no lens, else 0."""
+    """Return 2 if a scene was refused, 1 if a check failed or an error ended a design, else 0."""
     if any(row.status == REFUSED for row in rows):
         return 2
     return int(any(row.status == BROKEN or row.checks_failed for row in rows))
