@@ -35,7 +35,7 @@ FLAT_LEVEL, EDGE_LEVEL = 0.9, 0.1  # default levels η and ε
 MEDIAN_PIXELS = 3  # side of the window of the median (pixels)
 PLATEAU_LEVEL = 0.5  # level, relative to E_max, above which the peak of the histogram is sought
 HISTOGRAM_END = 2.0  # upper end of the histogram, relative to E_max; hot pixels are above it
-MAX_BINS = 1000  # largest number of bins up to E_max, the resolution of the plateau uniformity
+MAX_BINS = 1000  # largest number of bins up to E_max: the plateau uniformity is resolved to 1 / MAX_BINS
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """Point-by-point integration of a ray mapping: the traditional construction of a surface from a transport map.
 
 Wang et al. 2023 compare their tailoring with this construction (sections 1 and 3.3, after Luo et al. 2010).  The map is
-theirs, from the plane of the front's vertex to points of the target (slope_map.py).  Rays through a grid on that plane
-are traced up to the back.  At a point of a ray, Snell's law and the aim of the ray give the slopes p = ∂z/∂x and q =
-∂z/∂y of the back.  From the initial point on, each point a gives the point b on the next ray, where
+that of Wang et al., from the plane of the front's vertex to points of the target (slope_map.py).  Rays through a grid
+on that plane are traced up to the back.  At a point of a ray, Snell's law and the aim of the ray give the slopes p =
+∂z/∂x and q = ∂z/∂y of the back.  From the initial point on, each point a gives the point b on the next ray, where
 
     z_b - z_a = (p_a + p_b) / 2 (x_b - x_a) + (q_a + q_b) / 2 (y_b - y_a)
 

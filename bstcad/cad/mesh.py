@@ -333,7 +333,8 @@ def _chordal_error(vertices, faces, max_parts, radius, back, front):
     """Return the largest distance (mm) of the lens from triangles, along the triangles' normals.
 
     A triangle whose unit normal has |z| <= WALL_NORMAL_Z belongs to the wall: a cylinder of the given radius, or planes
-    (radius 0).  Each edge is sampled in two steps per smooth part of the face, at most 2 * max_parts.
+    (radius 0).  Edges and interior of a triangle on a face are sampled in two steps per `Surface.detail`, with at most
+    2 * max_parts steps per edge; of a triangle on a round wall, only the middles of its edges are.
     """
     worst = 0.0
     for k in range(len(faces)):

@@ -126,7 +126,7 @@ def _edge_in_space(edge: TopoDS_Edge) -> tuple[np.ndarray, ...]:
 
 
 def _edge_in_parameters(edge: TopoDS_Edge, face: TopoDS_Face) -> tuple[np.ndarray, ...]:
-    """Return u and v at Gauss points along an edge of a face, where u changes, and du multiplied by their weights."""
+    """Return u, v and weight times du at the Gauss points of an edge of a face; none of a piece where u is constant."""
     curve = BRepAdaptor_Curve2d(edge, face)
     curves = [curve] if BRep_Tool.Degenerated_s(edge) else [curve, BRepAdaptor_Curve(edge)]
     t, weight = _gauss_points(edge, curves)

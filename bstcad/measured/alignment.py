@@ -316,7 +316,7 @@ def first_pose(face: BackFace, cloud: np.ndarray) -> tuple[Pose, float]:
 
 
 def find_axis_exchange(face: BackFace, cloud: np.ndarray, original: float) -> tuple[np.ndarray, str] | None:
-    """Return an axis exchange (matrix (3, 3), words) after which the distance is far below `original` (mm), or None."""
+    """Return (matrix (3, 3), words) of an axis exchange that at least halves the distance `original` (mm), or None."""
     sample, fitting = _sample(cloud)[:: START_SAMPLE // AXES_SAMPLE], []
     for matrix, words in sorted(_axis_exchanges(), key=lambda exchange: _rarity(exchange[0])):
         turned = sample @ matrix.T

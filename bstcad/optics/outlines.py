@@ -32,7 +32,7 @@ class _Box(ABC):
     @property
     @abstractmethod
     def limits(self) -> Limits:
-        """Limits (a, b, r²)."""
+        """Limits (a, b, r²) of the interior: max(|x| - a, 0)² + max(|y| - b, 0)² <= r² (a, b: mm; r²: mm²)."""
 
     @property
     def farthest(self) -> tuple[float, float]:
@@ -93,7 +93,7 @@ class Rectangle(_Box):
 
     @property
     def limits(self) -> Limits:
-        """Limits (a, b, r²)."""
+        """Limits (a, b, r²) of the interior: mm, mm and mm², as in `Limits`."""
         return self.width / 2, self.height / 2, 0.0
 
     @property
@@ -127,7 +127,7 @@ class Rounded(Rectangle):
 
     @property
     def limits(self) -> Limits:
-        """Limits (a, b, r²)."""
+        """Limits (a, b, r²) of the interior: mm, mm and mm², as in `Limits`."""
         r = self.corner_radius
         return self.width / 2 - r, self.height / 2 - r, r * r
 
@@ -179,7 +179,7 @@ class Circle(_Box):
 
     @property
     def limits(self) -> Limits:
-        """Limits (a, b, r²)."""
+        """Limits (a, b, r²) of the interior: mm, mm and mm², as in `Limits`."""
         return 0.0, 0.0, self.radius**2
 
     @property

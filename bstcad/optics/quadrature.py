@@ -17,7 +17,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Surface
 
-MIN_SPANS = 128  # minimum parts of an axis of a net; the spans of a coarser net are divided
+MIN_SPANS = 128  # smallest number of parts per axis of a net; the spans of a coarser net are divided
 GAUSS_POINTS_PER_PART = 3  # Gauss points in each part of a chord or of an edge
 FINE_NET = 400  # smallest number of control points per side at which FINE_POINTS give the area to 1e-9
 FINE_POINTS = 2  # Gauss points in each part of a chord or of an edge of a net of at least FINE_NET points per side

@@ -133,7 +133,7 @@ class Receiver(ABC):
         return scale * p_x, scale * p_y
 
     def from_level_plane(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
-        """Return the coordinates that `to_level_plane` projects onto (q_x, q_y) (mm)."""
+        """Return the coordinates that `to_level_plane` projects from (0, 0, eye) onto (q_x, q_y) (mm)."""
         x, y = (torch.as_tensor(q, dtype=torch.float64) for q in (q_x, q_y))
         direction = torch.stack([x, y, torch.full_like(x, self.throw(eye))])
         direction = direction / torch.sqrt((direction * direction).sum(0))
@@ -302,7 +302,7 @@ class TiltedPlane(PlaneReceiver):
         return self.centre
 
     def from_level_plane(self, q_x: Array, q_y: Array, eye: float) -> tuple[Array, Array]:
-        """Return the coordinates that `to_level_plane` projects onto (q_x, q_y) (mm)."""
+        """Return the coordinates that `to_level_plane` projects from (0, 0, eye) onto (q_x, q_y) (mm)."""
         (e_x, e_y, n), (c_x, c_y, c_z) = self.axes, self.centre
         throw = c_z - eye
         path = -self.height((0.0, 0.0, eye)) / (n[0] * q_x + n[1] * q_y + n[2] * throw)

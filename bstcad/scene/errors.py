@@ -66,13 +66,13 @@ def nearest(word: str, known: list[str], otherwise: str) -> str:
 
 
 def explain(error: ValidationError, data: Any) -> str:
-    """Return the first fault of `data` as a sentence; an unknown key comes before a missing one."""
+    """Return the first fault of `data` as a sentence; an unknown key comes before all other faults."""
     problems = [problem for problem in error.errors(include_url=False) if _applies(problem["loc"], data)]
     return _sentence(min(problems, key=lambda problem: problem["type"] not in UNKNOWN_KEY))
 
 
 def _applies(location: tuple[int | str, ...], data: Any) -> bool:
-    """Return False if the error belongs to an outline whose shape differs from the shape in the data."""
+    """Return True unless the error belongs to an outline whose shape differs from the shape in the data."""
     for step in location:
         if step in ("Circle", "Rectangle") and isinstance(data, dict):
             return data.get("shape") == step.lower()

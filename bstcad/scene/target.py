@@ -306,7 +306,7 @@ def numbered(name: str, k: int) -> str:
 
 
 def coplanar_complaints(targets: tuple[Target, ...]) -> Iterator[str]:
-    """Yield complaints about targets in the plane of an earlier target, or crossing that target."""
+    """Yield complaints about targets that lie in the plane of an earlier target or cross it."""
     for k, target in enumerate(targets):
         for i, earlier in enumerate(targets[:k]):
             if _in_one_plane(target.screen, earlier.screen):

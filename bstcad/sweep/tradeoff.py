@@ -45,7 +45,7 @@ COUNT_LIMITS = (1, 16_384)  # minimum and maximum of all other varied numbers
 ROUND_COUNTS = (1, 2, 3, 5, 8)  # numbers of rounds of transport and slope fit in stage 1
 ADAM_FRACTIONS = (1 / 8, 1 / 4, 1 / 2, 1.0)  # numbers of steps of the procedure of Wang et al., relative to the preset
 
-Points = Mapping[str, Settings]  # points of a knob by label ("768"), in the order of increasing work
+Points = Mapping[str, Settings]  # settings by label ("768"), in the order of increasing work
 
 
 @dataclass(frozen=True)

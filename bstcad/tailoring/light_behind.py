@@ -206,7 +206,7 @@ def light_of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength
 def between_targets(
     near: Picture, far: Picture, n: int, sign: float = 1.0, solver: Solver = TARGETS_SOLVER
 ) -> LightBehind:
-    """Return the rays through two pictures by transport on FINE_FACTOR n cells per side, at first on fewer.
+    """Return the rays through two pictures by transport on FINE_FACTOR * n cells per side, at first on fewer.
 
     sign: σ, 1 for the convex and -1 for the concave solution.
     The map leads from the near to the far picture, or in reverse if the near one has clearly more contrast: a map to a

@@ -305,7 +305,7 @@ class CoarseVariable:
 
     @classmethod
     def of(cls, surface: BSplineSurface, coarse: BSplineSurface, weight: Tensor) -> CoarseVariable:
-        """Make the variable for the net of `surface`; weight: (m', n') at the control points of `coarse`."""
+        """Make the variable for the net of `surface`; weight: local weight w (m', n') of the variable of `coarse`."""
         across = (resampling_matrix(few, many) for few, many in zip(coarse.shape, surface.shape, strict=True))
         return cls(SobolevVariable.of(coarse, weight, COARSE_LAPLACIAN_POWER), *across)
 

@@ -264,7 +264,7 @@ def _aperture_check(name: str, measured: Outline, designed: Outline) -> Check:
 def _stability(
     lens: Lens, nominal: Nominal, lights: Sequence[Light], shape: Mapping[str, float | None]
 ) -> tuple[dict[str, float | int | None], list[Check]]:
-    """Return the margins of the lens to numerical limits, angles in degrees, curvature in 1/mm, and their checks."""
+    """Return figures of stability (degrees, 1/mm), and checks of total internal reflection and of finite values."""
     margin = margins(nominal.channels, lens, nominal.goals[0].receiver, nominal.scene.tailoring.seed + VERIFY_SEED)
     keys = (f"{face}radius_min_{kind}" for face in ("", "front_") for kind in ("concave", "convex"))
     radii = [radius for key in keys if (radius := shape.get(key))]
