@@ -224,9 +224,9 @@ def volume_and_area(mesh: Mesh) -> tuple[float, float]:
 
 
 def chordal_error(mesh: Mesh, lens: Lens) -> float:
-    """Return the largest distance (mm) between the lens and the facets, at their centres and points between corners.
+    """Return the largest distance (mm) between the lens and the facets, at points other than the facets' corners.
 
-    Since a net may bend in each knot span, edges are sampled twice per span (MAX_FACET_SAMPLES points in all at most).
+    Since a net may bend in each knot span, facets are sampled twice per span (at most MAX_FACET_SAMPLES points in all).
     """
     max_parts = max(1, int((MAX_FACET_SAMPLES / 2 / max(len(mesh.faces), 1)) ** 0.5))
     radius = float(lens.outline.radius) if isinstance(lens.outline, Circle) else 0.0
@@ -285,7 +285,7 @@ class FaceNumbers(NamedTuple):
 
 @njit(inline="always")
 def _basis(u, m):
-    """Return (k, B_k, B_{k+1}, B_{k+2}) at u, as bspline.basis does; repeated here, since numba caches per file."""
+    """Return (k, B_k, B_{k+1}, B_{k+2}) at u, in pitches: a copy of bspline.basis, since numba caches per file."""
     if u < 1.5:
         k, s = 0, 2.0 - math.sqrt(4.0 - 2.0 * u)
     elif u > m - 2.5:

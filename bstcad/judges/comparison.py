@@ -49,7 +49,7 @@ class Judge:
     version: str  # version of the program
     declined: str = ""  # reason why the judge cannot trace this light; "" if it can
     target: str = ""  # key of the target, if there are several: target[0], target[1], …
-    by: str | None = None  # variant of the program, if it has several; None here and below: the judge declined
+    by: str | None = None  # variant of the program, "" if it has only one; None here and below: the judge declined
     rays: int | None = None  # total number of rays
     pixels: tuple[int, int] | None = None  # number of columns and rows
     losses: str | None = None  # losses of light in both pictures: "none" or "Fresnel"

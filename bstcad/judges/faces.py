@@ -174,7 +174,7 @@ class Traced:
     halves: np.ndarray = field(repr=False)  # flux per pixel, (2, rows, columns), row 0 = y max; full flux in each half
     rays: int  # total number of rays
     error: FaceError  # largest error of the judge's faces
-    by: str = ""  # variant of the program, if it has several
+    by: str = ""  # variant of the program; "": it has only one
 
     @property
     def picture(self) -> np.ndarray:

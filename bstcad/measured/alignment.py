@@ -36,7 +36,7 @@ MAX_OUTLIER_ROUNDS = 6  # maximum number of rounds of outlier rejection
 STEP_TOLERANCE = 1e-10  # largest component (mm at the rim) of a step that ends the iteration
 FOOT_ITERATIONS = 3  # iterations for the foot of a perpendicular; each multiplies the error by distance x curvature
 INDEPENDENT_PATCHES = 100  # assumed number of patches of a face with independent form errors
-SCALE_PATCHES = 16  # assumed number of patches with independent form errors that resemble a scale, such as power
+SCALE_PATCHES = 16  # assumed number of independent patches of form errors that resemble a scale error, such as power
 MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty from form errors, in half widths, above which a motion is not determined
 MIN_SENSITIVITY = 1e-7  # smallest change of distance per motion (mm per mm); smaller values are rounding errors
 RIM_MARGIN = 2e-3  # width, in half widths, of the rim that is ignored: points there may lie on the edge
@@ -378,7 +378,7 @@ def _heights(face: BackFace, sample: np.ndarray, decentre: np.ndarray) -> list[f
 
 
 def _refine_start(face: BackFace, sample: np.ndarray, pose: Pose, steps: int) -> tuple[Pose, float]:
-    """Return a pose refined by Gauss-Newton, weights 1 / (1 + (d / (2 q))²), and the lower quartile q of |d| (mm)."""
+    """Return (refined pose, q): a quarter of the sample has |d| <= q (mm).  Weights are 1 / (1 + (d / (2 q))²)."""
     distance = np.inf
     for _ in range(steps):
         points = pose.to_design(sample)

@@ -29,7 +29,7 @@ from bstcad.optics.surfaces import sag, sampled
 POLYNOMIAL_DEGREE = 2  # degree of the polynomial in x and y
 NET_MARGIN = 0.2  # margin of the field's net beyond the lens's, relative to its side, since cosines end with zero slope
 POINTS_PER_NET_CELL = 6.0  # mean number of points in a cell of the net
-FIELD_NET_LIMITS = (9, 513)  # minimum and maximum number of control points per side
+FIELD_NET_LIMITS = (9, 513)  # limits of the number of control points per side, before the FFT rounds it up
 MAX_REFINEMENT = 4  # refinement factor per side of a lens's net before a finer field is added; the nets are not nested
 BANDS_PER_OCTAVE = 4  # number of bands of the spectrum per octave of frequency
 SPECTRUM_ROUNDS = 8  # number of alternating estimates of field and spectrum

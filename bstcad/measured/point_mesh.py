@@ -155,7 +155,7 @@ def _binary_vertices(data: bytes, elements: list[_Element], at: int, order: str)
 
 
 def _end_of_list_rows(data: bytes, element: _Element, at: int, order: str) -> int:
-    """Return the offset after the rows of an element with lists, row by row unless all rows have equal length."""
+    """Return the offset after the rows of an element with lists; rows of unequal length are read one by one."""
     types = ((order + kind, order + length if length else None) for _, kind, length in element.properties)
     parts = [(np.dtype(kind), None if length is None else np.dtype(length)) for kind, length in types]
     uniform_end = _end_of_uniform_rows(data, parts, at, element.count)

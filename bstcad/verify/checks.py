@@ -105,8 +105,8 @@ class Proof:
     checks: tuple[Check, ...]
     lens: Lens  # lens re-read from lens.step or, with a mount, from part.step, including clear apertures
     lights: tuple[Light, ...]  # light of the lens on each target
-    shape: dict[str, float | None]  # dimensions of the lens within the mount's rim, and volume of lens.step (mm³)
-    stability: dict[str, float | int | None]  # margins to numerical limits, see `_stability`
+    shape: dict[str, float | None]  # figures by key: lens within the mount's rim, volume of lens.step (mm³), ripple
+    stability: dict[str, float | int | None]  # figures of stability by key, see `_stability`
     blur: Blur | None = None  # blur due to the source's size on the worst target; None: the source has no size
     lines: Lines = ()  # pictures of the lines of a spectrum on the worst target
     at_bounds: dict[str, AtBound] | None = None  # bounds that the lens reaches, by key; None: no bound is reached

@@ -104,7 +104,7 @@ def _largest_difference(read: np.ndarray, designed: np.ndarray, name: str) -> tu
 def measure_checks(
     stated: ValidationProperties, shape: MassProperties | None, outline: Outline, name: str = SOURCE
 ) -> Iterator[Check]:
-    """Check stated measures against those of the faces, `shape` (None: none stated); outline: scales a tolerance."""
+    """Check stated measures against `shape`, those of the faces (None: none is stated); outline: size of the lens."""
     if stated.of_shape:
         assert shape is not None
         measures = ("area", "mm²", stated.areas, shape.area), ("volume", "mm³", stated.volumes, shape.volume)
@@ -166,7 +166,7 @@ def part_checks(text: StepText, part: Part, name: str = SOURCE) -> Iterator[Chec
 
 
 def _worst_value(values: Sequence[Numbers], own: Numbers, who: str, unit: str) -> tuple[float, str]:
-    """Return the largest error of stated values (unreadable: infinite) and a sentence; who: its words before `own`."""
+    """Return the largest error of stated values (unreadable: infinite), and a sentence with `who` before `own`."""
     off = [math.dist(each, own) for each in values]
     worst, stated = max((math.inf if math.isnan(by) else by, each) for by, each in zip(off, values, strict=True))
     return worst, f"the file states {_words(stated, unit)}, but {who} {_words(own, unit)}"

@@ -58,7 +58,7 @@ class Check:
 
 
 def verdict(passed: bool, given_up: Sequence[str], asked: bool = True) -> str:
-    """Return one of VERDICTS; given_up: wishes of the scene that could not be met, which become remarks.
+    """Return one of VERDICTS; given_up: texts of the report's remarks.
 
     asked: True if the scene limits the light; otherwise checks can show that a lens is bad, but not that it is good.
     """
