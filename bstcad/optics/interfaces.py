@@ -96,7 +96,7 @@ class Loss(Protocol):
     fused: bool  # True if kernels apply it: exp(-coefficient · path) in glass, a function of the angle at an interface
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
-        """Return the transmitted fraction; cosines of incidence and refraction, path before the interface (mm)."""
+        """Return the transmitted fraction for cosines of incidence and refraction, and a path before the face (mm)."""
 
 
 @dataclass(frozen=True)

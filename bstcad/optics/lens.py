@@ -192,7 +192,7 @@ class Lens:
         return self.interfaces[0].surface
 
     def unbounded(self) -> Lens:
-        """Return the lens with unlimited apertures of the solid: no ray misses its faces."""
+        """Return the lens with unlimited apertures of the solid: they stop no ray."""
         return replace(self, outline=EVERYWHERE, clear=(EVERYWHERE, EVERYWHERE))
 
     def with_apertures_scaled(self, by: float) -> Lens:

@@ -512,7 +512,7 @@ def _squared(t: Tensor) -> float:
 class ImageSamples:
     """Images of a source through several points of the back face: landing points of the light of each channel."""
 
-    offset: Tensor  # landing point minus centroid of the image, (2, channels, points), columns and rows
+    offset: Tensor  # landing point minus centroid of the image, (2, channels, points): columns, rows (pixels)
     flux: Tensor  # flux of each channel through each point, (channels, points)
 
     def width(self) -> float:

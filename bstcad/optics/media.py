@@ -225,7 +225,7 @@ _MEDIA, _METALS = _by_name(MEDIA), _by_name(METALS)
 
 
 def medium(material: str) -> Medium:
-    """Return the transparent medium of this name; ValueError, with the nearest names, if there is none."""
+    """Return the transparent medium of this name; ValueError for a metal, or with names to choose from for none."""
     if normalise_name(material) in _METALS:
         raise ValueError(f"{material!r} is a metal, which transmits no light; choose a medium such as 'PMMA'")
     return _MEDIA.get(normalise_name(material)) or _page(material, MEDIA)
@@ -237,7 +237,7 @@ def metal(material: str) -> Medium:
 
 
 def _page(material: str, expected: tuple[Medium, ...]) -> Medium:
-    """Return a page of the database as a medium; ValueError, with the nearest names, for none or several."""
+    """Return a page of the database as a medium; ValueError, with names to choose from, for none or several."""
     page = find(material)
     if page is not None:
         return Medium(page, page, nominal={medium.page: medium.nominal for medium in MEDIA}.get(page))

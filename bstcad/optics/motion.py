@@ -26,7 +26,7 @@ class Motion:
 
     @classmethod
     def of(cls, shift: Vector = ORIGIN, turn: Vector = ORIGIN, about: Vector = ORIGIN) -> Motion:
-        """Return rotations by `turn` (degrees) about the x, then y, then z axis through `about`, then a shift (mm)."""
+        """Return a rotation by `turn` (degrees) about the x, then y, then z axis through `about`, then a shift (mm)."""
         return cls(Rotation.from_euler("xyz", turn, degrees=True).as_matrix(), about, shift)
 
     @property

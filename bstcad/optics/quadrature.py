@@ -71,7 +71,7 @@ def of_face(face: Surface, border: Border, raised: float = 0.0) -> Sums:
 
 
 def of_wall(face: Surface, border: Border, raised: float = 0.0) -> Sums:
-    """Integrate over the wall along z between the plane z = 0 and the rim of a face, n pointing outwards."""
+    """Integrate over the wall along z from the plane z = 0 to the rim z = h + raised of a face, n pointing outwards."""
     h = face.relative_sag_and_slope(torch.from_numpy(border.x), torch.from_numpy(border.y))[0].numpy() + raised
     cone = h * (border.x * border.dy - border.y * border.dx)  # r·n ds, times the wall's height
     return Sums(float((border.ds * h).sum()), float(cone.sum()) / 3, _moment(cone, border.x, border.y, h / 2))
@@ -92,7 +92,7 @@ def _moment(cone: np.ndarray, *r: np.ndarray) -> np.ndarray:
 def rim_breaks(surface: BSplineSurface, radius: float) -> np.ndarray:
     """Return ascending angles (rad) from 0 to 2 pi between which the rim of a round lens crosses no knot line of a net.
 
-    Neighbouring angles differ by at most 2 pi / 256.
+    radius: radius of the rim (mm).  Neighbouring angles differ by at most 2 pi / 256.
     """
     angles = [np.linspace(0, 2 * np.pi, 257)]
     axes = zip((surface.x, surface.y), surface.pitch, surface.shape, (0.0, np.pi / 2), strict=True)

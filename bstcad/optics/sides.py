@@ -33,7 +33,7 @@ def side(net: Sides) -> int:
 
 
 def scaled(net: Sides, share: float) -> Sides:
-    """Return a net with `share` times the point spacings of `net` on each side, at least MIN_SIDE control points."""
+    """Return a net with `share` times as many point spacings per side as `net`, at least MIN_SIDE control points."""
     x, y = (max(round(share * (points - 1)) + 1, MIN_SIDE) for points in as_pair(net))
     return simplified((x, y))
 

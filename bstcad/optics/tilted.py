@@ -73,7 +73,7 @@ class TiltedSurface(Surface):
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
         """Return (path s in mm along rays from (x, y) on the plane z = V_z, True where they meet the surface).
 
-        c s² - 2 g s + f = 0, g = N · d - c u · d; the root near the vertex is s = f / (g ± sqrt(g² - c f)).
+        c s² - 2 g s + f = 0, g = N · d - c u · d; the root near the vertex is s = f / (g + sense sqrt(g² - c f)).
         """
         (n_x, n_y, n_z), (dx, dy, dz) = self.unit_normal, direction
         x, y, f = self._from_vertex(x, y)

@@ -38,7 +38,7 @@ PARTS_PER_SIDE = 4  # parts per side of a tube that is partly lit
 MIN_TRIANGLE_AREA = 1e-9  # smallest area of a triangle that is clipped (pixel²); smaller triangles count in one pixel
 COARSE_GRID_POINTS = 65  # points per side of the coarse grid on which `rays_to` solves first
 MAX_BROYDEN_STEPS = 30  # maximum number of Broyden steps of `rays_to`
-RAY_TOLERANCE = 1e-8  # largest distance between a ray found and its point, as a fraction of the grid's extent
+RAY_TOLERANCE = 1e-8  # distance of rays from their points at which the search ends, as a fraction of the grid's extent
 RELATIVE_DIFFERENCE_STEP = 1e-6  # step of the difference quotients, as a fraction of the grid's extent
 MIN_BROYDEN_DIVISOR = 0.1  # smallest divisor of a Broyden update, relative to the squared step
 

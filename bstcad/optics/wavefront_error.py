@@ -178,9 +178,9 @@ def wavefront_error(source: Emitter, lens: Lens, wave: Wave, n: int = RAYS_PER_S
 
 @torch.no_grad()
 def residual(pupil: ExitPupil, wave: Wave, nm: float) -> Tensor:
-    """Return the OPD (n, n) without piston and tilt, in waves of nm, times sqrt(flux / total flux); 0: not compared.
+    """Return the OPD (n, n) without piston and tilt, in waves, times sqrt(flux / total flux); 0: not compared.
 
-    The root of the sum of squares is the RMS OPD.  Raises ValueError if fewer than three rays can be compared.
+    nm: wavelength.  The root of the sum of squares is the RMS OPD.  Raises ValueError for fewer than 3 compared rays.
     """
     compared, without_piston, fit, share = _compare(pupil, wave, nm)
     weighted = torch.zeros_like(pupil.path)

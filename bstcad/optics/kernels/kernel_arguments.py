@@ -129,7 +129,7 @@ def _table_of_light(source: Emitter, window: Rectangle, z: float) -> Beam | None
 
 
 def _tilted(plane: Receiver | None, before: int, behind: int) -> records.TiltedScreen | None:
-    """Return a tilted plane as numbers, None for a level one; before, behind: sense of light at the net."""
+    """Return a tilted plane as numbers, None for a level one; before, behind: senses of light at the net."""
     if plane is None or plane.is_level:
         return None
     assert plane.axes is not None  # no kernel traces to other receivers

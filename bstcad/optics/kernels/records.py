@@ -79,7 +79,7 @@ class Fates(NamedTuple):
 
     missed_front: float  # status of rays that miss the front
     missed_back: float  # status of rays that miss the net
-    reflected: float  # status of rays that the law of the net blocks
+    reflected: float  # status of rays that the law of a face blocks
     turned: float  # status of rays that lead away from the screen
 
 

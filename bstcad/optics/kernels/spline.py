@@ -209,10 +209,11 @@ def largest_bending(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the maxima (3,), their indices along x and y (3, 2) and the numbers of points that reach `bounds` (3,).
 
-    The three are concave curvature, convex curvature (1/mm) and |∇z|; a curvature is negative if no point is bent that
-    way.  net: (m, n) heights (mm).  along: (m - 2, points, 9) weights of a span's three control points in value, first
-    (1/mm) and second derivative (1/mm²) along x, and (n - 2, points, 9) along y.  at: x and y of the points (mm), each
-    (spans, points).  limits: Outline.limits; points outside do not count.
+    The quantities are concave and convex curvature (1/mm) and |∇z|; a curvature is negative if no point is bent that
+    way.  Indices run over all points of an axis.  net: (m, n) heights (mm).  along: (m - 2, points, 9) weights of a
+    span's three control points in value, first (1/mm) and second derivative (1/mm²) along x, and (n - 2, points, 9)
+    along y.  at: x and y of the points (mm), each (spans, points).  limits: Outline.limits; points outside do not
+    count.
     """
     spans = len(net) - 2
     ends = [spans * part // ROW_PARTS for part in range(ROW_PARTS + 1)]
