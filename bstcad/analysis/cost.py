@@ -33,13 +33,13 @@ StageResults = Sequence[tuple[float, float | None]]  # stages in order: (seconds
 
 @dataclass(frozen=True)
 class ConvergenceEnd:
-    """End of a convergence curve: RRMSD at each evaluation, by the rays or tubes of tailoring.
+    """End of a convergence curve: RRMSD of the best lens so far, by flux tubes, after each evaluation.
 
     Near its end the curve is fitted by RRMSD ∝ t^-p, t the total time of the evaluations: to halve the error, t must
     grow by the factor 2^(1/p).
     """
 
-    rrmsd: float  # RRMSD at the end
+    rrmsd: float  # final RRMSD: median of the last twentieth of the evaluations
     last_tenth_seconds: float  # time since the RRMSD was last above LAST_TENTH_RATIO times its final value
     last_tenth: float  # `last_tenth_seconds` divided by the time from the start to the end of the curve
     power: float | None  # exponent p, zero if the curve does not fall; None: too few points
@@ -59,7 +59,7 @@ def ending(history: History, stages: StageResults, since: float = 0.0) -> Conver
     if not len(points):
         return None
     seconds, values = points.T
-    last = float(np.median(values[-max(1, len(values) // 20) :]))  # median: random rays scatter
+    last = float(np.median(values[-max(1, len(values) // 20) :]))  # median: robust against a single value
     above = np.flatnonzero(values > LAST_TENTH_RATIO * last)
     took = float(seconds[-1] - (seconds[above[-1]] if len(above) else 0.0))
     power, fit = _fit_power(*_last_points(seconds, values, ends, since))

@@ -70,7 +70,7 @@ def _polylines(rays: Rays, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.
 def ray_map(source: Emitter, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.ndarray]:
     """Return (start, end): grid points on the vertex plane of the first surface, and where their rays meet `plane`.
 
-    Both are x and y in mm, (GRID_LINES, GRID_LINES, 2), and NaN where there is no light or the ray is lost.
+    (GRID_LINES, GRID_LINES, 2) each, start in mm, end in the unit of `plane`; NaN where light is absent or lost.
     """
     area = clear_window(source, lens)
     line = torch.linspace(-0.499, 0.499, GRID_LINES, dtype=torch.float64)

@@ -1,7 +1,7 @@
 """Shape of a lens, in quantities that a machine shop needs; lengths in mm, angles in degrees, slope of a ripple in rad.
 
 Radii and slopes of a face are computed on a grid four times finer than its net.  Curvature jumps at the knots, so each
-knot span is sampled up to its ends, at optics.bspline.QUARTERS inside the outline.  Slopes are computed on the rim too.
+knot span is sampled with its ends (optics.bspline.QUARTERS), inside the outline.  Slopes are computed on the rim too.
 """
 
 from __future__ import annotations
@@ -262,7 +262,7 @@ def survey_front(
 def _grid(back: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the grid for spline.largest_bending: x and y (mm), and the weights along x and along y.
 
-    The points lie at QUARTERS of each span; x and y are (spans, points), the weights (spans, points, 9).
+    The points lie at QUARTERS of each span; x, y: (spans, points).  weights: see spline.largest_bending.
     """
     spans = [torch.arange(count - 2) for count in back.shape]
     points = span_points(back, spans[0], spans[1], QUARTERS)

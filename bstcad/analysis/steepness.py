@@ -41,8 +41,8 @@ def needed_steepness(
 ) -> Steepness:
     """Return the steepness for light through the points `origins` of the face to the points x, y of the goal.
 
-    x (c,), y (r,): coordinates on the receiver (mm).  origins: (c, r, 2), x and y of points of the face (mm); at_back
-    False: of the plane through the first vertex.
+    x (c,), y (r,): coordinates on the receiver, in its unit.  origins: (c, r, 2), x and y (mm) of points of the face;
+    at_back False: of the plane through the first vertex.
     """
     screen, number, lens = image_screen(lens, goal.receiver), lens.freeform[-1], lens.plain()
     i, j = (np.unique(np.linspace(0, n - 1, min(n, MAX_POINTS_PER_SIDE)).round().astype(int)) for n in (len(x), len(y)))

@@ -108,7 +108,7 @@ def plateau_uniformity(e: np.ndarray, maximum: float) -> float:
     """Return U_P = ΔE / E_max by the histogram of the irradiance E (any shape), at most 1.
 
     The width of the bins is that of Freedman and Diaconis (1981) for the n pixels above E_max / 2, 2 IQR n^-1/3, and at
-    least E_max / MAX_BINS.  From the highest bin above E_max / 2 the half maximum is sought on each side, interpolated
+    least E_max / MAX_BINS.  From the fullest bin above E_max / 2 the half maximum is sought on each side, interpolated
     between the centres of bins.  Without a plateau the number of pixels rises down to E = 0.
     """
     upper = e[e > PLATEAU_LEVEL * maximum]

@@ -171,7 +171,7 @@ def axes(outline: Outline, points: int, least: int = 2) -> tuple[np.ndarray, np.
 def through_knots(face: BSplineSurface, outline: Outline, parts: int) -> tuple[np.ndarray, np.ndarray] | None:
     """Return x and y (mm) of a grid through all knots near the outline's bounding box, `parts` cells per knot span.
 
-    None: no such grid is possible.  The knot t lies t + 1/2 pitches inside the net.  A grid with one cell per span
+    None: no such grid is possible.  An inner knot t lies t + 1/2 pitches inside the net.  A grid with one cell per span
     excludes the end spans, 1.5 pitches long; the bounding box has to lie between them.
     """
     found = []

@@ -3,7 +3,7 @@
 The name of a page is its path without ".md", such as "tutorials/first-lens".  Directives of Sphinx are removed.
 
 checks.md and remarks.md beside this file have a section for each check and remark: a label "(check-rrmsd)=" with the
-id, a heading "###", a line with the text in a report, in which "…" stands for any text, and paragraphs.
+id, a heading "###", a paragraph with the id and the texts in a report ("…" stands for any text), and explanations.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 All views have one scale of the standard series (ISO 5455), in first-angle projection (ISO 128-30): the plan, which is
 the view along -z, lies to the left of the section that is seen along +x with z to the right.  Inside the rim the plan
-is a contour map of the back; flange and holes surround it.  Lines, arrows and dimensions follow ISO 128 and ISO 129-1,
-in black, so that a copy of a copy is legible.  matplotlib draws them: the drawing add-on of ezdxf 1.4.5 fills the hole
-of "Ø" and converts text to curves, so that a reader could not search the page or copy the SHA-256 from it.
+is a contour map of the back; flange and holes surround it.  Lines, arrows and dimensions follow ISO 128 and ISO 129-1;
+edges and dimensions are black, so that a copy of a copy is legible.  matplotlib draws them: the add-on of ezdxf 1.4.5
+fills the hole of "Ø" and converts text to curves, so that the page cannot be searched, nor the SHA-256 copied from it.
 """
 
 from __future__ import annotations
@@ -295,11 +295,11 @@ def _depth(front: Callable[[float], float], z: float, u: float, lean: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Part to draw, in the frame of its STEP file (mm)."""
+    """Part to draw; `cuts` and `vertices` are in the frame of its STEP file (mm)."""
 
-    lens: Lens  # lens inside the rim
+    lens: Lens  # lens inside the rim, in the frame of the scene
     mount: Mount  # Mount() for a bare lens
-    origin: float  # z of the file's origin in the frame of the scene
+    origin: float  # z of the file's origin in the frame of the scene (mm)
     used: Outline | None  # clear aperture of the back; None: the whole face
     names: tuple[tuple[str, str], tuple[str, str]]  # names of front and back: (long, short) each
 
@@ -338,7 +338,7 @@ class PaperFrame:
 
 
 def scale_for(views: Views, width: float, height: float) -> float:
-    """Return the largest scale of the series 1, 2, 5, 10 … at which all views fit on paper of this size (mm)."""
+    """Return the largest scale of the series … 0.5, 1, 2, 5 … at which all views fit on paper of this size (mm)."""
     a, b = views.outermost.half_extent
     wide = 2 * a + sum(np.ptp(cut.ends[0]) for cut in views.cuts)
     most = min((width - sum(SIDE_MARGINS)) / wide, (height - TOP_MARGIN - BOTTOM_MARGIN) / (2 * max(a, b)))

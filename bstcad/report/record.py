@@ -89,7 +89,7 @@ class CurvePoint:
     """One point of the convergence curve."""
 
     seconds: Seconds  # time since the start
-    rrmsd: Rrmsd  # RRMSD by the flux tubes of the stage; at the end of a stage, its final RRMSD by new rays
+    rrmsd: Rrmsd  # RRMSD of the best lens so far, by flux tubes; at the end of a stage, final RRMSD by new rays
 
 
 class PrecisionTest(TypedDict):
@@ -189,7 +189,7 @@ class Contents:
     quality: str | None = None  # tailoring.quality of the scene
     # record of the transport solver: grid, iterations, mass error, reason to stop; steepness (analysis.steepness)
     transport: Mapping[str, Scalar] | None = None
-    skipped_steps: Annotated[int, Field(ge=0)] | None = None  # steps skipped: gradient not finite
+    skipped_steps: Annotated[int, Field(ge=0)] | None = None  # steps skipped: merit or gradient not finite
     stopped: str | None = None  # reason why tailoring ended
     twins: PrecisionTest | None = None  # comparison of float32 with float64; None: not made
     rrmsd_asked: Size | None = None  # accept.rrmsd of the scene; None: no limit
@@ -208,7 +208,7 @@ class Contents:
     convergence: Mapping[str, Size | None] | None = None
     # distribution of the remaining error: parts [{name, error, pixels}] (fractions of the squared error and of the
     # pixels), octaves [{frequency (cycles per pixel), period (in the target's unit), error}], outside (fraction of the
-    # light beside the target)
+    # light behind the last face that misses the target)
     remaining_error: Mapping[str, Any] | None = None
     # bounds on the tailored faces: asked {key of [lens]: value}, at {key: fraction of the area at the bound; None: a
     # thickness at the bound}, tightest {key: position, in words}, both (true: both faces are tailored) or front (true:
@@ -522,7 +522,7 @@ class Report:
     """
 
     contents: Contents
-    irradiances: tuple[np.ndarray, ...]  # irradiance (rows, columns) on each target, row 0 = y max, scaled to its sum
+    irradiances: tuple[np.ndarray, ...]  # irradiance (rows, columns) on each target, row 0 = y max, sum of the target
     # made part of this verification: facts, outliers (n, 3), predicted irradiances, and the deviation map with x, y and
     # form (rows y, columns x; mm, + out of the glass, NaN outside); None: no part was measured
     measured: Any = None

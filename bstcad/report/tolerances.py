@@ -87,7 +87,7 @@ class Inverse:
 
 @dataclass(frozen=True)
 class TargetStudy:
-    """Results on one of several targets; the trials are those of all targets."""
+    """Results on one of several targets; all targets have the same trials."""
 
     key: str  # target[0], target[1], …
     where: str  # position of the receiver, in words
