@@ -149,7 +149,7 @@ def _evaluate(
 def _gauss_points(
     edge: TopoDS_Edge, curves: Sequence[BRepAdaptor_Curve | BRepAdaptor_Curve2d], over_net: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return parameters and weights of Gauss points between knots, in an edge's direction; over_net: edge of a net."""
+    """Return parameters and weights of Gauss points between knots, in an edge's direction; over_net: True on a net."""
     first, last = curves[0].FirstParameter(), curves[0].LastParameter()
     knots = {first, last}
     for curve in curves:

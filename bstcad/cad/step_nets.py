@@ -119,7 +119,7 @@ def fill_in_nets(text: bytes, placeholders: Sequence[int], nets: Sequence[LargeN
 
 
 def _surface_statement(name: int, net: LargeNet, first: int) -> Iterator[bytes]:
-    """Yield the text of statement `name`: a net whose points are numbered from `first` on, v changing fastest."""
+    """Yield the text of statement number `name`: a net with points numbered from `first` on, v changing fastest."""
     m, n, _ = net.control_points.shape
     yield b"#%d = B_SPLINE_SURFACE_WITH_KNOTS('',%d,%d,(\n" % (name, *net.degrees)
     for i in range(m):

@@ -44,7 +44,7 @@ PART_FILE = "part.step"
 
 
 def one_sentence(work: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a job so that any error of OCC becomes a ValueError in one sentence; its path is a file or a folder."""
+    """Decorate a job so that any error of OCC becomes a ValueError in one sentence; path: file or folder of the job."""
 
     @functools.wraps(work)
     def checked(path: Path, *arguments: Any, **options: Any) -> Any:
@@ -286,7 +286,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
 
 
 def _part_edge_check(wanted: Any, reread: Any, why: str) -> Check:
-    """Check the largest distance (mm) between edges of two solids; wanted: the mount's; None: not built, see `why`."""
+    """Check the distance (mm) between edges of two solids; wanted: part of the mount, None if not built, see `why`."""
     name = f"{PART_FILE}: distance of edges from the mount's"
     if wanted is None:
         return Check.true(name, False, why, id="part-edges")
