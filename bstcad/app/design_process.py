@@ -28,8 +28,8 @@ CLOUD = "cloud"  # stem of the file with the measured points; the suffix states 
 PROGRESS, LIGHT, STATE = "progress.jsonl", "light.png", "state.json"  # output files of a run
 MAX_JOB_SIZE = 1_000_000  # largest size of job.json (bytes)
 MAX_PICTURE_SIDE = 512  # largest length of the longer side of the picture of the light (pixels)
-TUBES_PER_SIDE = 521  # flux tubes per side for the picture of the light
-MIN_INTERVAL = 2.0  # shortest time between two pictures, or two lines of progress with equal text (s)
+TUBES_PER_SIDE = 521  # flux tubes per side for the picture of the light; fewer for an extended source
+MIN_INTERVAL = 2.0  # shortest time (s) between two pictures, or, in a trade-off, lines of progress with equal text
 MAX_TIME_FRACTION = 0.03  # largest fraction of the run's time that the pictures may take
 SOURCE_POINTS = 16  # points that represent an extended source in the picture
 

@@ -157,10 +157,7 @@ class Run:
         return str(self.folder) in command_of(process)
 
     def news(self, since: int) -> dict[str, Any]:
-        """Return the state and the lines of progress from line `since` on, for the page.
-
-        A line is [seconds since 1970, stage, done, total, text].
-        """
+        """Return state, and lines of progress from line `since`: [seconds since 1970, stage, done, total, text]."""
         state = self.state
         lines = self.read(PROGRESS).decode("utf-8", "replace").split("\n")[:-1]
         progress = [found for line in lines[max(since, 0) :] if (found := _read(line)) is not None]

@@ -81,7 +81,7 @@ def with_followers(data: Mapping[str, Any], key: str, value: Any, locked: bool =
 
 
 def _other_side(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """Return {key: value} of the other side, in its ratio to the changed side; {} if one of the sides has no length."""
+    """Return {key: value} of the other side, in its ratio to the changed side; {} if a length is missing or invalid."""
     parent, _, name = key.rpartition(".")
     other = f"{parent}.{LOCKED_SIDES.get(name, '')}"
     was, its = value_at(key, data), value_at(other, data)

@@ -13,7 +13,7 @@ from bstcad.scene.schema import Node, records, schema, tags
 KEY_PART = re.compile(r"([^.\[\]]+)(?:\[(\d+)\])?")  # part of a dotted key: name, number of a table in its list
 TABLE_NUMBER = re.compile(r"\[\d*\]")  # number of a table in its list, as in target[1]
 SOURCE_DISTANCE = 100.0  # distance of a new source from the lens (mm)
-DISTANCE_RATIO = 1.5  # distance of an added target from the back / distance of the last target from it
+DISTANCE_RATIO = 1.5  # distance of an added target from the back / distance of the last target from the back
 SIZE_MODELS = {  # new outline: (table whose size it gets, factor on this size)
     "source.aperture": ("lens.outline", 1.0), "mount.rim": ("lens.outline", 1.0), "wavefront": ("lens.outline", 1.0),
     "mount.flange.outline": ("lens.outline", 2.0), "lens.front.outline": ("lens.outline", 0.5),

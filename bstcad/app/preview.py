@@ -36,7 +36,7 @@ GOALS_SIZE_FACTOR = 0.5  # factor on pixels, control points and tubes per side f
 GOALS_EVALUATIONS_FACTOR = 3  # factor on the evaluations for several targets or a wavefront
 MIN_POINT_ROUNDS = 3  # smallest number of rounds of stage 1 for a point source
 TUBES_PER_PIXEL = 2.5  # flux tubes per pixel along each axis for the picture; tailoring uses other tubes
-LEDGER_RAYS = 160  # rays per side for the flux ledger
+LEDGER_RAYS = 160  # rays per side for the flux ledger; fewer for an extended source
 SHAPE_POINTS = 129  # points per side of the lens for the figures of its shape
 IMAGE_POINTS = 16  # points per side of the back, for the images of the source and the lit fraction
 SEED = 77  # seed of the ledger's rays
@@ -72,7 +72,7 @@ class Preview:
     flux: dict[str, float]  # ledger of the light: fractions that sum to 1
     shape: dict[str, float | None]  # shape of the lens, by the keys of report.json
     source_images: tuple[Blur | None, ...]  # image of the source on each target; None: the source has no size
-    lit_fraction: float  # fraction of the back's area, up to the rim, that the central point of the source lights
+    lit_fraction: float  # fraction of the back's area, up to the rim, that one point of the source lights
     remarks: tuple[str, ...] = ()  # warnings of the scene, and remarks on light that cannot reach the target
     seconds: float = math.nan  # time of the preview (s)
 
@@ -147,7 +147,7 @@ def _evaluate(scene: Scene, made: Made) -> Preview:
 
 
 def _lit_fraction(scene: Scene, lens: Lens) -> float:
-    """Return the fraction of the back's area, up to the rim, that the central point of the source lights."""
+    """Return the fraction of the back's area, up to the rim, that one point of the source lights."""
     x, y = (middle(ends).reshape(-1) for ends in corners(lens.apertures[1], IMAGE_POINTS))
     _, flux = landing_pixels(scene.channels()[:1], lens, scene.target.screen, IMAGE_POINTS)
     inside = lens.apertures[1].contains(x, y)

@@ -156,7 +156,7 @@ def names(path: Path) -> list[str]:
 
 
 def net(path: Path, most: int) -> np.ndarray:
-    """Return control_points (m, n, 3) as float64 from an .npz archive; m, n: at most `most`.  Errors: see `arrays`."""
+    """Return control_points (m, n, 3) of an .npz archive.  ValueError if m or n exceeds `most`; else see `arrays`."""
     with zipfile.ZipFile(io.BytesIO(contents(path, MAX_ARCHIVE_SIZE))) as archive:
         with archive.open("control_points.npy") as file:
             (m, n, *_), _ = _header(file, "control_points")

@@ -102,7 +102,7 @@ class Choice:
 
 
 def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
-    """Return (scene with a chosen net, choice); (scene, None) if it has one.  SceneError: no light on the back."""
+    """Return (scene with a net, choice or None if it states net or levels).  SceneError: no light on the back."""
     if scene.lens.back.control_points is not None:
         return scene, None
     levels = scene.tailoring.levels

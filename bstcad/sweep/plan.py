@@ -145,7 +145,8 @@ def _request_of(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[st
 def predict_qualities(scene: Scene, lenses: Sequence[Lens], tick: Tick = lambda: None) -> dict[str, Any]:
     """Return {predicted, not_predicted, finer, notes}: predictions for each quality, or the reason why there are none.
 
-    finer: predictions for twice the spans per side; None: net too large.  lenses: a coarse one per target.
+    notes: remarks on steepness and on limits that end a design early.  finer: predictions for twice the spans per side;
+    None: net too large, or no predictions.  lenses: a coarse lens per target.
     """
     entries: dict[str, Any] = {"predicted": None, "not_predicted": None, "finer": None, "notes": []}
     try:

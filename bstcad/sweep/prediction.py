@@ -40,7 +40,7 @@ INTERVAL_FACTORS = {"seconds": 1.5, "rrmsd": 1.5, "memory_gb": 1.25}  # factors 
 
 # --- the pilot --------------------------------------------------------------------------------------------------------
 
-PILOT_LIMITS = 128, 193, 512  # maximum pixels (more for MIN_PILOT_POINTS), control points, tubes per side of a pilot
+PILOT_LIMITS = 128, 193, 512  # maximum pixels (unless MIN_PILOT_POINTS needs more), control points, tubes per side
 MIN_PILOT_POINTS = 65  # minimum control points per side of a pilot, unless its scene has fewer
 MIN_PILOT_TUBES = 16  # minimum tubes per side of a pilot
 PILOT_CELLS = (16, 256)  # minimum and maximum cells per side of the transport of a pilot
@@ -155,8 +155,8 @@ REMAINING_BLUR = 0.5  # fraction of the blur by an extended source that remains 
 def predict(scene: Scene, pilots: Mapping[str, Pilot], gain: float = 1.0) -> dict[str, dict[str, Interval]]:
     """Return intervals of seconds, rrmsd and memory_gb (two processes), by quality, from pilots of PILOT_QUALITIES.
 
-    The RRMSD does not increase from a quality to the next better quality.  gain: ratio of the RRMSD of the scene's net
-    to the RRMSD of the pilots' net.
+    The RRMSD does not increase from a quality to the next better quality.  gain: RRMSD with the net of `scene`, divided
+    by the RRMSD with the net of the scene of which the pilots are small versions.
     """
     best, intervals = math.inf, {}
     for quality in QUALITIES:

@@ -44,7 +44,7 @@ TRADEOFF_COLUMNS = (
     "knobs", "settings", "status", "seconds", "cpu_seconds", "kernel_seconds", "units", "rrmsd", "rrmsd_noise",
     "rrmsd_reported", "peak_memory_gb", "on_front", "predicted_seconds", "cost_seconds", "where", "reason",
 )  # fmt: skip
-PRIVATE_FIELDS = {"allowed_seconds", "history", "machine", "versions", "version"}  # fields stored in RunFile only
+PRIVATE_FIELDS = {"allowed_seconds", "history", "machine", "versions", "version"}  # not written: they are in RunFile
 
 
 class KnobPoint(StoredRecord):
@@ -108,7 +108,7 @@ class TradeoffTable(StoredRecord):
     versions: dict[str, str]  # versions of the libraries, by name
     reference: dict[str, Any]  # reference for the RRMSD: rays (numbers of rays, ascending), what (in words)
     calibration: Calibration  # time of the calibration kernel
-    runs: tuple[ColdRun, ...]  # ended runs, then the others, both in order of importance; no PRIVATE_FIELDS
+    runs: tuple[ColdRun, ...]  # ended runs, then the others, both in order of importance
     knobs: tuple[TableKnob, ...]  # knobs that were varied
     front: tuple[StoredSettings, ...]  # settings of the runs on the Pareto front, the fastest first
     front_halving: float | None  # factor of the time that halves the error along the front
@@ -243,7 +243,7 @@ def draw_runs(axes: Axes, table: TradeoffTable) -> None:
         label = "convergence of the base run"
         axes.plot(*zip(*points, strict=True), color="#b5b5b5", label=label, **THIN_LINE)
     for knob in table.knobs:
-        if knob.key in KNOB_STYLES and len(knob.places) > (knob.key != "adam"):  # all others include the base
+        if knob.key in KNOB_STYLES and len(knob.places) > (knob.key != "adam"):  # other knobs include the base
             _draw_knob(axes, knob)
     if table.front_runs:
         times, errors = zip(*(run.time_and_error for run in table.front_runs), strict=True)

@@ -55,7 +55,7 @@ class Knob:
     key: str  # name for programs, such as "tubes"
     title: str  # name in words, such as "Flux tubes per side"
     points: Points  # values of the setting
-    combines: bool = False  # True if the knob changes several keys at a time
+    combines: bool = False  # True if the knob varies two other knobs together
 
 
 def other_seed(scene: Scene, point: Settings) -> Settings:

@@ -31,7 +31,7 @@ class ToleranceGrade:
     thickness: float  # thickness at the centre, mm
     index: float  # refractive index
     front_power: float  # sag of the front at its rim, mm
-    scale: float  # relative size of the lens
+    scale: float  # size of the lens, relative
     temperature: float  # difference from the design temperature, K
     wavelength: float  # difference from the design wavelength, nm
     source: float  # size and cone angle of the source, relative
@@ -93,10 +93,10 @@ def base_grade(table: Sequence[Tolerance]) -> str:
 
 
 def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None = None) -> tuple[Perturbation, ...]:
-    """Return all errors of the setup, with limits from a graded table.
+    """Return all errors of the setup, with limits from a graded table; material: lens.material or None.
 
-    Form errors and ripple that need a finer net are omitted; SceneError if the table names them.  Errors of one face
-    relative to the other are included only if the table names them.  Also raises SceneError for unknown errors.
+    Form errors and ripple that need a finer net are omitted.  Errors of one face relative to the other are included
+    only if the table names them.  SceneError if the table names an omitted error, or if all errors are zero.
     """
     errors = []
     for kind in kinds(setup, material).values():

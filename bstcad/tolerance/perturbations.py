@@ -118,7 +118,7 @@ class Kind:
     name: str  # name in scene files, such as "lens.decentre_x"
     words: str  # name in reports
     unit: str  # unit of its amounts; "" for a ratio
-    apply: Callable[[Setup, float], Setup]  # function (setup, amount) -> setup with this error too
+    apply: Callable[[Setup, float], Setup]  # function (setup, amount) -> setup with this error added
 
 
 @dataclass(frozen=True)
