@@ -1,7 +1,7 @@
 """Point-by-point integration of a ray mapping: the traditional construction of a surface from a transport map.
 
 Wang et al. 2023 compare their tailoring with this construction (sections 1 and 3.3, after Luo et al. 2010).  The map is
-that of Wang et al., from the plane of the front's vertex to points of the target (slope_map.py).  Rays through a grid
+that of Wang et al., from the vertex plane of the first surface to the target (slope_map.py).  Rays through a grid
 on that plane are traced up to the back.  At a point of a ray, Snell's law and the aim of the ray give the slopes p =
 ∂z/∂x and q = ∂z/∂y of the back.  From the initial point on, each point a gives the point b on the next ray, where
 
@@ -98,8 +98,8 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
 def march(coming: Rays, aim: Tensor, plane: Receiver, law: Law, z: float, first: First = "x") -> SurfacePoints:
     """Return points of a face that sends rays (n, n), n odd, to aims (2, n, n) mm on the receiver `plane`.
 
-    coming: rays on the way to the face.  z: z (mm) of the point on the middle ray.  first: axis of the first line,
-    across which all others run.  A lost ray, or one parallel to the face, ends its line.  SceneError: no middle ray.
+    coming: rays on the way to the face.  z: z (mm) of the point on the middle ray.  first: axis of the first line;
+    all others cross it.  A lost ray, or one parallel to the face, ends its line.  SceneError if the middle ray is lost.
     """
     middle = aim.shape[-1] // 2
     if not bool(coming.alive[middle, middle]):

@@ -1,7 +1,7 @@
 """The procedure of the paper: stages 1 and 2 by Adam on raw control points (Wang et al. 2023, sections 2.3 and 3).
 
-It is the reference for lenses of other `tailoring.quality`.  Choices for which the paper gives no number are stated
-here or in quality.py: steps per level, learning rates that fall to zero in each level, and the rate of stage 2.
+Other lenses are compared with its lenses (`tailoring.quality` = "paper").  Choices for which the paper gives no number
+are stated here or in quality.py: steps per level, learning rates that fall to zero in each level, the rate of stage 2.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ class Level:
     """State of stage 1 between two steps on one of its nets."""
 
     level: int  # number of the net, from 0
-    mapping: Mapping  # map from the front's vertex plane to the target
+    mapping: Mapping  # map from the vertex plane of the first surface to the target
     lens: Parameters  # parameters at the start of this level
     best: Best  # best parameters so far
     search: AdamState  # state of Adam after the last step
 
 
 def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[StageStep]:
-    """Run stage 1, or resume it, on one net after another, with one map from the front's vertex plane to the target."""
+    """Run stage 1, or resume it, on one net after another, with the same map (`transport`) for all nets."""
     knobs, lens, each = task.knobs, task.heaviest.through(lens), task.knobs.stage1_iterations
     area = clear_window(task.heaviest.source, lens)  # window of the light that passes the blank
     if state is None:
@@ -103,7 +103,7 @@ def _improved(lens: Lens, best: Best, free: tuple[str, ...], net: Sides) -> Lens
 
 
 def transport(task: Task, lens: Lens) -> Mapping:
-    """Return the map from the front's vertex plane to the target, for a blank lens."""
+    """Return the map from the vertex plane of the first surface to the target, for a blank lens."""
     source, goal = task.heaviest.source, task.goals[0]
     n, count = task.knobs.transport_grid, task.knobs.transport_iterations
 
@@ -114,9 +114,9 @@ def transport(task: Task, lens: Lens) -> Mapping:
 
 
 def tent_average(target: Tensor) -> Tensor:
-    """Return a picture of constant irradiance in each pixel after tent binning: [1, 6, 1] / 8 along the two axes.
+    """Return what tent binning makes of a picture, constant in each pixel: the filter [1, 6, 1] / 8 along each axis.
 
-    Compared with this picture, instead of the sharp one, a perfect lens has merit zero.
+    Compared with the result, instead of the sharp picture, a perfect lens has merit zero.
     """
     for _ in range(2):  # each pass filters one axis and transposes
         target = torch.nn.functional.pad(target, (1, 1))
@@ -179,7 +179,7 @@ def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[S
 
 
 def random_bundles(channels: tuple[Channel, ...], lens: Lens, count: int, seed: int) -> tuple[Rays, ...]:
-    """Return `count` random rays of each channel through the clear part of the vertex plane; all use one seed."""
+    """Return `count` random rays of each channel through its `clear_window`; all channels use one seed."""
 
     def bundle(channel: Channel) -> Rays:
         area = clear_window(channel.source, channel.through(lens))

@@ -69,7 +69,7 @@ def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], flo
 
 
 def _points_near_bounds(lens: Lens, bounds: Bounds, margin: float) -> Iterator[tuple[Tensor, Tensor, float, float]]:
-    """Yield (x, y, weight of a point, minimum thickness) for points within `margin` of a bound, and some others (mm).
+    """Yield (x, y, weight of a point, minimum thickness), in mm, for points within `margin` of a bound and some others.
 
     The points along the rim come last; their weights sum to 1.
     """

@@ -2,8 +2,8 @@
 
 The wavefront, or the two pictures, determine the rays behind the lens (light_behind.py).  These rays determine where
 the light meets the back, and by which angle the front has to deflect it.  A design is refused if, for much of the
-light, rays would have to cross between lens and target, or to leave the back outside of its clear aperture.  It is
-reported if the front would have to deflect light by more than refraction can.
+light, rays would have to cross between lens and target, or to leave the back outside of its clear aperture.  If the
+front would have to deflect light by more than refraction can, this is only reported.
 
 At an index of 1.49 a front can deflect light by up to 43 degrees (incidence at 85 degrees).  A back that cancels this
 is nearly vertical, and remains so in stage 2.  If the deflection would exceed MAX_GENTLE_DEFLECTION, stage 1 raises the

@@ -1,6 +1,6 @@
 """The merit function of stages 2 and 3, and the variables that condition it (`Spectrum` conditions the slope fit).
 
-The merit is the weighted mean over the goals: of RRMSD² for a picture and of the squared RMS wavefront error in waves:
+The merit is the weighted mean of RRMSD² of each picture goal and the squared RMS wavefront error in waves:
 
     M = (Σ_k w_k RRMSD_k² + w (RMS / λ)²) / (Σ_k w_k + w),    RRMSD_k² = Σ_ij |E^s_ij - E_ij|² / Σ_ij E_ij².
 
@@ -119,7 +119,7 @@ class Merit:
     def with_blur(self, source: ExtendedSource, lens: Lens, seed: int | None = None) -> Merit:
         """Return the merit for a source of finite size; the channels of this merit are the light of its centre.
 
-        seed: seed of the rays that measure the error of the blur (almost a second per goal); None: no measurement.
+        seed: seed of the rays that measure the error of the blur, in almost a second per goal; None: no measurement.
         """
         exact = lens.plain()
         merit = replace(self, blurs=tuple(blurs(source, exact, goal.receiver) for goal in self.goals))
@@ -140,7 +140,7 @@ class Merit:
 
     @cached_property
     def targets(self) -> tuple[Tensor, ...]:
-        """Target picture of each goal, (rows, columns), on the light's device; a single one is scaled to the sum 1."""
+        """Target pictures (rows, columns), one per goal, on the light's device; a single picture has the sum 1."""
         pictures = tuple(torch.from_numpy(goal.picture).to(self.light.sheets[0].flux.device) for goal in self.goals)
         return tuple(picture / total(picture) for picture in pictures) if self._is_one else pictures
 

@@ -3,8 +3,8 @@
 For a point source or collimated light the slopes of both faces have nearly the same effect: light from the point q of
 the front meets the back at b(q), and a slope at q moves the landing point of this light on a plane behind the lens
 nearly as far as an equal slope at b(q).  In the heights of the two nets the merit is therefore a long narrow valley.
-The direction along the valley separates from the one across it if the back repeats each change h(q) of the front where
-the light arrives:
+The directions along and across the valley separate if the back repeats each change h(q) of the front where the light
+from q arrives:
 
     δz_front(q) = h(q),    δz_back(b(q)) = κ h(q),    κ = (n d_z - d_z,in) / (n d_z - d_z,out).
 
@@ -82,9 +82,9 @@ def _multiply(matrix: csr_array, t: Tensor, like: Tensor) -> Tensor:
 def along_light(source: Emitter, lens: Lens, goals: Sequence[Goal]) -> tuple[csr_array, float]:
     """Return R and f for a lens with two nets.
 
-    f is SCALE_FRACTION times the scale at which both blocks move the pictures equally far: the RMS over k of d_k / m_k,
-    divided by T / (n m_b), which are paraxial shifts of the light from q.  T is the thickness, d_k the distance from
-    the back to plane k, and m_b and m_k are the magnifications of b(q) and of picture k.
+    f is SCALE_FRACTION times the scale at which both blocks move the pictures equally far: the weighted RMS over the
+    goals k of d_k / m_k, divided by T / (n m_b); these are paraxial shifts per slope.  T is the thickness, d_k the
+    distance from the back to plane k, and m_b and m_k are the magnifications of b(q) and of picture k.
     """
     front, back = lens.nets
     q_x, q_y = torch.meshgrid(*control_point_axes(front), indexing="ij")

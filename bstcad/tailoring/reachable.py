@@ -80,7 +80,7 @@ def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT
 
 
 def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
-    """Return the goal resampled to at most `pixels` pixels along the longer side: means, of a sum below 1."""
+    """Return the goal with at most `pixels` pixels along the longer side: means of the old pixels, of a sum below 1."""
     screen, picture = goal.receiver, goal.picture
     shrunk = max(1.0, max(screen.shape) / pixels)
     rows, columns = (max(round(n / shrunk), 1) for n in screen.shape)

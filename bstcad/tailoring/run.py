@@ -79,9 +79,9 @@ BEST_LENS_STAGE = "back to the best lens before"  # name in the record of the re
 WAVEFRONT_TUBES = 256  # flux tubes per side that measure the wavefront error of a lens between the stages
 TUBES_PER_SECOND = 4.7e6  # tubes traced per second, with the gradient of the merit, on a machine of pace 1
 RRMSD_SECONDS = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
-# Rays for the RRMSD of a lens between the stages, accurate to some 5 % for STAGE_EFFORT_PIXELS pixels per side.  The
-# error of the product of two pictures of n² stratified rays varies as (p / n)³ / p, so a target of p pixels per side
-# needs (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays per side.
+# Rays for the RRMSD of a lens between the stages, accurate to some 5 % for STAGE_EFFORT_PIXELS pixels per side.  RRMSD²
+# is estimated from products of two pictures (measure.py).  With n² stratified rays per picture its error varies as
+# (p / n)³ / p, so a target of p pixels per side needs (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays per side.
 STAGE_EFFORT, STAGE_EFFORT_PIXELS = Effort(rays=724, accuracy=0, witness=False), 512
 FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays for scenes with accuracy or bounds, and `better`
 FLUX_EFFORT = Effort(rays=128, accuracy=1.0, witness=False)  # rays for the flux on the target alone

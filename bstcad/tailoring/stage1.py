@@ -47,8 +47,8 @@ COARSE_FACE_FIT = Fit(bending=1e-2, steps=40, degree=3)  # fit of coarse rounds:
 FINE_FACE_FIT = Fit(unlit=1e-2)  # fit of fine rounds: weak fit to the previous slopes where no light falls
 FINE_ROUNDS = 2  # number of fine rounds: the first has half the cells per side of the last
 # RRMSD, and RMS change of the map in the last round, above which `follow_aims` is tried.  The unit of the change is
-# half a side of the square around the light (`slope_map.square_grid`).  For lenses that further rounds do not improve
-# the change is at most 0.016.
+# half a side of the square around the light (`slope_map.square_grid`).  The change is at most 0.016 for lenses that
+# further rounds do not improve.
 RETRY_RRMSD, RETRY_CHANGE = 0.25, 0.025
 SETTLED_CHANGE = 0.01  # RMS change of the map, in the unit of RETRY_CHANGE, below which coarse rounds end
 MAX_RAY_CELLS = 1026  # largest number of rays per side in the slope fit; a finer grid interpolates between rays
@@ -179,7 +179,7 @@ def _round(task: Task, lens: Lens, previous: SlopeMap | None, number: int) -> tu
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
-    """Return the lens fitted to the map of the paper, from the front's vertex plane to the target, and this map.
+    """Return the lens fitted to the map of the paper (`slope_map.map_to_target`), and this map.
 
     The face is fitted to slopes, while the paper minimises |P_i^t - P_i|².  A ray keeps its aim while the sag changes.
     So these slope fits converge even if the slopes needed at fixed points of the back depend strongly on the sag: in

@@ -319,7 +319,7 @@ class Problem:
 
 
 def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariables:
-    """Return the variables of stage 2 for all nets; with `pixels`, of coarser nets with so many cells per side."""
+    """Return the variables of stage 2 for all nets; pixels: cells on the longer side of coarser nets, or None."""
     nets = lens.nets
     if pixels is not None:
         lens = lens.with_nets(net.refined(coarser(net.shape, pixels + 1)) for net in nets)

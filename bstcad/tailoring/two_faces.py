@@ -46,7 +46,7 @@ POINT_SHIFT = 1e-4  # shift of a point for difference quotients of slopes, relat
 # second finest nets.  Several rounds are needed until the faces fit each other.  (With two, the errors of two
 # photographs, averaged over blocks of 4 to 32 pixels, are 1.5 times larger.)
 FINE_PAIR_ROUNDS = 4
-SETTLED_FRONT = 0.003  # RMS change of q(t), in half widths of the front's lit part, below which the coarse rounds end
+SETTLED_FRONT = 0.003  # largest `SlopeMap.moved` (relative RMS change of q(t)) at which the coarse rounds end
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ class Mapping:
 
     x: np.ndarray  # (n + 1, n + 1), x of S at pixel corners, cell units of the source frame
     y: np.ndarray  # (n + 1, n + 1), y of S at pixel corners, cell units of the source frame
-    guess_x: np.ndarray  # (n + 1, n + 1), x of T at source cell corners to about a cell, cell units of the target frame
+    guess_x: np.ndarray  # (n + 1, n + 1), x of T at source cell corners, error about a cell, cell units of target frame
     guess_y: np.ndarray  # (n + 1, n + 1), y of T at source cell corners
     source: Density
     target: Density  # target, raised to the floor
