@@ -40,8 +40,8 @@ PROFILE_NAMES = {"gaussian": "Gaussian", "lambertian": "Lambertian", "uniform": 
 class Emitter(ABC):
     """A source of light.
 
-    A subclass is a frozen dataclass that defines `irradiance`, `rays` and `window`.  The other methods follow from
-    these, or raise NotImplementedError, which names the missing method.
+    A subclass is a frozen dataclass that defines `irradiance`, `rays` and `window`.  The other methods have defaults;
+    some raise NotImplementedError, which names the method that the subclass must add.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]

