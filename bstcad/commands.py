@@ -233,7 +233,7 @@ def _prove_files(made: Made, folder: Path, drawn: Pictures, options: ProofOption
 def _checkpoint_on_error(keeper: Keeper, refused: tuple[type[Exception], ...] = ()) -> Iterator[None]:
     """Write a checkpoint if an error or a signal ends the block; the error's note says how to resume.
 
-    refused: errors of an invalid scene, after which the checkpoint is deleted.
+    refused: errors of an invalid scene, after which the checkpoint of this run is deleted; an earlier one stays.
     """
     try:
         yield

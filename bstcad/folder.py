@@ -180,8 +180,8 @@ def _flush(path: Path) -> None:
 def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
     """Yield a temporary folder whose files are moved to a design's folder when the block ends without an error.
 
-    place: folder for the report of a made part, which the temporary folder replaces instead; SceneError if `place` has
-    other files.  If the design in `folder` has changed meanwhile, SceneError is raised and nothing is written.
+    place: folder for the report of a made part; the temporary folder then replaces `place`, and `folder` is unchanged.
+    SceneError if `place` has other files, or if the design in `folder` has changed meanwhile; nothing is then written.
     """
     if place is not None:
         files.check_free(place, files.MADE_PART_FILES, "a made part's")

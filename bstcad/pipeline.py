@@ -1,7 +1,7 @@
 """The stages of a design in order, from the blank of a scene to the tailored lens.
 
-Stage 1 comes first, then stage 2.  For a source of finite size stage 3 replaces stage 2 (`second_stage`); only the
-paper's procedure, which is for point sources, runs stage 2 before stage 3.
+Stage 1 comes first, then stage 2.  For a source of finite size stage 3 replaces stage 2 (`second_stage`).  Only the
+paper's procedure, whose stage 2 treats each source as a point, runs stage 2 before stage 3.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class DesignState:
     first: Stage1State | None = None  # state of stage 1; None: it has not begun, or it has ended
     followed: Stage1Result | None = None  # result of stage 1; None: it has not ended
     second: Stage2State | None = None  # state of stage 2 or 3; None: it has not begun, or it has ended
-    best: RatedLens | None = None  # best lens before or during stage 2 or 3; None: the stage is not running, or preview
+    best: RatedLens | None = None  # best lens before or during stage 2 or 3; None: stage not running, or a preview
     lens: Parameters | None = None  # lens after stage 2 or 3; None: tailoring has not ended
     stopped: str = ""  # reason why tailoring ended; "": it has not ended
 
@@ -405,7 +405,7 @@ def _final_lens(task: Task, driver: Driver, last: StageStep, before: Sequence[Ra
 
 
 def _corrected(task: Task, lens: Lens) -> Lens:
-    """Return the lens corrected for total reflection at the edge of the reach, crossing faces, and bounds."""
+    """Return the lens corrected for total reflection at the edge of the reach, crossing faces, and violated bounds."""
     if task.edge is not None:
         lens = without_reflection(lens, task.edge)
     bounds = active_bounds(lens, task.bounds, task.min_thickness)
@@ -479,7 +479,7 @@ def require_bounded_light(scene: Scene, rrmsd: float) -> float:
 
 
 def check_thickness(lens: Lens, scene: Scene) -> None:
-    """Raise SceneError, before the long stage 2, if front and back cross or the back reaches what follows the lens."""
+    """Raise SceneError, before stage 2, if the back crosses the front or reaches the next element or target."""
     thinnest, thickest = thickness_range(lens.plain())
     if not thinnest > 0:
         raise SceneError(

@@ -80,8 +80,8 @@ def effect(name: str, makes: LossFactory) -> Own:
     makes(wavelength in nm) returns an object with a method share(cos_in, cos_out, path), which returns the fraction of
     each ray's flux that continues: a tensor of the shape of the arguments, differentiable in them.  cos_in and cos_out
     are the cosines of the angles of incidence and of refraction (or reflection); path is the length (mm) of the ray
-    before the face.  The loss acts at each face that refracts or reflects light; if the object has the attribute
-    in_glass = True, it acts only along paths in the glass.  The ledger counts the lost flux as "taken by NAME".  The
+    before the face.  The loss acts at each face of the lens that light meets, not at other elements; if the object has
+    the attribute in_glass = True, it acts only along paths in the glass.  The ledger counts it as "taken by NAME".  The
     scene file contains only NAME, so a script calls `effect` before it opens such a design; an installed package
     declares an entry point NAME = "module:makes" of the group "bstcad.effects" instead.
     """

@@ -24,7 +24,7 @@ MAX_DRAFT = 30.0  # degrees; largest draft angle of the walls of a lens
 MIN_WEB = 0.1  # mm; smallest width of material between a hole and any other edge
 LAND = 0.1  # height of the upright wall below the back's rim: mm, or for walls below 1 mm, fraction of their height
 ITERATIONS = 60  # iterations for the end of a bevel or wall; on a front of slope 0.5 each at least halves the error
-MIN_CLOSING = 0.25  # smallest rate at which a bevel or a wall with draft nears the front (mm per mm)
+MIN_CLOSING = 0.25  # smallest rate at which a bevel or a wall with draft nears the front (mm per mm of depth)
 MIN_CLEAR_APERTURE = 1e-3  # smallest clear aperture of the front after draft and bevel, as a fraction of the rim
 LENS_COLOUR, MIRROR_COLOUR = "#9ed3f580", "#c8ccd0"  # default colours of a part
 MAX_TEXT = 200  # largest number of characters of a text of the title block
@@ -207,7 +207,7 @@ class Mount(Record):
         """Return the largest distance (mm) by which draft and bevel move the edge of the front inwards.
 
         From (p, top), p on the rim, a line of the wall goes down to the front, and inwards (direction m) by tan(draft)
-        per mm of depth.  The bevel cuts its end at 45°.  Iteration finds the ends of cad.walls.LeaningPiece.ends.
+        per mm of depth.  The bevel cuts its end at 45°.  Both ends agree with cad.walls.LeaningPiece.ends.
         """
         (x, y), tangent = rim.rim_points(), math.tan(math.radians(self.draft))
         m_x, m_y = rim.inset_direction(x, y)

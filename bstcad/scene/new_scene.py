@@ -95,11 +95,11 @@ class Plate:
 
     @property
     def pixel(self) -> float:
-        """Side of a pixel (mm)."""
+        """Side of a pixel on the wall (mm)."""
         return self.magnification * self.side / self.light.pixels
 
     def source_image(self, distance: float) -> float:
-        """Return the source's image width (mm) on a wall at L (mm); source size s: s L / before, or 2 L tan(s/2)."""
+        """Return the width of the source's image on a wall at L (mm): s L / before, or 2 L tan(s/2); s: source size."""
         if self.before:
             return self.light.size * distance / self.before
         return 2 * distance * math.tan(math.radians(self.light.size / 2))

@@ -233,10 +233,10 @@ class Photo:
     name: str  # file name, or name of the sample
     image: Image.Image
     curve: Curve
-    profile: Conversion | None = None  # conversion by the picture's ICC profile; None: the colours are sRGB
+    profile: Conversion | None = None  # conversion by the picture's ICC profile; None: no conversion
     low: Image.Image | None = None  # second bytes of 16-bit colours; Pillow keeps only the first bytes
     white: float = 1.0  # pixel value of white, for files with neither 8 nor 16 bits
-    other_curve: Curve | None = None  # other possible curve of a file without a stated curve and of an uncommon depth
+    other_curve: Curve | None = None  # other possible curve of a file of 16 bits or more that states none; else None
     assumed: str = ""  # sentence on the assumed curve; "": none is assumed
     several: bool = False  # True if the file has further pictures
 

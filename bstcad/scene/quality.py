@@ -170,7 +170,7 @@ Name = Literal[
 ]  # fmt: skip
 FORM, RIPPLE = ("back.form", "front.form"), ("back.ripple",)
 FACE_ERRORS = {"correlation_length": FORM, "period": RIPPLE, "pattern": RIPPLE}  # key -> errors that can have this key
-TWO_FACE_ERRORS = ("front.", "lens.wedge")  # prefixes of errors of one face relative to the other; zero unless named
+TWO_FACE_ERRORS = ("front.", "lens.wedge")  # prefixes of errors that are zero unless a [[tolerance]] names them
 NONE = "none"  # grade of an error that is always zero
 
 

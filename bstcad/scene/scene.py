@@ -263,7 +263,7 @@ class Scene(Record):
         return before, elements.interfaces(self.behind, 1, wavelength)
 
     def clearance(self, highest: float) -> tuple[float, str]:
-        """Return (gap, key) of the next element or target behind a lens up to z = highest; gap (mm) < 0: they cross."""
+        """Return (gap, key) of the element or target next to a lens that ends at z = highest; gap (mm) < 0: overlap."""
         room = [(elements.lowest(self.behind) - highest, "behind[0].z")] if self.behind else []
         if not self.light_path.is_folded:
             for target, key in zip(self.targets, self.target_keys, strict=True):

@@ -73,7 +73,7 @@ def toml_value(text: str) -> Any:
 
 
 def check_plain(data: Any, key: str = "", depth: int = 0) -> None:
-    """Raise SceneError for values that JSON does not have: dates, infinity, NaN, lone surrogates."""
+    """Raise SceneError for dates, NaN, numbers >= 1e300, lone surrogates; RecursionError beyond MAX_NESTING levels."""
     if depth > MAX_NESTING:
         raise RecursionError
     if isinstance(data, dict | list):

@@ -23,7 +23,7 @@ from bstcad.runs import files
 
 FILE = Path(__file__).with_name("schema.json")
 TAGS = ("kind", "shape")  # keys whose value selects the record of a union
-ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # characters that TOML reads from backslash escapes, as in "C:\new\ten.png"
+ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # characters that escapes in TOML or Python denote, such as \n in "C:\new.png"
 LENGTHS, COORDINATES = (1e-3, 1e6), (-1e8, 1e8)  # ranges of lengths and of coordinates, mm
 
 Node = Mapping[str, Any]

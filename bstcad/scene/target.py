@@ -247,7 +247,7 @@ class Target(Record):
             yield f"{key}: an edge of the target {edge}; tilt it less, make it smaller, or move it along +z"
 
     def metres(self, lens: LensBlank) -> Iterator[str]:
-        """Yield a question for each length that looks like metres."""
+        """Yield a question on the first length that looks like metres, if there is one."""
         outline, widest = lens.outline, max(self.size)
         name, size = ("radius", outline.radius) if isinstance(outline, Circle) else ("width", outline.width)
         across, question = 2 * max(outline.half_extent), "are these metres? lengths are in mm"
