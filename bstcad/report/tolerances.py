@@ -128,7 +128,7 @@ class Tolerances:
     seed: Annotated[int, Field(ge=0)]  # seed of the trials
     tubes: Count  # flux tubes per side, for each channel
     limit: Rrmsd  # largest RRMSD of a lens that passes
-    rrmsd: Rrmsd  # RRMSD of the design; if there are several targets, on the worst one, here and below for each lens
+    rrmsd: Rrmsd  # RRMSD of the design; here and below each RRMSD of a lens is the largest over the targets
     trials: Count  # number of trials by superposed pictures
     full_trials: Count  # number of trials by full traces
     # yield by superposed pictures: lenses within `limit` on all targets and within the limit of the wavefront
