@@ -76,7 +76,7 @@ ADDITIONS = {  # labels of buttons that add a table, by key
 }  # fmt: skip
 LOCKED_SIDES = {"x": "y", "y": "x", "width": "height", "height": "width"}  # side: the other side, which a lock changes
 OPTIONAL_TABLES = ("mount",)  # tables that a button adds though no key is required
-MAX_TABLES = 1000  # largest number of tables in a list for which the schema states none
+MAX_TABLES = 1000  # largest number of tables in a list, if the schema states no number
 MIN_STEPS = 100  # smallest number of steps of a slider
 STEP_DIGITS = (5, 2, 1)  # possible first digits of a slider's step; its other digits are 0
 

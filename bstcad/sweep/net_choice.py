@@ -228,7 +228,7 @@ def net_rrmsd(light: ControlCells, scene: Scene, image: float = 0.0) -> float:
     """Estimate the RRMSD of a scene from detail finer than its net's cells or than cells twice as wide, and an offset.
 
     light: see `area_cells`.  image: RRMSD of the target blurred by the image of the source.  The estimate is fitted to
-    designs in standard quality: half are within a factor of 1.3, nine of ten within 2.  Others are less accurate.
+    designs in standard quality: half are within a factor 1.3, nine of ten within 2.  Other qualities: less accurate.
     """
     factor, rest = QUALITY_TERMS.get(scene.tailoring.quality, QUALITY_TERMS["standard"])
     width, height = scene.lens.cells
