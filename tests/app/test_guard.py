@@ -385,8 +385,9 @@ def test_a_socket_lets_in_no_more_than_the_guard(served):
         {"host": []}, {"host": [served.host, "evil.example"]},
     ):  # fmt: skip
         for request in ({"path": "/"}, {"path": path, **change}):
-            status, _, body = got(served, **request, **({"cookie": cookie} | hostile))
-            assert status in (400, 403) and b"small" not in body, (hostile, request)
+            with contextlib.suppress(ConnectionResetError):  # a malformed request may be cut off
+                status, _, body = got(served, **request, **({"cookie": cookie} | hostile))
+                assert status in (400, 403) and b"small" not in body, (hostile, request)
     assert tree(served.folder) == before
     assert got(served, path, **change, cookie=cookie, origin=f"http://{served.host}")[0] == 200
     websocket = {"connection": "Upgrade", "upgrade": "websocket", "sec_websocket_version": "13"}
