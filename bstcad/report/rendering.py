@@ -285,7 +285,7 @@ def _add_screen(plotter: Any, screen: np.ndarray, picture: np.ndarray, opacity: 
 
 
 def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarray, filled: float) -> None:
-    """Place the eye at `towards` (`_clear_of_screen`), y up; the points fill the fraction `filled` of the view."""
+    """Look from direction `towards` (`_clear_of_screen`), y up; the points fill the fraction `filled` of the view."""
     towards = _clear_of_screen(path, towards)
     right = np.cross([0.0, 1.0, 0.0], towards)
     right /= np.linalg.norm(right)
