@@ -275,7 +275,7 @@ def map_from_face(points: Points, screen: Screen) -> TransportMap:
 
 
 def pixel_corners(screen: Screen) -> Points:
-    """Return x and y (mm) of the corners of the pixels, each (columns + 1, rows + 1), x first."""
+    """Return x and y of the corners of the pixels, in the receiver's unit, each (columns + 1, rows + 1), x first."""
     sides = np.linspace(*screen.x, screen.columns + 1), np.linspace(*screen.y, screen.rows + 1)
     x, y = np.meshgrid(*sides, indexing="ij")
     return x, y
@@ -344,7 +344,7 @@ def map_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> Transport
 
 
 def aim_points(mapping: Mapping, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Tensor:
-    """Return the points of the screen (2, …) mm to which the map of `map_to_target` sends points x, y (…) mm."""
+    """Return the points of the screen (2, …), in its unit, to which `map_to_target`'s map sends points x, y (…) mm."""
     screen, sent = image_screen(lens, screen), mapping(*(p.detach().cpu().double().numpy() for p in (x, y)))
     if not screen.plane.is_level:
         sent = screen.plane.from_level_plane(*sent, lens.front.z)

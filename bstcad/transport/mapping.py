@@ -84,8 +84,8 @@ class TransportMap:
     the floor (mapping.FLOOR) in dark parts.  Stages 2 and 3 change the lens afterwards, but not the map.
     """
 
-    x: np.ndarray  # (c,) x on the target plane, mm, ascending, float64
-    y: np.ndarray  # (r,) y on the target plane, mm, ascending, float64
+    x: np.ndarray  # (c,) x on the target in its receiver's unit, ascending, float64
+    y: np.ndarray  # (r,) y on the target in its receiver's unit, ascending, float64
     source: np.ndarray  # (c, r, 2) float32, x and y (mm) in the scene's frame where the light for (x, y) passes `plane`
     # "back": the last tailored face along the light, which is the front if only the front is tailored, or for a mirror
     # behind glass.  "entrance": the plane z = const through the vertex of the first face, where the map of Wang et al.
