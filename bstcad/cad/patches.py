@@ -256,8 +256,8 @@ def knots_of(surface: Geom_BSplineSurface) -> tuple[np.ndarray, np.ndarray]:
 # ---- nets as bytes of OCC's binary files -----------------------------------------------------------------------------
 
 SMALL_NET = 4096  # largest number of control points that are passed to OCC one by one
-# Layout of a surface's header: number of its kind, flags (rational in u, in v, periodic in u, in v), degrees, numbers
-# of poles and of distinct knots in u and v.  Then follow the poles, v changing fastest, and the knots (KNOT_RECORD).
+# Layout of a surface's header: number of its kind, flags (rational in u, in v, periodic in u, in v), degrees (u, v),
+# numbers of poles, numbers of distinct knots.  Then follow the poles, v changing fastest, and the knots (KNOT_RECORD).
 SURFACE_HEADER = struct.Struct("<B4B2H4i")
 BSPLINE_KIND = 9  # number of the kind of B-spline surfaces in OCC's binary files
 KNOT_RECORD = np.dtype([("value", "<f8"), ("count", "<i4")])  # a knot and its multiplicity
