@@ -96,18 +96,36 @@ class Submit(Protocol):
 def submit(work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> Future[R]:
     """Call the function `work` in the second process; calls run one after the other.
 
-    The Future raises BrokenExecutor if the process died during the call.  If the system allows no second process, a
-    thread does the work.
+    The arguments are pickled before `submit` returns, so the caller may cache properties of them during the call.  The
+    Future raises BrokenExecutor if the process died during the call.  If the system allows no second process, a thread
+    does the work.
     """
     global _process
     if _process is not None:
         try:
-            return _process.submit(work, *arguments, **options)
+            return _submit_to(_process, work, *arguments, **options)
         except BrokenExecutor:  # the process died during earlier work, whose Future reports it
             end()
     _process = _start()
     with ignored_by_children():
-        return _process.submit(work, *arguments, **options)
+        return _submit_to(_process, work, *arguments, **options)
+
+
+def _submit_to(process: Executor, work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> Future[R]:
+    """Submit a call, pickled in this thread if it is for a process: loky would pickle it later, in another thread."""
+    if isinstance(process, ThreadPoolExecutor):
+        return process.submit(work, *arguments, **options)
+    from loky.backend import reduction
+
+    return process.submit(_call, bytes(reduction.dumps((work, arguments, options))))
+
+
+def _call(pickled: bytes) -> Any:
+    """Return the result of a call that `_submit_to` pickled."""
+    from loky.backend import reduction
+
+    work, arguments, options = reduction.loads(pickled)
+    return work(*arguments, **options)
 
 
 class Overdue(TimeoutError):

@@ -39,6 +39,14 @@ def test_a_work_that_takes_too_long_is_ended_and_the_next_one_done(fresh):
     assert processes.result(processes.submit(os.getpid), 60.0) != process
 
 
+def test_a_call_has_the_arguments_of_its_submission(fresh):
+    """A lens caches properties while its calls wait: loky's thread then failed to pickle its changing dictionary."""
+    waiting, argument = [processes.submit(time.sleep, 0.1) for _ in range(4)], {"face": 1}
+    counted = processes.submit(len, argument)
+    argument["cached"] = 2
+    assert counted.result() == 1 and all(work.done() for work in waiting)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="tells of memory in another way")
 def test_memory_that_is_freed_goes_back_when_asked_and_the_peak_is_that_of_the_process_itself():
     held = bytearray(400_000_000)  # here: getrusage in a process that is started now counts it, too
