@@ -37,7 +37,7 @@ FRONT_RATES = {  # learning rates of the front's parameters, per step
     "conic_constant": 0.02,  # chosen here, since the fronts of the paper are spheres
 }
 STAGE2_RATE = 2e-4  # learning rate (mm per step); chosen here, since the paper does not state it
-MAX_RAYS_PER_CONTROL_POINT = 8  # largest number of rays per control point and axis; saves rays on the coarsest net
+MAX_RAYS_PER_CONTROL_POINT = 8  # largest number of rays per control point along an axis; saves rays on the coarsest net
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Stage
 
 
 def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: Level | None) -> Iterator[Iterate]:
-    """Run or resume stage 1 on the net of `lens`: minimise `mean_square_miss` by heights and free front parameters."""
+    """Run or resume stage 1 on the net of `lens`: vary heights and free front parameters for the least miss."""
     n = min(task.knobs.rays, MAX_RAYS_PER_CONTROL_POINT * max(lens.back_net.shape))
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
@@ -116,7 +116,7 @@ def transport(task: Task, lens: Lens) -> Mapping:
 def tent_average(target: Tensor) -> Tensor:
     """Return what tent binning makes of a picture, constant in each pixel: the filter [1, 6, 1] / 8 along each axis.
 
-    Compared with the result, instead of the sharp picture, a perfect lens has merit zero.
+    Compared with this result, not with the sharp picture, the picture of a perfect lens has merit zero.
     """
     for _ in range(2):  # each pass filters one axis and transposes
         target = torch.nn.functional.pad(target, (1, 1))

@@ -13,8 +13,8 @@ The picture for display is the mean of all sets, smoothed as long as this remove
 (tubes.py) give a second picture without noise, the witness; rays and tubes share only the trace.  Tubes interpolate
 linearly between their corners: with two tubes per side of a cell of the net the error is about the RRMSD that remains
 after tailoring with tubes, with four a third of this error, with eight a tenth (measured).  The tubes are therefore
-halved in width until the pictures agree, or until the error of the tubes cannot explain the difference.  The RRMSD by
-tubes (`rrmsd_by_tubes`) is a few per cent too low for a lens tailored with them.  A ghost is traced once, for all sets.
+halved in width until the pictures agree, or until their error cannot explain the difference.  `rrmsd_by_tubes` is a
+few per cent too low for a lens tailored with tubes.  A ghost (light reflected twice in a lens) is traced once.
 
 An extended source forms an image of itself through each point of the lens (`ImageSamples`).  All rays through one point
 of the back meet the same slope, whichever source point they come from: no lens can unite them in one point.
@@ -55,7 +55,7 @@ SIDE_EXPONENT = 0.5
 RAYS_PER_POINT = 1 << 13  # rays of each set per point of an extended source
 MIN_SOURCE_POINTS, MAX_SOURCE_POINTS = 8, 1024  # limits of the number of source points of each set
 MIN_TUBES = 513  # minimum tubes per side (`tubes_of`): fewer do not resolve pixels
-COARSE_SHEET = 64  # tubes per side of the coarse sheet if over_the_back; interpolation misplaces 1e-6 of the light
+COARSE_SHEET = 64  # tubes per side of the coarse sheet over the back; interpolation from it misplaces 1e-6 of the light
 PASS_SEEDS = 1 << 20  # difference between the seeds of successive passes of rays from an extended source
 GHOST_DIVISOR = 4  # rays per side divided by those of the ghost, which is about a thousandth of the light
 IMAGE_POINTS_PER_SIDE = 48  # points per side of the back face through which the image of the source is computed
@@ -75,7 +75,7 @@ class Effort:
     points: int = 1 << 17  # points per face at which the written file is compared with the design
     accuracy: float = 0.005  # relative standard error of the RRMSD at which tracing ends; 0: all rays are traced
     seconds: float = math.inf  # time limit (s): no sets of rays are started that would end later
-    witness: bool = True  # True: flux tubes give a second picture, if the source has no extent
+    witness: bool = True  # True: flux tubes give a second picture, except in the cases of `Light.witness`
 
 
 FULL = Effort()
@@ -253,13 +253,13 @@ def _value(rays: _Rays, target: Tensor) -> tuple[float, float]:
 def squared_distance(pictures: Sequence[Tensor], other: Tensor) -> tuple[float, float]:
     """Return (|A - other|² / |other|², its standard error), unbiased, from independent noisy pictures A_i of A.
 
-    U = mean over i ≠ j of p_ij = d_i · d_j, d_i = A_i - other.  With M sets and Hoeffding's p_ij = U + a_i + a_j + e_ij
+    U = mean over i ≠ j of p_ij = d_i · d_j / |other|², d_i = A_i - other.  With M pictures and Hoeffding's terms p_ij =
+    U + a_i + a_j + e_ij the variance of U is σ² = 4 σ_a² / M + 2 σ_e² / (M (M - 1)).
 
-        σ² = 4 σ_a² / M + 2 σ_e² / (M (M - 1)).
-
-    The jackknife is 4 / M times the variance of the means of p_ij over j times ((M - 1) / (M - 2))².  Its second term
-    is 4 σ_e² / (M (M - 2)) (Efron and Stein 1981): twice too large where noise dominates, or by chance ten times too
-    small.  Therefore σ_e² is estimated from the M (M - 1) / 2 residuals e_ij, with M (M - 3) / 2 degrees of freedom.
+    The jackknife estimates σ² as 4 / M ((M - 1) / (M - 2))² times the variance over i of the mean of p_ij over j.  Its
+    second term, 4 σ_e² / (M (M - 2)) (Efron and Stein 1981), is twice too large, or by chance ten times too small.
+    Therefore this term is replaced, with σ_e² estimated from the M (M - 1) / 2 residuals e_ij, which have
+    M (M - 3) / 2 degrees of freedom.
     """
     differences = [(picture - other).reshape(-1) for picture in pictures]
     size, m = _squared(other), len(differences)
@@ -343,11 +343,11 @@ def _sample(setup: _Setup, effort: Effort, max_noise: float = math.inf) -> _Rays
 
 
 def _sample_source(setup: _Setup, effort: Effort, max_noise: float) -> _Rays:
-    """Trace rays from an extended source to the limits of `_sample`, from new source points in each set.
+    """Trace rays to the limits of `_sample`, in each set from new points of an extended source.
 
-    Each pixel receives few rays from each of many points, so that its variance falls as n^-2, as for random rays.  The
-    error of the RRMSD falls as n^-2, or faster where more rays come from more points (measured: n^-2.6).  Source and
-    picture are smooth, so that `max_noise` limits the error of the smoothed picture, not the noise of single pixels.
+    Each pixel gets few rays from each of many points: with n rays per side its variance falls as n^-2, as for random
+    rays.  The error of the RRMSD falls as n^-2, or faster where more rays come from more points (measured: n^-2.6).
+    Source and picture are smooth, so `max_noise` limits the error of the smoothed picture, not the noise of pixels.
     """
     pilot = max(effort.rays // PILOT_DIVISOR, min(effort.rays, 32))
     began, side, rays = time.perf_counter(), pilot if effort.accuracy else effort.rays, None
@@ -393,8 +393,8 @@ def _compare(
 ) -> Witness:
     """Compare pictures by independent sets of rays with pictures by tubes, whose number per side doubles from `first`.
 
-    The error of n tubes per side falls about as n^-1.6, so that it is less than half the change from the picture by n /
-    2 tubes.  If the pictures by tubes and by rays differ by more than twice this change, no finer tubes will agree.
+    The error of n tubes per side falls about as n^-1.6, so that it is less than half the change from the picture by
+    n / 2 tubes.  If the pictures by tubes and by rays differ by more than twice this change, no finer tubes will agree.
     """
 
     def change_from(fine: Tensor | None, coarse: Tensor | None) -> float:
@@ -460,7 +460,7 @@ class RayTubes:
 def tubes_picture(
     lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, over_the_back: bool = False
 ) -> Tensor:
-    """Return the flux in each pixel (rows, columns), as a fraction of the source's, by n x n tubes per channel."""
+    """Return the flux in each pixel as a fraction of the source's, by n x n tubes per channel; see `tubes.picture`."""
     few = COARSE_SHEET if over_the_back else tubes.SHEET_TUBES
     lights = ((c.source, c.through(lens)) for c in channels)
     pictures = (tubes.picture(*light, screen, n, few=few, over_the_back=over_the_back) for light in lights)

@@ -1,8 +1,8 @@
 """Media: complex refractive index n + ik of the materials of lenses and mirrors, as a function of wavelength.
 
-A material is one of MEDIA, any page of refractiveindex.info as "shelf/book/page", or a glass by its name in the maker's
-catalogue, "N-LAK33A".  n is relative to air, near room temperature.  n and k are known in the wavelength ranges of
-their pages, which may differ, and are not extrapolated outside.
+A material is one of MEDIA (mirrors: also METALS), any page of refractiveindex.info as "shelf/book/page", or a glass by
+its name in the maker's catalogue, "N-LAK33A".  n is relative to air, near room temperature.  n and k are known in the
+wavelength ranges of their pages, which may differ, and are not extrapolated outside.
 
     k is the extinction coefficient: over a path s, flux falls to the fraction exp(-a s), a = 4 π k / λ   (Beer-Lambert)
 
@@ -126,11 +126,11 @@ def find(name: str) -> str | None:
     if len(wanted) == 1:
         named = [page for page in named if page.startswith(f"{MAKERS_SHELF}/")]
     if len(named) > 1:
-        raise ValueError(f"{name!r} is the name of {_list_pages(named)}; give one of them")
+        raise ValueError(f"{name!r} is the name of {_list_pages(named)}; give one of them in full")
     if not named and len(wanted) < 3:
         inside = [page for page in known if _matches(page.split("/")[:2], wanted)]
         if inside:
-            raise ValueError(f"{name!r} contains {_list_pages(inside)}; give one of them")
+            raise ValueError(f"the book {name!r} contains {_list_pages(inside)}; give the full name of a page")
     return named[0] if named else None
 
 
@@ -225,7 +225,7 @@ _MEDIA, _METALS = _by_name(MEDIA), _by_name(METALS)
 
 
 def medium(material: str) -> Medium:
-    """Return the transparent medium of this name; ValueError for a metal, or with names to choose from for none."""
+    """Return the transparent medium of this name; ValueError for a metal or an unknown name."""
     if normalise_name(material) in _METALS:
         raise ValueError(f"{material!r} is a metal, which transmits no light; choose a medium such as 'PMMA'")
     return _MEDIA.get(normalise_name(material)) or _page(material, MEDIA)

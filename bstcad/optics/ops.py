@@ -1,10 +1,10 @@
 """Registry of the functions of optics that have a kernel, by device.
 
-A kernel returns the values of its plain form to rounding and accepts the same tensors.  The caller requests it by name
-and runs the plain form where there is none, as on a GPU.  A kernel for a GPU is one more entry in the row of its
-function.  On every device some computations run on the CPU: the blur by the image of a source, stage 1's transport,
-the map between two faces, the bounds and checks of a net's shape, and the rays by which a design is verified.  The
-cosine transform of stage 2 is scipy's on the CPU and a product of matrices elsewhere.
+A kernel returns the values of the plain form (torch code) of its function to rounding and accepts the same tensors.
+The caller requests it by name and runs the plain form where there is none, as on a GPU.  A kernel for a GPU is one more
+entry in the row of its function.  On every device some computations run on the CPU: the blur by the image of a source,
+stage 1's transport, the map between two faces, the bounds and checks of a net's shape, and the rays by which a design
+is verified.  The cosine transform of stage 2 is scipy's on the CPU and a product of matrices elsewhere.
 """
 
 from __future__ import annotations

@@ -160,7 +160,7 @@ class Point(Emitter):
 
         gaussian: 2 / (π w²) exp(-2 r² / w²).  lambertian: I = cos θ / (π sin² θ_max) and E = I cos θ / d², so
         E = D² / (π sin² θ_max d⁴), D and d the distances of plane and (x, y, z) from the source.  uniform:
-        I = 1 / (2π (1 - cos θ_max)), E = I D / d³.  The last two are zero beyond θ_max.
+        I = 1 / (2π (1 - cos θ_max)), E = I D / d³.  The last two are zero beyond θ_max, the half angle `edge`.
         """
         distance = abs(z - self.position[2])
         if self.tilted:
@@ -180,7 +180,7 @@ class Point(Emitter):
 
     @property
     def _spread(self) -> float:
-        """Width of a gaussian profile relative to the distance: tan(half_angle_1e2)."""
+        """1/e² radius of a gaussian profile divided by the distance: tan(half_angle_1e2)."""
         assert self.half_angle_1e2 is not None  # a gaussian profile needs it (`widths`)
         return math.tan(math.radians(self.half_angle_1e2))
 
@@ -200,7 +200,7 @@ class Point(Emitter):
         return sense * n[0], sense * n[1], n[2]
 
     def _tilted_irradiance(self, x: Tensor, y: Tensor, distance: float, axis: Vector) -> Tensor:
-        """Return E of a tilted source with axis n at (x, y) from its projection onto a plane at distance D.
+        """Return E of a tilted source with axis n on a plane at distance D, at (x, y) (mm) relative to the source.
 
         E = I(θ) D / d³, and zero where c = n · (x, y, D) = d cos θ <= 0.  lambertian: I = cos θ / (π sin² θ_max),
         E = D c / (π sin² θ_max d⁴); uniform: I is constant; both are zero where cos θ < cos θ_max.  gaussian: on planes

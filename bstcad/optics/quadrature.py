@@ -22,7 +22,7 @@ GAUSS_POINTS_PER_PART = 3  # Gauss points in each part of a chord or of an edge
 FINE_NET = 400  # smallest number of control points per side at which FINE_POINTS give the area to 1e-9
 FINE_POINTS = 2  # Gauss points in each part of a chord or of an edge of a net of at least FINE_NET points per side
 CHORD_POINTS = 96  # Gauss points of a chord over a smooth face; exact to rounding on a sphere to 0.95 of its radius
-END_PARTS = 12  # minimum parts of an end span, where h(x) is not a polynomial; gives volumes to 1e-12
+END_PARTS = 12  # minimum number of parts of an end span, where heights are not polynomial; gives volumes to 1e-12
 BORDER_POINTS_PER_STRIP = 512  # border points evaluated at a time
 MIN_RELATIVE_DX = 1e-14  # |dx| / ds up to which border points are left out, since they add nothing
 EDGE_PARTS = 256  # minimum number of parts of an edge's curve
@@ -58,7 +58,7 @@ class Sums:
 
 
 def of_face(face: Surface, border: Border, raised: float = 0.0) -> Sums:
-    """Integrate over z = h(x, y) + raised inside a border, n dA = (-h_x, -h_y, 1) dx dy; float64 on the CPU.
+    """Return the sums over z = h(x, y) + raised (mm) inside a border, n dA = (-h_x, -h_y, 1) dx dy; face: in float64.
 
     ∫∫ g dx dy = -∮ G dx with G = ∫ g dy along a chord of constant x from y = 0 to the border; two Gauss quadratures.
     """
@@ -71,7 +71,7 @@ def of_face(face: Surface, border: Border, raised: float = 0.0) -> Sums:
 
 
 def of_wall(face: Surface, border: Border, raised: float = 0.0) -> Sums:
-    """Integrate over the wall along z from the plane z = 0 to the rim z = h + raised of a face, n pointing outwards."""
+    """Return the sums over the wall from the plane z = 0 up to the rim z = h + raised (mm) of a face, n outwards."""
     h = face.relative_sag_and_slope(torch.from_numpy(border.x), torch.from_numpy(border.y))[0].numpy() + raised
     cone = h * (border.x * border.dy - border.y * border.dx)  # r·n ds, times the wall's height
     return Sums(float((border.ds * h).sum()), float(cone.sum()) / 3, _moment(cone, border.x, border.y, h / 2))
@@ -166,7 +166,7 @@ def _points(face: BSplineSurface) -> int:
 
 
 def _smooth_parts(face: BSplineSurface, axis: int, parts: int) -> np.ndarray:
-    """Return breaks (mm) along an axis of a net: knots and divisions, between which heights are nearly polynomial."""
+    """Return breaks (mm) that divide an axis of a net into at least `parts` parts of nearly polynomial heights."""
     (first, last), pitch = (face.x, face.y)[axis], face.pitch[axis]
     lines = np.concatenate([[first], first + pitch * (np.arange(1, face.shape[axis] - 2) + 0.5), [last]])
     ends = [np.linspace(low, high, END_PARTS + 1) for low, high in (lines[:2], lines[-2:])]
@@ -195,7 +195,7 @@ class MassProperties:
 
 
 def of_lens(lens: Lens) -> MassProperties:
-    """Return the properties of a bare lens to 1e-9; OCC needs minutes for a large net and has errors of 1e-5."""
+    """Return the properties of a bare lens to 1e-9; OpenCASCADE needs minutes for a large net, with errors of 1e-5."""
     lens, total = lens.plain(), Sums()
     z_ref = lens.front.z  # origin of z in the sums: a near one limits rounding
     for face, sign in ((lens.back, 1), (lens.front, -1)):

@@ -36,10 +36,10 @@ def largest_deflection(index: float, grazing: float = MAX_EXIT_ANGLE) -> float:
 
 
 def grazing_of(index: float, others: Iterable[float], spread: float = 0.0) -> float:
-    """Return the largest exit angle (rad), at most MAX_EXIT_ANGLE, at which no other light is totally reflected.
+    """Return the exit angle (rad) of a ray up to which no other light at the same point exceeds MAX_EXIT_ANGLE.
 
-    others: relative indices at the other wavelengths; the largest index reaches its critical angle first.  spread:
-    largest angle (rad) in the glass between a ray and the other rays that meet the face at the same point.
+    index, others: relative indices at its wavelength and at the others; the largest reaches its critical angle first.
+    spread: largest angle (rad) in the glass between a ray and the other rays that meet the face at the same point.
     """
     largest = math.asin(math.sin(MAX_EXIT_ANGLE) / max((index, *others)))  # incidence at the wavelength deflected most
     return math.asin(index * math.sin(max(largest - spread, 0.0)))
@@ -78,8 +78,8 @@ def slopes_towards(at_face: Rays, out: Tensor, law: Law) -> tuple[Tensor, Tensor
     """Return the slopes (∂z/∂x, ∂z/∂y) that deflect each ray into the direction d' of `out`, unit vectors (3, …).
 
     By the laws of refraction and reflection the normal (-z_x, -z_y, 1) is parallel to ±(η d - d') (`normal_towards`).
-    If no face can deflect a ray so far, the slope deflects it towards the same side by the largest angle, that of a ray
-    which meets or leaves the face at MAX_EXIT_ANGLE.  No slope is steeper than MAX_SLOPE.
+    If no face can deflect a ray by so large an angle, the slope deflects it to the same side by the largest: that of a
+    ray which meets or leaves the face at MAX_EXIT_ANGLE.  No slope is steeper than MAX_SLOPE.
     """
     d = at_face.direction
     along = dot(d, out)
@@ -124,7 +124,7 @@ def reach_margin(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing:
     """Return the margin of each ray (a cosine) to the limits of the face; negative: the aim is out of reach.
 
     Minimum of three: d · d' minus the cosine of the largest deflection (not for a mirror); n_z - |(n_x, n_y)| /
-    MAX_SLOPE of `normal_towards`; and the cosine between the light and the receiver's normal away from the lens.
+    MAX_SLOPE of `normal_towards`; and the cosine of d' to the receiver's normal away from the lens.
     """
     _, out, along = directions(at_face, aim, plane)
     normal = normal_towards(at_face, out, law)

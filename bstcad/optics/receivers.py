@@ -106,7 +106,7 @@ class Receiver(ABC):
         return torch.stack([x - rays.position[0], y - rays.position[1], z - rays.above(0.0)])
 
     def clearance(self, outline: Outline, z: float) -> float:
-        """Return the least path (mm) along +z from an outline on the plane z to the receiver; -inf if a part misses."""
+        """Return the least path (mm) along +z from a rim on the plane z to the receiver; -inf if a rim point misses."""
         x, y = (torch.as_tensor(p, dtype=torch.float64) for p in outline.rim_points())
         along = torch.stack([torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)])
         start = torch.stack([x, y, torch.zeros_like(x)])
@@ -211,7 +211,7 @@ class PlaneReceiver(Receiver):
         return math.fsum(n * (p - c) for n, p, c in zip(self.frame[2], point, self.middle, strict=True))
 
     def clearance(self, outline: Outline, z: float) -> float:
-        """Return the smallest distance (mm) from an outline on the plane z to this plane; negative: they intersect."""
+        """Return the least distance (mm) of an outline on the plane z from this plane; negative: part is behind it."""
         return -self.height((0.0, 0.0, z)) - outline.reach(*self.frame[2][:2])
 
     def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:

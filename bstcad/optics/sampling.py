@@ -29,7 +29,7 @@ GOLDEN_RATIO, DRAW_SHIFT = 0.6180339887498949, 0.7548776662466927
 
 
 def grid(window: Rectangle, sides: Sides, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """Return x and y (mm) of the centres of equal cells, each (cells along x, cells along y); sides: their numbers."""
+    """Return x and y (mm), each (n_x, n_y), of the centres of n_x x n_y equal cells; sides: these numbers."""
     along_x, along_y = ((torch.arange(n, dtype=dtype) + 0.5) / n - 0.5 for n in as_pair(sides))
     x, y = torch.meshgrid(along_x * window.width, along_y * window.height, indexing="ij")
     return x.contiguous(), y.contiguous()
@@ -55,7 +55,7 @@ def hash_seed(seed: int) -> int:
 
 
 def jitter(key: int, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two numbers in (0, 1), multiples of 2^-33, for each cell: the upper and lower 32 bits of SplitMix64."""
+    """Return two numbers in (0, 1), from the upper and lower 32 bits of SplitMix64, for each cell; key: hashed seed."""
     bits = _mix(np.uint64(key) + cell.astype(np.uint64) * np.uint64(SPLITMIX_INCREMENT))
     upper, lower = ((half + 0.5) * 2.0**-32 for half in (bits >> np.uint64(32), bits & np.uint64(0xFFFFFFFF)))
     return upper, lower
@@ -80,8 +80,8 @@ def point_pairs(outline: Outline, pairs: int, draw: int = 0) -> list[tuple[float
     A golden lattice, a = (k + 1/2) / pairs and b = (k φ + shift) mod 1 for k = 0, 1, … (φ: GOLDEN_RATIO), covers one
     half: of a rectangle as (a, 2 b - 1), of a disc as the sunflower spiral r² = a, ψ = π b.  `draw` determines the
     shift.  For two or more pairs the second moments are made those of the outline, so that a point may lie outside a
-    rectangle by hundredths of its size.  32 points of a disc have 2/3 of the noise of 128 random ones at a hard edge,
-    1/5 at a soft one.
+    rectangle by hundredths of its size.  32 points of a disc have 2/3 of the noise of 128 random ones at a hard edge of
+    a picture, 1/5 at a soft one.
     """
     half_x, half_y = outline.half_extent
     lattice = [((k + 0.5) / pairs, (0.5 + draw * DRAW_SHIFT + k * GOLDEN_RATIO) % 1.0) for k in range(pairs)]

@@ -1,7 +1,7 @@
 """Ray tracing through the interfaces of a lens to a receiver, simulation of its irradiance, and ghosts.
 
-The trace is differentiable in all parameters.  The path in front of the first freeform interface does not change while
-a lens is tailored: `to_first_net` traces it once, and `from_first_net` traces the rest whenever the nets change.
+The trace is differentiable in all parameters.  Nets do not change the path in front of the first freeform interface:
+`to_first_net` traces it once, and `from_first_net` traces the rest whenever the nets change.
 
 A simulation traces stratified rays a strip at a time, so that memory does not grow with their number.
 
@@ -38,7 +38,7 @@ from bstcad.optics.receivers import Receiver
 from bstcad.optics.surfaces import Plane, Surface
 
 UNDERSIDE = "vignetted by the underside"  # line of the ledger: light that meets a front beside its optical part
-BLOCKED = "stopped beside a window or mirror"  # line of the ledger: light outside the outline of an element
+BLOCKED = "stopped beside a window or mirror"  # line of the ledger: light that misses an element behind the lens
 UNDERSIDE_CELLS = 256  # cells per side of the grid on which light that meets the underside is summed
 WINDOW_CELLS = 96  # cells per side of the grid that finds the light which reaches the lens through windows and mirrors
 MIN_RAYS_FOR_TABLE = 256  # minimum rays per side for which a table of the source's light is worth its cost

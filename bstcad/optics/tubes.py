@@ -76,8 +76,8 @@ def launch_tubes(source: Emitter, lens: Lens, n: int) -> Tubes:
     """Launch n x n tubes that carry all the light which both faces of the lens transmit.
 
     If the net has different numbers of control points along x and y, about n² tubes are launched, in the proportion of
-    its spans under the light.  The sheet covers the beam's cross-section if the lens transmits all of the beam, else
-    the back face; its rim is the rim of the light.  A partly lit tube spreads its flux over its whole area.
+    its spans under the light.  The sheet of tubes covers the beam's cross-section if the lens transmits all of the
+    beam, else the back face; its rim is the rim of the light.  A partly lit tube spreads its flux over its whole area.
     """
     sheet = _sheet(source, lens, n)
     flux: list[Tensor] = []
@@ -100,8 +100,8 @@ def picture(
 ) -> Tensor:
     """Return the flux in each pixel (rows, columns) by n x n tubes (`launch_tubes`), in bands to limit the memory.
 
-    few: tubes per side of the sheet from which finer sheets are interpolated, where the lens cuts the beam.
-    over_the_back: spread the tubes over the back face even where the lens does not cut the beam.  Pictures of lenses
+    few: tubes per side of the sheet from which finer sheets over the back face are interpolated.
+    over_the_back: spread the tubes over the back face even if the lens does not cut the beam.  Pictures of lenses
     that differ little then have similar errors, even if only some of them cut the beam.
     """
     sheet = _sheet(source, lens, n, few=few, over_the_back=over_the_back)

@@ -103,7 +103,7 @@ class BehindGlass(Receiver):
         From a point of the face the light goes along the unit vector s over the distance d to the receiver.  By Snell's
         law it comes along i, (i_x, i_y) = (s_x, s_y) / η, through glass of thickness t; the ray along i meets the face
         at a second point.  Newton's method makes the two points equal: as the first moves by 1, the second moves back
-        by k = t / (η d i_z) across the plane of incidence, and by k (s_z / i_z)² in it.
+        by k = t / (η d i_z) perpendicular to the plane of incidence, and by k (s_z / i_z)² in it.
         """
         below, direction = rays.above(self.z), self.rest.vector_to(rays, aim)
         point = rays.position - below / direction[2] * direction

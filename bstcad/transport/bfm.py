@@ -39,7 +39,7 @@ LINES_PER_BLOCK = 8  # lines transformed together: eight doubles fill a cache li
 MIN_CELLS = 32  # number of cells per side above which a coarser grid is solved first (`ladder`)
 FIRST_STEP = 1.0  # step length sigma on the coarsest grid; for uniform densities 1 is Newton's step
 MIN_FIRST_STEP = 0.25  # smallest initial sigma on a finer grid: noise lowers sigma at the end of a solve
-STEP_INCREASE, STEP_DECREASE, REFUSED_STEP_FACTOR = 1.25, 0.8, 0.5  # factors of sigma if a step is short, long, refused
+STEP_INCREASE, STEP_DECREASE, REFUSED_STEP_FACTOR = 1.25, 0.8, 0.5  # factors of sigma if too short, too long, refused
 MIN_GAIN_RATIO, MAX_GAIN_RATIO = 0.25, 0.75  # Armijo-Goldstein bounds of (gain of J) / (sigma |∇J|²)
 PLATEAU_TOLERANCE = 0.005  # relative decrease of the mass error below which the solve is on a plateau
 PLATEAU_ITERATIONS = 5  # number of iterations over which the decrease of the mass error is measured
@@ -124,8 +124,8 @@ class Poisson:
 class PoissonWithoutCheckerboard(Poisson):
     """Operator (-Δ)^-1 (1 - D_x D_y / 16), with the negative second differences D_x and D_y along the two axes.
 
-    It removes the checkerboard, for which D_x and D_y are nearly 4.  For a cosine along y, D_y is a number s_y and the
-    operator (1 + s_y²/16) / (D_x + s_y) - s_y/16, again one elimination.
+    It removes the checkerboard, for which D_x and D_y are nearly 4.  For a cosine along y, D_y is a number s_y, and
+    the operator is (1 + s_y²/16) / (D_x + s_y) - s_y/16, again one elimination.
     """
 
     def __init__(self, n: int):
@@ -198,7 +198,7 @@ class Transport:
 def back_and_forth(
     source: Density, target: Density, *, iterations: int = 40, tolerance: float = 1e-3, progress: Listener = None
 ) -> Transport:
-    """Return the potentials between two densities on one grid, solved on coarser grids first; densities may be zero.
+    """Return the potentials between two densities on one grid, solved on coarser grids first; cells may be zero.
 
     iterations: largest number of iterations on each grid.  tolerance: mass error at which the solve has converged.
     """

@@ -48,7 +48,7 @@ class Density:
     def from_picture(
         cls, picture: np.ndarray, n: int, *, width: float = 1.0, height: float = 1.0, floor: float = 0.0
     ) -> Density:
-        """Resample a grey picture by exact overlap areas of pixels and cells.
+        """Resample a grey picture to n x n cells, by exact overlap areas of pixels and cells.
 
         picture: (rows, columns), row 0 = y max, column 0 = x min.  Its pixels span width x height (any unit), centred
         in the square of the longer side, so that x and y have equal scales; the rest of the square is zero.
@@ -79,7 +79,7 @@ class Density:
 
 
 def _overlaps(n: int, pixels: int, extent: float) -> csr_array:
-    """Return the fractions (n, pixels) of n cells of [0, 1] that the pixels of a centred interval `extent` long cover.
+    """Return the fraction (n, pixels) of each of n cells of [0, 1] in each pixel of a centred interval `extent` long.
 
     The matrix is sparse, since the rounding of a product of dense matrices depends on the number of threads.
     """
@@ -89,7 +89,7 @@ def _overlaps(n: int, pixels: int, extent: float) -> csr_array:
 
 
 def _normalised(values: np.ndarray, cover: np.ndarray, floor: float, name: str) -> Density:
-    """Raise values to floor x (mean in the picture), scale to mean 1; cover: fraction of each cell in the picture."""
+    """Raise values to floor x (mean in the picture), then scale to mean 1; cover: part of each cell in the picture."""
     if values.ndim != 2 or values.shape[0] != values.shape[1] or values.shape[0] < 4:
         raise ValueError(f"{name}: has the shape {values.shape}; give an n x n grid with n >= 4")
     _check_values(values, name)

@@ -42,10 +42,10 @@ class Frame:
 
 @dataclass(frozen=True)
 class Mapping:
-    """The optimal map T and its inverse S = ∇v, stored as S at the pixel corners of the target.
+    """The optimal map T and its inverse S = ∇v (monge_ampere.py), stored as S at the pixel corners of the target.
 
-    S is bilinear inside a pixel; T(x), the y with S(y) = x, is found by iteration (`solve_point`).  T sends exactly the
-    flux of each tube into its pixel; T and S are inverse to rounding.  Points outside a frame are moved to its border.
+    S is bilinear inside a pixel, and T(x) is the solution y of S(y) = x, to rounding (`solve_point`).  T sends the flux
+    of a tube, the image of a pixel under S, exactly into this pixel.  Points outside a frame are moved to its border.
     """
 
     x: np.ndarray  # (n + 1, n + 1), x of S at pixel corners, cell units of the source frame
@@ -94,7 +94,7 @@ class TransportMap:
 
     @property
     def target(self) -> np.ndarray:
-        """Points (x, y) on the target plane, (c, r, 2), mm."""
+        """Points (x, y) on the target, (c, r, 2), in its receiver's unit."""
         return np.stack(np.meshgrid(self.x, self.y, indexing="ij"), axis=-1)
 
 

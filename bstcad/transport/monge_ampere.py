@@ -169,7 +169,7 @@ def _corners(phi, x, y):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
 def _flux(rho, x, y, out):
-    """Integrate rho over the signed area of each bilinear tube: up to 400² midpoints, at most half a cell apart."""
+    """Integrate rho over the signed area of each bilinear tube; midpoints half a cell apart or nearer, up to 400²."""
     n = out.shape[0]
     last = np.nextafter(n - 1.0, 0.0)
     for i in prange(n):

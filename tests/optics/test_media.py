@@ -133,7 +133,7 @@ class TestNames:
             ("PMNA", "did you mean 'PMMA'"),
             ("unobtainium", "choose one of PMMA, .* as 'shelf/book/page', or give the index itself"),
             ("specs/SCHOTT-optical/N-LAK33", "did you mean .*'specs/SCHOTT-optical/N-LAK33A'"),
-            ("main/SiO2", "'main/SiO2' contains 16 pages .*'main/SiO2/Malitson', .* and others; give one of them"),
+            ("main/SiO2", "'main/SiO2' contains 16 pages .*'main/SiO2/Malitson', .* and others; give the full name"),
             ("main/AgGaSe2/Boyd-o", "cannot be read"),
             ("x" * 100_000, "is not a known material"),
         ],
