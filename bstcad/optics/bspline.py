@@ -1,14 +1,14 @@
 """B-spline surface of Wang et al. 2023: order 3, uniform clamped knots, control points uniform in x and y.
 
-Only the heights z of the control points are free.  Because the points are uniform in x and y, x(t), in spacings of the
-points, is t + 1/2 in the inner spans and quadratic in the two end spans.  So t(x) has a closed form, no search for the
-parameter of a point is needed, and a height is the sum of nine products.
+Only the heights z of the control points are free.  Because the points are uniform in x and y, x as a function of the
+spline's parameter t is, in spacings of the points, t + 1/2 in the inner spans and quadratic in the two end spans.  So
+t(x) has a closed form, no search for the parameter of a point is needed, and a height is the sum of nine products.
 Source: Wang et al. 2023, "B-spline freeform surface tailoring for prescribed irradiance", Eqs. 2 and 6-13.
 
 A net has m control points along x and n along y.  The basis is written in u = (m - 1) (x - x_min) / (x_max - x_min),
 the distance along the net in control-point spacings, 0 <= u <= m - 1, and likewise in v along y.  In span (i, j) the
-surface is one biquadratic piece of nine control points, and s in [0, 1] is the position within it.  Slope and curvature
-are exact in each knot span, up to the knots on either side.  Second derivatives jump at the knots, so that their bounds
+surface is one biquadratic piece of nine control points, and s in [0, 1] is the position within it.  Slopes and
+curvatures follow from the exact derivatives of this piece.  Second derivatives jump at the knots, so that their bounds
 are computed for each span separately.
 """
 
@@ -64,7 +64,7 @@ def span(u: Tensor, m: int) -> tuple[Tensor, Tensor]:
 
 
 def position(t: Tensor, m: int) -> Tensor:
-    """Return u(t), inverse of `parameter`: 2t - t²/2 in the first span, its mirror image in the last, or t + 1/2."""
+    """Return u(t), inverse of `parameter`: 2t - t²/2 in the first span, mirrored in the last, and t + 1/2 between."""
     end = m - 2.0 - t
     return torch.where(t < 1, 2 * t - t * t / 2, torch.where(end < 1, m - 1 - 2 * end + end * end / 2, t + 0.5))
 
@@ -197,7 +197,7 @@ class BSplineSurface(Surface):
 
     @classmethod
     def from_control_points(cls, net: np.ndarray, z: float | None = None) -> BSplineSurface:
-        """Return the surface of a control net (m, n, 3) in mm; heights are measured from z (default: their mean)."""
+        """Return the surface of a control net (m, n, 3) in mm; heights are measured from z (default: mean z)."""
         z = float(net[..., 2].mean()) if z is None else z
         x, y = ((float(net[0, 0, i]), float(net[-1, -1, i])) for i in (0, 1))
         return cls(z, torch.from_numpy(net[..., 2] - z), x, y)
@@ -206,9 +206,9 @@ class BSplineSurface(Surface):
     def fitted(cls, surface: Surface, x: tuple[float, float], y: tuple[float, float], m: int) -> BSplineSurface:
         """Fit a net of m x m control points over x and y (mm) to a surface by least squares along each axis.
 
-        B^T B H C^T C = B^T Z C: Z are the surface's heights at four points per span along each axis, B and C the basis
-        along x and y.  The first and the last span are left out: x(t) is quadratic there, so that the error would fall
-        as the second power of the spacing instead of the third.  The outermost control points are extrapolated.
+        B^T B H C^T C = B^T Z C: H are the heights of the control points, Z those of the surface at four points per span
+        along each axis, B and C the basis along x and y.  The first and the last span, where x(t) is quadratic, would
+        reduce the order of the error from 3 to 2; they are left out, and the outermost control points extrapolated.
         """
         u = np.linspace(1.5, m - 2.5, 4 * (m - 4) + 1)
         basis = basis_matrix(u, m)[:, 1:-1]  # the first and the last control point act on the end spans only
@@ -222,7 +222,7 @@ class BSplineSurface(Surface):
 
     @property
     def detail(self) -> float:
-        """Width of the smooth pieces of the surface (mm): a knot span."""
+        """Width of the smooth pieces of the surface (mm): the smaller pitch, which is the width of a knot span."""
         return min(self.pitch)
 
     def from_vertex(self) -> BSplineSurface:
@@ -300,7 +300,7 @@ class BSplineSurface(Surface):
         return replace(self, heights=self.heights + curvature / 2 * (x[:, None] ** 2 + y[None, :] ** 2))
 
     def parameters(self) -> dict[str, float | Tensor]:
-        """Return the heights (mm)."""
+        """Return the heights of the control points (mm), by the name "heights"."""
         return {"heights": self.heights}
 
     def plain(self) -> BSplineSurface:
@@ -403,7 +403,7 @@ class Spans:
         )
 
     def _weights(self, index: Tensor, count: int, s: Sequence[float]) -> list[list[Tensor]]:
-        """Return [derivative][basis function] (positions, spans) of a basis of `count` functions."""
+        """Return `weights` by [derivative][basis function], each (len(s), spans); index: spans, count: m or n."""
         each = [weights(index, count, at) for at in s]
         return [[torch.stack([w[order][k] for w in each]).to(self.heights) for k in range(3)] for order in range(3)]
 

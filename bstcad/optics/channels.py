@@ -1,8 +1,8 @@
 """Channels: the light as a weighted sum of parts, each of which is traced separately.
 
 A channel is one sample point of the source at one wavelength, with the index of each medium at this wavelength.
-Irradiance, merit function and flux ledger are sums over channels, E = Σ_k w_k E_k with Σ_k w_k = 1.  A scene without an
-extended source and without a spectrum has one channel of weight 1.
+Irradiance and flux ledger are sums over channels, E = Σ_k w_k E_k with Σ_k w_k = 1; RRMSD is computed from the sum.
+A scene without an extended source and without a spectrum has one channel of weight 1.
 
 The sample points of an extended source are divided among its spectral lines: n points give about n channels.  In
 `channels_of` each line has at least two points, in pairs that are symmetric about the centre.
@@ -43,8 +43,8 @@ class Channel:
 def channels_of(source: Emitter, index: Callable[[float], float], points: int, draw: int = 0) -> tuple[Channel, ...]:
     """Return the channels of a source; index(nm) is the refractive index of the lens.
 
-    points: number of sample points of an extended source, at least two; draw: number of the point set.  A point or a
-    parallel beam of one wavelength gives one channel, whose source is `source` itself.
+    points: number of sample points of an extended source, all lines together, but at least two per line.  draw: number
+    of the point set.  A point or a parallel beam of one wavelength gives one channel, whose source is `source` itself.
     """
     extent = source.extent
     if extent is None:

@@ -19,7 +19,7 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, tilt_of
 
-WIDTHS_BEFORE_LENS = 4.0  # distance from lens to aperture of a rotated beam without z, in diagonals of its bounding box
+WIDTHS_BEFORE_LENS = 4.0  # distance from lens to aperture of a rotated beam without z, in diagonals of the aperture
 MAX_INCLINATION = 89.0  # limit of the angle between light and the axis of the lens, degrees
 
 
@@ -39,7 +39,7 @@ class Collimated(Emitter):
     radius_1e2: Annotated[
         float | None, Key("Radius at which a gaussian profile is 1/e² of its peak.", "mm", 1e-3, 1e6, example=8.0)
     ] = None
-    # None: the plane of the lens's first vertex; rays start at z = 0, or in front of a lens that reaches below z = 0
+    # None: the plane of the lens's first vertex; rays start at z = 0, or below if the front may reach it (`start`)
     z: Annotated[float | None, Key("Plane of the aperture, where rays start.", "mm", -1e8, 1e8, example=0.0)] = None
     centre: Annotated[
         tuple[float, float] | None, Key("Centre of aperture and profile.", "mm", -1e8, 1e8, example=[2.0, 0.0])
@@ -86,7 +86,7 @@ class Collimated(Emitter):
         """Return the simple beam after a motion; entrance: z of the plane through the first vertex (mm).
 
         The aperture keeps its size in a plane z = const when the light is rotated, so the beam gets too narrow across
-        its direction: light along z, rotated by θ, by the factor cos θ, or 1.5e-6 of its size at 0.1 degrees.
+        its direction.  If light along z is rotated by θ, the factor is cos θ: at 0.1 degrees, 1.5e-6 less than 1.
         """
         if not (motion.rotates or self.tilted):  # light along z has the same irradiance on all planes
             x, y = (p + d for p, d in zip(self.centre or (0.0, 0.0), motion.shift, strict=False))

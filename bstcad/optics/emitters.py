@@ -49,7 +49,7 @@ class Emitter(ABC):
     lumens: float | None = None  # total flux, lm; None: not stated, so that fluxes are relative
     tilt: tuple[float, float] | None = None  # rotation of the axis about x, then y (degrees); None: not tilted
     profile: str = "own"  # name of the distribution of the light
-    size_key: str | None = None  # scene key of the size; the real lamp's has the prefix real_; None: no size
+    size_key: str | None = None  # scene key of the size; the key for the real lamp has the prefix real_; None: no size
     kind: str = "own"  # name of the kind of source
     parallel: bool = False  # True if the light of each point of the extent is parallel
     simple_name: str = "a source without size"  # name of the source without its extent
@@ -86,7 +86,7 @@ class Emitter(ABC):
 
     @abstractmethod
     def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
-        """Return rays through (x, y) of the plane z (mm), each with the flux of a cell of the plane of `area` (mm²)."""
+        """Return rays through (x, y) of the plane z (mm), each with the flux of a cell of `area` (mm²)."""
 
     @abstractmethod
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
@@ -142,7 +142,7 @@ class Emitter(ABC):
 
     @property
     def is_rotation_invariant(self) -> bool:
-        """True if a rotation about its axis leaves the light unchanged; if not, `moved` cannot apply such rotations."""
+        """True if a rotation about the source's axis leaves the light unchanged; else `moved` does not apply it."""
         return False
 
     @property
@@ -155,7 +155,7 @@ class Emitter(ABC):
         return None
 
     def moved_away(self, by: float, about: Vector) -> Emitter | None:
-        """Return the simple source with its distance from `about` larger by the fraction `by`; None: no position."""
+        """Return the source with its distance from `about` (mm) larger by the fraction `by`; None: no position."""
         return None
 
     @property

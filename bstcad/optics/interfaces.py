@@ -179,7 +179,7 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
 
     F(s) = z(s) - sag(x(s), y(s)) = 0.  The root is found without gradient; then one differentiable Newton step,
     s = s* - F(s*) / F'(s*) with constant F', adds the implicit gradient ds = -dF / F' (Wang, C. 2022 after Griewank).
-    The path s is measured from the surface's base plane.  It is then as short as the sag, so that neither a distant
+    The path s is measured from the base plane z = surface.z.  It is then as short as the sag, so that neither a distant
     source nor a scene far from its origin loses digits.
 
     Returns (rays at the surface, ∂z/∂x, ∂z/∂y there).

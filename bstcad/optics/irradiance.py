@@ -81,7 +81,7 @@ class Screen:
 
     @property
     def per_unit(self) -> tuple[float, float]:
-        """Columns and rows per unit of the receiver."""
+        """Columns and rows per unit of the receiver's coordinates."""
         return self.columns / (self.x[1] - self.x[0]), self.rows / (self.y[1] - self.y[0])
 
     @property

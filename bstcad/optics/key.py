@@ -17,9 +17,9 @@ class Key:
 
     meaning: str  # meaning, one sentence
     unit: str = ""  # unit; "": a pure number or a word
-    minimum: float | None = None  # lower end of the range; None: the field contains no number
-    maximum: float | None = None
-    example: Any = None  # example value of a key without a default, for reference and messages; None: no example
+    minimum: float | None = None  # lower end of the range; None: no range
+    maximum: float | None = None  # upper end of the range
+    example: Any = None  # example value, for the reference and for messages; None: no example
     remedy: str = ""  # advice for a number out of range; "": "choose a value in between"
     of_light: bool = False  # True for a limit on the light; a verdict on the light requires at least one such limit
 

@@ -41,7 +41,7 @@ class Lens:
     back: Surface  # upper surface, at larger z
     outline: Outline  # outline of front and back
     index: float  # refractive index at the design wavelength; unused for a first-surface mirror
-    reflects: bool = False  # True if a face reflects; if `own_passes` is None, True: MIRROR, False: LENS
+    reflects: bool = False  # True if a face reflects; without `own_passes` it selects MIRROR (True) or LENS (False)
     losses: LensLosses | None = None  # losses at its faces and in its glass; None: no losses
     clear: tuple[Outline, Outline] | None = None  # clear apertures (front, back); None: see `apertures`
     before: tuple[Interface, ...] = ()  # interfaces before the solid, such as a window

@@ -63,7 +63,7 @@ def coated_reflectance(face: Transmission, coating: CoatingLayer, cos_in: Tensor
 
 
 def metal_reflectance(index: complex, cos_in: Tensor, polarisation: Polarisation = "none") -> Tensor:
-    """Return the reflectance R of a metal of complex index n + ik in air.
+    """Return the reflectance R of a metal of complex index n + ik, relative to the medium before it.
 
     With a + ib = sqrt((n + ik)² - sin² θ):  R_s = ((a - cos θ)² + b²) / ((a + cos θ)² + b²),
     R_p = R_s ((a cos θ - sin² θ)² + b² cos² θ) / ((a cos θ + sin² θ)² + b² cos² θ).
@@ -141,7 +141,7 @@ class CustomLoss:
 
     @property
     def in_glass(self) -> bool:
-        """True if the loss acts in the glass alone."""
+        """True if the loss acts on the path in the glass, False if at the faces."""
         return bool(getattr(self.loss, "in_glass", False))
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
@@ -159,7 +159,7 @@ class FresnelLoss:
 
     wavelength: float  # wavelength, nm
     polarisation: Polarisation = "none"
-    coating: CoatingLayer | None = None  # single layer on the face; None: uncoated
+    coating: CoatingLayer | None = None  # single layer on every refracting face; None: uncoated
     metal: complex | None = None  # n + ik of the mirror's metal; None: no mirror
 
     def of(self, interface: Interface, index: float = 1.0) -> Loss:
@@ -187,7 +187,7 @@ class Losses:
     def _at(self, k: int, interface: Interface, index: float) -> tuple[Loss, ...]:
         inside = (self.absorption,) if self.absorption and k > 0 else ()  # glass lies behind the first interface
         own = (loss for loss in self.own if k > 0 or not loss.in_glass)
-        return (*inside, *own, *((self.fresnel.of(interface, index),) if self.fresnel else ()))  # last: trace.ghost
+        return (*inside, *own, *((self.fresnel.of(interface, index),) if self.fresnel else ()))  # last, for trace.ghost
 
 
 def _amplitudes(n_in: float, n_out: float, cos_in: Tensor, cos_out: Tensor) -> tuple[Tensor, Tensor]:

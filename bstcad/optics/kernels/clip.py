@@ -9,14 +9,14 @@ so each edge is followed from pixel border to pixel border.  A piece of it adds 
 number, to all pixels below; a running sum down the columns completes the picture.  The two triangles beside an edge
 traverse it in opposite senses, so it is followed once, with the difference of their densities.  Some triangles are not
 followed: one that lies in one pixel or is too thin gives its flux to a pixel, and one outside the screen or with an
-invalid corner gives none.  Their edges get the density 0, so that they do not affect their neighbours.
+invalid corner gives none.  Along its edges the density of such a triangle is 0: only its neighbours count there.
 
 With L the merit function, G = ∂L/∂I and H(x, y) = ∫_y^∞ G dy, the adjoint needs for each edge Φ = ∫ H dx (for ∂L/∂A)
 and ∫ (1 - s) G ds, ∫ s G ds, s = 0 … 1 along the edge (an edge that moves by δ sweeps the area δ · n ds, n its normal).
 They are computed once for the two triangles beside the edge.
 
-All lengths are in pixels, x along columns, y down the rows.  Columns come first in the sums, as x does in a sheet of
-tubes: the rows of tubes of one part reach few columns.
+All lengths are in pixels, x across the columns, y down the rows.  Columns come first in the sums, as x does in a sheet
+of tubes: the rows of tubes of one part reach few columns.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ inlined = njit(forceinline=True, error_model="numpy")
 
 @inlined
 def pixel_at(x, y, columns, rows):
-    """Return (column, row, state) of a point; -1, `columns` and `rows` are the cells outside the screen."""
+    """Return (column, row, state) of a point; outside the screen, column is -1 or `columns`, or row is -1 or `rows`."""
     if 0.0 <= x < columns and 0.0 <= y < rows:
         return int(x), int(y), ON
     if not abs(x) + abs(y) < MAX_DISTANCE:

@@ -236,7 +236,7 @@ def _load_gradient(lands, g, more, first, count, work):
 def _cross_adjoint(
     net, faces, tilted, lands, position, direction, status, path, g, more, d_rays, first, last, own, touched
 ):
-    """Add to `own` (m, n) the gradient of Σ g · out of rays first … last - 1 in the net (see reductions.py).
+    """Add to `own` (m, n) the gradient of the merit in the net, from rays first … last - 1 (see reductions.py).
 
     g: gradient in `out` of `_cross`.  more: gradients in path and cosine of incidence (2, n), or (2, 0).  d_rays: None,
     or (6, n), which receives the gradient in positions and directions.
@@ -257,7 +257,7 @@ def _cross_adjoint(
 class Crossing(NamedTuple):
     """Parameters of a crossing besides the net and the rays."""
 
-    faces: Faces  # numbers of the face; the fields of the front are unused
+    faces: Faces  # face, and screen if rays land, as numbers; the fields of the front are unused
     tilted: TiltedScreen | None  # tilted screen; None: a level screen, or none
     lands: bool  # True if rays land on the screen, False if they go on behind the face
     lossy: bool  # True if the face has losses, which need path and angle of incidence
@@ -351,7 +351,7 @@ def _start_below_net(rays: Rays, interface: Interface) -> Rays:
     """Move the start of light along the axis to a plane in front of all of a net.
 
     The start of such a beam is arbitrary, and interfaces.intersect does not use it.  The kernels only find roots ahead
-    of the start, and would lose light where a deep net extends further.
+    of the start, and would lose light where a deep net extends in front of this start.
     """
     surface, sense = interface.net, rays.sense
     lowest = net_bounds(surface, torch.float64, sense).lowest

@@ -47,7 +47,7 @@ def cosines(offset, count, work):
 
 @njit(error_model="numpy")
 def refract(eta, reflected, count, work):
-    """Refract rays at the slopes in `work` by Snell's law: `interfaces.Refract`; reflected: status of blocked rays."""
+    """Refract rays at the slopes in `work` as `interfaces.Refract` does; reflected: status of blocked rays."""
     for r in range(count):
         p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
         dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
@@ -65,7 +65,7 @@ def refract(eta, reflected, count, work):
 
 @njit(error_model="numpy")
 def reflect(turned, count, work):
-    """Reflect rays at the slopes in `work`: `interfaces.Reflect`; turned: status of blocked rays."""
+    """Reflect rays at the slopes in `work` as `interfaces.Reflect` does; turned: status of blocked rays."""
     for r in range(count):
         p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
         dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
@@ -80,7 +80,7 @@ def reflect(turned, count, work):
 
 @njit(error_model="numpy")
 def first_root(net, faces, x, y, z, dx, dy, dz):
-    """Return (s, found): path (mm) of a ray steep to the net to its first crossing; z: height over the net's plane."""
+    """Return (s, found): path s (mm) of a steep ray to its first crossing; z: height over the net's plane."""
     last_u, last_v, floor = faces.m - 1.0, faces.n - 1.0, faces.rules.min_derivative
     u, v, u_s, v_s = (x - faces.x) * faces.per_x, (y - faces.y) * faces.per_y, dx * faces.per_x, dy * faces.per_y
     rate = abs(dz) + faces.steepest_x * abs(dx) + faces.steepest_y * abs(dy)
@@ -133,7 +133,7 @@ def to_net(faces, count, work):
 
 @njit(error_model="numpy", fastmath={"contract"})
 def search(net, faces, count, work, active):
-    """Find the path s from the net's plane to the back by Newton steps of all rays in turn: `interfaces._newton`.
+    """Find path s from the net's plane to the back by Newton steps of all rays in turn, as `interfaces._newton`.
 
     On return `work` contains s after a ray's last step, and sag and slopes (in u and v) before that step.
     """
@@ -183,7 +183,7 @@ def at_back(faces, count, work):
 
 @njit(error_model="numpy")
 def to_tilted(faces, tilted, count, work):
-    """Move rays from the back face to a tilted screen: `TiltedPlane.land`."""
+    """Move rays from the back face to a tilted screen, as `TiltedPlane.land` does."""
     grazing, turned = faces.rules.grazing, faces.fates.turned
     for r in range(count):
         dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
@@ -224,7 +224,7 @@ RAY_PARTS = 8  # number of partial sums of the rays; each has its own pictures, 
 
 @njit(error_model="numpy")
 def _points(cells, i, j, count, work):
-    """Store the points of cells (i, j), …, (i, j + count - 1): `sampling.stratified_strips`."""
+    """Store the points of cells (i, j), …, (i, j + count - 1), as `sampling.stratified_strips` does."""
     for r in range(count):
         z = cells.key + np.uint64(i * cells.n + j + r) * cells.stride
         z = (z ^ (z >> np.uint64(30))) * cells.mix_1
@@ -238,7 +238,7 @@ def _points(cells, i, j, count, work):
 
 @njit(error_model="numpy")
 def _launch(beam, count, work):
-    """Store flux density and direction of the rays through the points: `source.irradiance`, `source.rays`."""
+    """Store flux density and direction of the rays through the points, as `source.irradiance` and `source.rays` do."""
     for r in range(count):
         x, y = work[X + r] - beam.x, work[Y + r] - beam.y
         r2 = x * x + y * y
@@ -297,7 +297,7 @@ def _look_up(peak, table, count, work):
 
 @njit(error_model="numpy")
 def _meet_front(faces, axial, count, work):
-    """Move rays to the front: `interfaces.intersect` with `Conic.crossing`, or with the sag for rays along the axis."""
+    """Move rays to the front as `interfaces.intersect`: by `Conic.crossing`, or by the sag for rays along the axis."""
     c, conic, min_cos2 = faces.curvature, 1.0 + faces.conic_constant, faces.rules.min_cos2
     for r in range(count):
         x, y, dx, dy, dz = work[X + r], work[Y + r], work[DX + r], work[DY + r], work[DZ + r]
@@ -369,7 +369,7 @@ def _trace(net, beam, faces, tilted, losses, count, work, active):
 
 @njit(error_model="numpy")
 def _count(pixels, count, work, box, tent, lines):
-    """Add rays to box picture, tent picture and ledger: `irradiance.box`, `tent` and `ledger`."""
+    """Add rays to box picture, tent picture and ledger, as `irradiance.box`, `tent` and `ledger` do."""
     rows, columns = box.shape
     for r in range(count):
         f = work[FLUX + r]
@@ -416,7 +416,7 @@ def _share(table, cosine):
 
 @njit(error_model="numpy")
 def _dim(faces, losses, count, work, lines):
-    """Reduce the flux of each ray by its losses, and add these to the ledger: `interfaces.apply_losses`."""
+    """Reduce the flux of each ray by its losses, and add these to the ledger, as `interfaces.apply_losses` does."""
     for r in range(count):
         flux, fate = work[FLUX + r], work[FATE + r]
         if not flux > 0.0:
@@ -502,7 +502,7 @@ def _taken(lens: Lens) -> dict[str, int]:
 
 
 def _scenes(lights: Sequence[SeededLight], plane: Receiver, n: int) -> Iterator[tuple[Any, ...]]:
-    """Yield net, beam, faces, tilt of the screen, losses and cells of each light; equal lenses are converted once."""
+    """Yield the first six arguments of `_rows` for each light; successive equal lenses are converted once."""
     last: tuple[Lens, tuple[Any, ...]] | None = None
     for weight, source, lens, seed, window in lights:
         if last is None or not _is_same(lens, last[0]):
@@ -515,7 +515,7 @@ def _scenes(lights: Sequence[SeededLight], plane: Receiver, n: int) -> Iterator[
 
 
 def _is_same(one: Lens, other: Lens) -> bool:
-    """Return True if two lenses have the same surfaces, outlines, laws (so one wavelength) and losses."""
+    """Return True if two lenses have the same surfaces, outlines, laws (so the same indices) and losses."""
     return len(one.interfaces) == len(other.interfaces) and all(
         a.surface is b.surface and (a.outline, a.law, a.losses) == (b.outline, b.law, b.losses)
         for a, b in zip(one.interfaces, other.interfaces, strict=True)
@@ -525,7 +525,7 @@ def _is_same(one: Lens, other: Lens) -> bool:
 def land(source: Emitter, lens: Lens, plane: Receiver, x: Tensor, y: Tensor) -> Landed:
     """Trace rays through (x, y) of the first vertex's plane, each (n,) float64, to `plane`; flux: density at (x, y).
 
-    Equal to `trace.trace` of `source.rays(x, y, lens.entrance.z, 1.0)`, except for the status of rays without flux.
+    Equal to `trace.trace` of these `source.rays` without losses, except for the status of rays without flux.
     """
     scene = *_scene(source, lens, plane), NO_LOSS_TABLES
     landing, flux, fate = np.empty((2, x.numel())), np.empty(x.numel()), np.empty(x.numel(), np.uint8)
@@ -537,7 +537,7 @@ def land(source: Emitter, lens: Lens, plane: Receiver, x: Tensor, y: Tensor) -> 
 
 
 def _scene(source: Emitter, lens: Lens, plane: Receiver) -> tuple[Any, ...]:
-    """Return net, beam, faces and tilt of the screen for the kernels; light along -z is reflected by z -> -z."""
+    """Return net, beam, faces and tilted screen for the kernels; light along -z is reflected by z -> -z."""
     (*front, last), z = lens.interfaces, lens.entrance.z
     heights = last.net.heights
     faces = kernel_arguments.faces(last, plane, lens.passes.sense, z, *front)

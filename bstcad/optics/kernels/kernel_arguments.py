@@ -29,8 +29,8 @@ TABLE_SIDES = 65, 129, 257, 513  # control points per side of a table of light, 
 IRRADIANCE_TOLERANCE = 1e-5  # largest RMS of a table's relative error in the irradiance, far below errors of pictures
 MIN_IRRADIANCE = 1e-4  # fraction of the maximum irradiance that is added to the divisor of the relative error
 SLOPE_TOLERANCE = 1e-8  # largest RMS of a table's error in the slopes of rays
-PEAK_TO_RMS = 100.0  # largest error at a point of a table divided by the RMS tolerance: the outermost spans are worst
-MAX_LIGHT_TABLES = 16  # tables of light in the cache
+PEAK_TO_RMS = 100.0  # largest allowed error at a point of a table divided by the RMS tolerance: end spans are worst
+MAX_LIGHT_TABLES = 16  # maximum number of tables of light in the cache
 MAX_TABLE_ERROR_RATIO = 0.5  # largest ratio of a table's error to the coarser table's; larger: the light has an edge
 
 

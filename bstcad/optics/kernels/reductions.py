@@ -27,7 +27,7 @@ from bstcad.optics.kernels.compiling import compiled
 MAX_PARTS = 16  # maximum number of parts; a power of two, so that two, four or eight threads have equal work
 MIN_PART = 1 << 14  # minimum number of rays or tubes in a part
 ROW_LENGTH = 4096  # numbers summed by one thread
-ELEMENTARY = 1024  # numbers whose exp, sin or cos one thread computes: torch divides only 2048 or more
+ELEMENTARY = 1024  # numbers whose exp, sin or cos torch computes at once, by one thread: it divides only 2048 or more
 
 
 def parts(n: int) -> int:
@@ -119,7 +119,7 @@ def _merge(own, touched, out):
 
 
 def shares(n: int, block: int) -> list[tuple[int, int]]:
-    """Return (first, last + 1) of the rays of each part; each part consists of whole blocks."""
+    """Return (first, last + 1) of the rays of each part; all parts begin at multiples of `block`."""
     count, blocks = parts(n), -(-n // block)
     ends = [min(n, k * blocks // count * block) for k in range(count + 1)]
     return list(zip(ends, ends[1:], strict=False))

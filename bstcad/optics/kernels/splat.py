@@ -84,9 +84,9 @@ def _splat_adjoint(position, flux, frame, g, g_outside, d_position):
 
 
 class Splat(torch.autograd.Function):
-    """Map (position (2, n) mm, flux (n,), frame, shape) to (image (rows, columns), outside), as `irradiance.collect`.
+    """Map (position (2, n), flux (n,), frame, shape) to (image (rows, columns), outside), as `irradiance.collect`.
 
-    frame: x_min (mm), columns per mm, y_max (mm), rows per mm.  The gradient is taken in the position.
+    frame: x_min, columns per unit, y_max, rows per unit (of the receiver).  The gradient is taken in the position.
     """
 
     @staticmethod

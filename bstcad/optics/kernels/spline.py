@@ -201,7 +201,7 @@ class BSplineSag(torch.autograd.Function):
 Pair = tuple[np.ndarray, np.ndarray]
 Triple = tuple[float, float, float]
 QUANTITIES = 3  # number of quantities: concave curvature, convex curvature, |∇z|
-ROW_PARTS = 16  # parts of the rows of spans, one per task
+ROW_PARTS = 16  # parts into which the rows of spans are divided, one per task
 
 
 def largest_bending(
