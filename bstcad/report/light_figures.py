@@ -152,7 +152,7 @@ def rrmsd(target: np.ndarray, irradiance: np.ndarray) -> float:
 
 
 def brightest(target: np.ndarray, irradiance: np.ndarray) -> float:
-    """Return the end of a scale for both pictures: above the brightest pixel, but below the peak of a hot spot."""
+    """Return the end of a scale for both pictures: above their brightest pixel, but hot spots may exceed it."""
     peak = float(target.max())
     glare = min(float(irradiance.max()), MAX_GLARE * peak)
     return HEADROOM * max(peak, glare, float(np.percentile(irradiance, GLARE_PERCENTILE)))

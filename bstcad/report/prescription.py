@@ -54,7 +54,7 @@ EXACT_FACES = (  # sentence on a freeform back, and on two freeform faces
     "Both freeform faces are exact in lens.step, and their control points are in design.npz.",
 )
 SHEET, PART, LENS = "datasheet.pdf", "part.step", "lens.step"
-DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # mount.datum: plane z = 0
+DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # plane z = 0, by datum
 EDGE_TOLERANCE = 1e-3  # largest fraction of an outline's area outside the back's edge that counts as zero
 
 Point = tuple[float, float, float]

@@ -198,7 +198,7 @@ class Contents:
     # margin to total reflection (deg), smallest divisor in Newton's method, largest curvature (1/mm), non-finite values
     stability: Mapping[str, float | int | None] | None = None
     blur: Blur | None = None  # blur by the source's size; None: a point source or parallel light
-    finest_detail: FinestDetail | None = None  # width of a point of the picture on the target
+    finest_detail: FinestDetail | None = None  # finest detail on the target; None: no size of the source
     lines: tuple[LineFigures, ...] = ()  # lines of the spectrum; empty: the source has one wavelength
     picture: tuple[str, ...] = ()  # sentences on how a file was read: first of its pictures, transparency, tones, fit
     given_up: tuple[str, ...] = ()  # text of the remarks
@@ -366,8 +366,7 @@ def extent(source: Emitter) -> Iterator[tuple[str, str]]:
 
 
 # --- remarks ----------------------------------------------------------------------------------------------------------
-# A remark names a request of the scene that the design does not fulfil, with its figure, even if no check judges it.  A
-# lens may be exact to a nanometre and still lose light; a reader of "passed" should not have to search for that.
+# A remark states, with a figure, an unfulfilled request of the scene, a loss or a doubt, even if no check judges it.
 
 
 def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: Sequence[np.ndarray]) -> list[Remark]:
@@ -381,7 +380,7 @@ def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: 
 
 
 def too_steep(found: Steepness) -> list[str]:
-    """Return the remark on light that needs a face steeper than MAX_SLOPE_DEG (70°); empty if there is little of it."""
+    """Return the remark on light that needs a face steeper than MAX_SLOPE_DEG (70°); empty up to 0.1 % of it."""
     sent = {"steep_share": found.share, "steepest_deg": found.steepest}
     return [remark.text for remark in written("remarks.txt.j2", "steep", sent=sent)]
 

@@ -68,7 +68,7 @@ def quantity(value: float | bool | None, unit: str) -> str:
 
 
 def percent(part: float) -> str:
-    """Return a fraction in percent, rounded to 0 % or 100 % only if it is exactly 0 or 1."""
+    """Return a fraction in percent; 0 % and 100 % only if it is exactly 0 or 1."""
     if part in (0.0, 1.0):
         return f"{100 * part:g} %"
     distance = min(abs(part), abs(1.0 - part)) * 100.0
@@ -208,7 +208,7 @@ class Remark(NamedTuple):
 
     @property
     def topic(self) -> str:
-        """Name of the page for `bstcad docs`; empty: there is none."""
+        """Name of the section for `bstcad docs`; empty: there is none."""
         return self.id and f"remark-{self.id}"
 
 

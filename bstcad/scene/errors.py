@@ -27,10 +27,10 @@ NOT_BUILT = {  # unknown word for a feature that bstcad does not have yet: begin
 }
 # Patterns: key of a single target at the beginning of a sentence or inside it; key of one of several targets.
 THE_TARGET, ONE_TARGET = re.compile(r"^target(?=[.:])|(?<=\s)target(?=\.[a-z])"), re.compile(r"target\[\d+\]")
-SIMILARITY = 0.7  # smallest ratio of difflib at which a known word is proposed; for "ies" and "pixels" it is 0.67
+SIMILARITY = 0.7  # smallest ratio of difflib at which a known word is proposed; "ies" and "pixels" have 0.67
 
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")  # pydantic's errors for an unknown key
-SENTENCES = {  # sentence for each type of error of pydantic; {shown} is the value
+SENTENCES = {  # sentence by type of pydantic's error; {shown}: the value; {listed}, {example}: examples
     ("float_type", "float_parsing", "finite_number"): "{shown} is not a number; write one, without quotes",
     ("int_type", "int_parsing", "int_from_float", "int_parsing_size"): (
         "{shown} is not a whole number; write one, without quotes or a decimal point"

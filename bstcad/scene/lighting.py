@@ -79,7 +79,7 @@ def unlit_complaints(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator
 
 
 def doubts(source: Emitter, rim: Outline, key: str) -> Iterator[str]:
-    """Yield warnings about a parallel beam that is wider or much narrower than the lens; key: dotted key of the rim."""
+    """Yield warnings about a parallel beam that is wider or over 10 % narrower than the lens; key: key of the rim."""
     beam, _ = source.spot(0.0)
     if beam is None:  # without an edge
         return

@@ -22,7 +22,7 @@ from bstcad.scene.schema import COORDINATES, LENGTHS, Record
 
 MAX_DRAFT = 30.0  # degrees; largest draft angle of the walls of a lens
 MIN_WEB = 0.1  # mm; smallest width of material between a hole and any other edge
-LAND = 0.1  # height of the upright wall below the back's rim: mm, or for walls below 1 mm, fraction of their height
+LAND = 0.1  # height of the upright wall below the back's rim: 0.1 mm, or a tenth of a wall lower than 1 mm
 ITERATIONS = 60  # iterations for the end of a bevel or wall; on a front of slope 0.5 each at least halves the error
 MIN_CLOSING = 0.25  # smallest rate at which a bevel or a wall with draft nears the front (mm per mm of depth)
 MIN_CLEAR_APERTURE = 1e-3  # smallest clear aperture of the front after draft and bevel, as a fraction of the rim
@@ -206,8 +206,8 @@ class Mount(Record):
     def _inset(self, rim: Outline, front: Surface, top: float) -> float:
         """Return the largest distance (mm) by which draft and bevel move the edge of the front inwards.
 
-        From (p, top), p on the rim, a line of the wall goes down to the front, and inwards (direction m) by tan(draft)
-        per mm of depth.  The bevel cuts its end at 45°.  Both ends agree with cad.walls.LeaningPiece.ends.
+        From each point of the rim at z = top, a line of the wall goes down to the front, and inwards (direction m) by
+        tan(draft) per mm of depth.  A bevel at 45° replaces its lower end.  cad.walls.LeaningPiece.ends does the same.
         """
         (x, y), tangent = rim.rim_points(), math.tan(math.radians(self.draft))
         m_x, m_y = rim.inset_direction(x, y)

@@ -23,7 +23,7 @@ SIZE = 80.0  # default size of a plate, mm
 WIDTH_TO_THICKNESS = 10.0  # ratio of the width of a plate to its thickness
 MIN_THICKNESS = 3.0  # mm; smallest thickness of a plate
 RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # ranges of the options, mm
-BLUR_MARGIN = 1.1  # ratio of accept.rrmsd to the RRMSD of the blurred picture; standard quality stays well below it
+BLUR_MARGIN = 1.1  # accept.rrmsd divided by the RRMSD of the blurred picture; standard designs stay below this limit
 MIN_RRMSD, MAX_RRMSD = 0.05, 0.25  # smallest and largest accept.rrmsd of a new scene
 
 LIKE_THE_PHOTO = re.compile(r"(?:([^xX×]+)[xX×])?photo")  # size with the photo's proportions: "photo" or "120xphoto"
@@ -99,7 +99,7 @@ class Plate:
         return self.magnification * self.side / self.light.pixels
 
     def source_image(self, distance: float) -> float:
-        """Return the width of the source's image on a wall at L (mm): s L / before, or 2 L tan(s/2); s: source size."""
+        """Return the width (mm) of the source's image at distance L: s L / before, or 2 L tan(s/2); s: source size."""
         if self.before:
             return self.light.size * distance / self.before
         return 2 * distance * math.tan(math.radians(self.light.size / 2))

@@ -80,7 +80,7 @@ class Picture(FileContent):
 
 
 def safe_name(text: str) -> str:
-    """Return a file name of letters, digits, '.', '_' and '-' that does not start with '.'; it may be empty."""
+    """Return a file name of up to 80 letters, digits, '.', '_' and '-' that starts with no '.' or '-'; may be empty."""
     plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()  # é -> e
     name = re.sub(r"[^A-Za-z0-9._-]+", "-", plain.replace("\\", "/").rpartition("/")[2]).lstrip(".-")[:80].rstrip(".")
     return f"_{name}"[:80] if DEVICE.fullmatch(name) else name
@@ -237,7 +237,7 @@ class Photo:
     low: Image.Image | None = None  # second bytes of 16-bit colours; Pillow keeps only the first bytes
     white: float = 1.0  # pixel value of white, for files with neither 8 nor 16 bits
     other_curve: Curve | None = None  # other possible curve of a file of 16 bits or more that states none; else None
-    assumed: str = ""  # sentence on the assumed curve; "": none is assumed
+    assumed: str = ""  # INTEGERS or FLOATS, which state the assumed curve; "": none is assumed
     several: bool = False  # True if the file has further pictures
 
     def part(self, box: PixelBox) -> Photo:
@@ -315,7 +315,7 @@ class Photo:
 
 
 def strips(box: PixelBox) -> Iterator[PixelBox]:
-    """Yield the strips of a box of STRIP_ROWS rows each, from the top."""
+    """Divide a box into strips of STRIP_ROWS rows, the last of the remaining rows, and yield them from the top."""
     left, top, right, bottom = box
     return ((left, start, right, min(start + STRIP_ROWS, bottom)) for start in range(top, bottom, STRIP_ROWS))
 
@@ -327,8 +327,8 @@ def _as_floats(numbers: np.ndarray) -> np.ndarray:
 def photo(given: Picture | str, gamma: float | None = None, invert: bool = False) -> Photo:
     """Return the decoded picture of a file, or one of SAMPLES.
 
-    gamma: irradiance = (pixel value) ** gamma; None: as the file states.  Values of a sample are irradiance, as in the
-    paper and in other programs, for comparison.  invert: return the negative.
+    gamma: irradiance = (pixel value) ** gamma; None: as the file states, and 1 for a sample, as in the paper and in
+    other programs.  invert: return the negative.
     """
     if isinstance(given, str):
         from skimage import data  # loads much of scikit-image, needed for samples only

@@ -51,13 +51,13 @@ class Tailoring(Record):
     transport_iterations: Annotated[
         int | None, Key("Maximum number of iterations of the transport map.", "", 1, 100_000, example=100)
     ] = None
-    rays: Annotated[int | None, Key("Rays or flux tubes along each side of the light.", "", 16, 16_384)] = None
+    rays: Annotated[int | None, Key("Rays or flux tubes per side of their grid.", "", 16, 16_384)] = None
     stage1_iterations: Annotated[int | None, Key("Steps of method adam per net.", "", 0, 1_000_000, example=300)] = None
     rounds: Annotated[
         int | None, Key("Maximum number of rounds of transport map and slope fit in stage 1.", "", 1, 100, example=10)
     ] = None
     stage2_iterations: Annotated[
-        int | None, Key("Evaluations of the merit in stage 2 or 3.", "", 0, 1_000_000, example=120)
+        int | None, Key("Maximum number of evaluations of the merit in stage 2 or 3.", "", 0, 1_000_000, example=120)
     ] = None
     overshoot: Annotated[
         float | None, Key("Weight of light beside the target, per pixel² of distance.", "", 0.0, 1e3, example=0.03)
@@ -88,8 +88,8 @@ class Tailoring(Record):
     def resolved(self, net: Sides) -> ResolvedTailoring:
         """Return the settings with all values set; net: control points per side of the back, or along x and along y.
 
-        Levels of an oblong net are pairs, with cells in the same proportions.  Defaults: at least two rays per cell of
-        the net along x and along y (draft: √2); a map of at most twice the net's cells per side (paper: any map).
+        Levels of an oblong net are pairs, with cells in its proportions.  Defaults: at least two rays per cell of
+        the net along x and along y (draft: √2); a map of up to twice the net's cells, or COARSEST_GRID (paper: any).
         """
         levels = tuple(level if isinstance(level, tuple) else coarser(net, level) for level in self.levels or ())
         preset = dict(PRESETS[self.quality], levels=levels or coarse_to_fine(net))

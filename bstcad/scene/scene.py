@@ -274,7 +274,7 @@ class Scene(Record):
         """Return the lens before tailoring, with a flat net as its back.
 
         net: control points per side of the back's net, or (along x, along y).  A tailored front is a net too, flat or
-        as in its file; the ratio of its control points to the back's is that of the scene.
+        as in its file; its control points have the ratio to the back's that the scene states.
         as_wide_as: the finest net to which `net` will be refined (default: `net`), whose spans determine how far the
         nets extend past the rim.
         """

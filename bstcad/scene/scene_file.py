@@ -83,7 +83,7 @@ def check_plain(data: Any, key: str = "", depth: int = 0) -> None:
             check_plain(value, where, depth + 1)
     elif isinstance(data, int | float) and not abs(data) < 1e300:  # also NaN
         shown = data if isinstance(data, float) else "a number of more than 300 digits"  # too long to print
-        raise SceneError(f"{key}: {shown} is not a finite number; give a finite number")
+        raise SceneError(f"{key}: {shown} is not a finite number of magnitude below 1e300; give another number")
     elif isinstance(data, str) and not data.isascii() and any("\ud800" <= c <= "\udfff" for c in data):
         raise SceneError(f"{key}: the text has an incomplete character; write it again in UTF-8")
     elif not isinstance(data, str | int | float):

@@ -229,7 +229,7 @@ def rows(record: Node | None = None, table: str = "") -> list[Row]:
 
 
 def _union(union: list[Node], table: str) -> list[Row]:
-    """Return the keys of the tables that are possible at a key, each once, with the kinds of table that have it."""
+    """Return the keys of the tables that are possible at a key, each key once, with the kinds of table that have it."""
     if len(union) < 2:
         return [row for record in union for row in rows(record, table)]
     [name] = tags(union[0])

@@ -350,12 +350,13 @@ else:
 # ---- the drawn picture -----------------------------------------------------------------------------------------------
 
 
+# Keys that do not change the drawing, with the values that all targets have in the cache.
 IRRELEVANT = {"z": 0.0, "tilt": None, "weight": 1.0, "outline": None, "seen_from": "lens", "unreachable": "dark"}
 
 
 def drawing(target: Target) -> Drawing:
     """Return the irradiance of a target's picture per pixel, before its outline, and remarks on it."""
-    return _drawing(target.model_copy(update=IRRELEVANT))  # these keys do not change the drawing, which is cached
+    return _drawing(target.model_copy(update=IRRELEVANT))
 
 
 @functools.lru_cache(maxsize=4)  # a photograph takes half a second, and is needed for the check and for the design
