@@ -107,7 +107,8 @@ def choose_judges(names: Sequence[str | OwnJudge]) -> tuple[str | OwnJudge, ...]
         if not isinstance(name, str):
             continue
         if name not in JUDGES:
-            raise SceneError(f"--against: {name!r} is not a known program; {nearest(name, list(JUDGES), 'choose')}")
+            choices = nearest(name, list(JUDGES), "choose one of")
+            raise SceneError(f"--against: {name!r} is not a known program; {choices}")
         if importlib.util.find_spec(name) is None:
             raise MachineError(f"--against {name}: {name} is not installed; run pip install 'bstcad[judges]'")
     return tuple(dict.fromkeys(names))

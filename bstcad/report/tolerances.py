@@ -231,7 +231,7 @@ def errors(found: Tolerances) -> list[dict[str, Any]]:
 def _error(items: Sequence[Sensitivity], loosest: Mapping[str, float]) -> dict[str, Any]:
     first, part, change = items[0], *(math.fsum(getattr(i, key) for i in items) for key in ("share", "rrmsd_change"))
     waves = [item.wavefront_change for item in items if item.wavefront_change is not None]
-    words, loose = first.words.partition(" (draw")[0], [loosest[item.name] for item in items if item.name in loosest]
+    words, loose = first.words.partition(" (sample")[0], [loosest[item.name] for item in items if item.name in loosest]
     widest = WIDEST * math.hypot(*(item.limit for item in items))  # limit of the search
     at_least = "≥ " if math.isclose(math.hypot(*loose), widest) else ""
     return {
