@@ -87,7 +87,7 @@ def same_front(one: Surface, other: Surface) -> bool:
 # --- estimates of file sizes ------------------------------------------------------------------------------------------
 
 LARGE_STEP = 100e6  # smallest size of lens.step that is printed before a design (bytes)
-BYTES_PER_POINT = 83  # bytes of a control point's STEP statement and of a reference to it, without its number's digits
+BYTES_PER_POINT = 83  # bytes of a point's STEP statement and of one reference to it (#N), without the digits of N
 OTHER_BYTES = 103_000, 1600  # bytes of all other statements: constant part, and part per control point of a side
 
 
@@ -275,9 +275,9 @@ def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) 
     target_2, irradiance_2, reachable_2, and so on.  reachable (rows, columns) is 1 in the pixels that light can reach;
     it is absent if light can reach all bright pixels.
     Transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), the positions of c columns and r rows
-    of points on the target (mm), and transport_back or transport_entrance (c, r, 2), x and y (mm) where the light for
-    each of these points meets the last tailored face (the back; the front if only the front is tailored, or for a
-    mirror behind glass), or the plane z = const through the vertex of the first face.
+    of points on the target (unit of the receiver), and transport_back or transport_entrance (c, r, 2), x and y (mm) of
+    the light for each point: transport_back on the last tailored face (the back; the front if only the front is
+    tailored, or for a mirror behind glass), transport_entrance in the plane z = const of the first face's vertex.
     """
     lens, sent = design.lens, design.transport
     (m, n), front = lens.back_net.shape, lens.front

@@ -119,7 +119,7 @@ def reach_drawn(scene: Scene) -> tuple[bytes, ...]:
     if scene.lens.front.is_tailored:
         raise SceneError(
             "--png: draws the part of the target that light can reach through a tailored back, but in this scene the "
-            "front is tailored; omit --png; `bstcad generate` begins by stating which targets such a lens cannot light"
+            "front is tailored; omit --png"
         )
     images = []
     for alone in scene.single_target_scenes():
