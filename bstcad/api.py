@@ -45,7 +45,7 @@ from bstcad.tailoring.merit import PictureError
 from bstcad.tailoring.run import Hooks
 from bstcad.transport.mapping import TransportMap
 
-RELATIVE_TOLERANCE = 1e-9  # largest ignored difference: of two indices, relative; of the ends of nets, in net widths
+RELATIVE_TOLERANCE = 1e-9  # largest ignored difference of indices (relative) and of the ends of nets (in net widths)
 PREVIEW_TUBES = 521  # flux tubes per side of the light, for the picture of a design that is not verified yet
 AnyPath = str | os.PathLike[str]  # path of a file or of a folder
 
@@ -259,7 +259,7 @@ class Design:
         measured: file of points of a made part (CSV, PLY or STL; mm), which is also verified, see Report.measured.
         folder: folder for report, figures and deviation map of the made part; the design's folder is not changed.
         against: independent programs that also trace the design, "batoid" and "mitsuba", or your own judge
-        (bstcad.judges.comparison.OwnJudge).  These three need a written design.  effort, checks, sections: see `write`.
+        (bstcad.judges.comparison.OwnJudge).  measured, folder and against need a written design.  Others: see `write`.
         """
         options = ProofOptions(effort, checks=checks, sections=sections)
         cloud, place = (Path(path).expanduser() if path else None for path in (measured, folder))

@@ -223,10 +223,11 @@ def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tu
 
 
 def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | None]:
-    """Return (part, edge) of a goal: True in the pixels (rows, columns) that light can reach, and light at their edge.
+    """Return (part, edge) of a goal: part (rows, columns) is True in the pixels that light can reach.
 
-    scene: has no other goal.  (None, None): light can reach the whole picture, or the front is tailored.  edge is None
-    for a mirror.  SceneError if light reaches no part, or not the whole of a target with unreachable = "refuse".
+    scene: has no other goal.  edge: see `Edge`; None for a mirror.  (None, None): light can reach the whole picture, or
+    the front is tailored.  SceneError if the part has at most MIN_REACHABLE of the light, or, with unreachable =
+    "refuse", is not the whole target.
     """
     if scene.lens.front.is_tailored:  # with two tailored faces `with_solution` finds the limits
         return None, None
@@ -281,7 +282,7 @@ def check_front(lens: Lens, scene: Scene) -> None:
 
 
 def _with_comparison(making: DesignCourse, task: Task, lens: Lens, before: int) -> DesignCourse:
-    """Return the record with the comparison of precisions for the lens of stage 1, as stage number `before`, from 0."""
+    """Return the record with the comparison of precisions for the lens of stage 1, inserted after `before` stages."""
     began, cpu = time.perf_counter(), time.process_time()
     comparison = cast(PrecisionTest, asdict(compare_precisions(task, lens)))
     stage = StageRecord(COMPARISON_STAGE, time.perf_counter() - began, cpu_seconds=time.process_time() - cpu)

@@ -1,7 +1,7 @@
 """A job of the workbench in its own process: a design, or work on a finished design.  Closing the page does not end it.
 
-python -m bstcad.app.design_process FOLDER DESIGN [--resume] does the job of FOLDER/job.json.  The process writes into
-FOLDER what the page shows: the lines of progress, a picture of the light through the best lens so far, and the state.
+python -m bstcad.app.design_process FOLDER DESIGN [--resume] does the job of FOLDER/job.json for the design in the
+folder DESIGN.  The process writes into FOLDER what the page shows: progress, light of the best lens, and state.
 SIGINT ends a design with the best lens so far; SIGTERM ends it at once with a checkpoint.  After SIGTERM or SIGKILL,
 `--resume` continues to the same lens, to the last bit.
 """

@@ -21,7 +21,7 @@ from bstcad.scene.schema import TAGS, Node, records, rows, schema, tags
 if TYPE_CHECKING:
     import jinja2
 
-# Labels, by key, of the fields that most people change.  An entry is one field: for the key that is set, or the first.
+# Labels, by key, of the main fields.  Each entry gives one field: for its key that is set, or else for its first key.
 MAIN_FIELDS: tuple[Mapping[str, str], ...] = (
     {
         "target.image": "Picture: image file", "target.text": "Picture: letters", "target.sample": "Picture: sample",
@@ -75,7 +75,7 @@ ADDITIONS = {  # labels of buttons that add a table, by key
     "effects": "Add an effect (losses, ghosts)", "tolerance": "Add a tolerance",
 }  # fmt: skip
 LOCKED_SIDES = {"x": "y", "y": "x", "width": "height", "height": "width"}  # side: the other side, which a lock changes
-OPTIONAL_TABLES = ("mount",)  # tables that a button adds though no key is required
+OPTIONAL_TABLES = ("mount",)  # tables without a required key that a button adds; other such tables are always shown
 MAX_TABLES = 1000  # largest number of tables in a list, if the schema states no number
 MIN_STEPS = 100  # smallest number of steps of a slider
 STEP_DIGITS = (5, 2, 1)  # possible first digits of a slider's step; its other digits are 0

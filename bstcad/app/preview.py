@@ -55,7 +55,7 @@ class PreviewSize:
 
 
 QUICK = PreviewSize(pixels=72, net=180, tubes=240, rounds=2, evaluations=12, blurred=8)  # first preview
-REFINED = PreviewSize(pixels=128, net=320, tubes=384, rounds=4, evaluations=50, blurred=30)  # preview when idle
+REFINED = PreviewSize(pixels=128, net=320, tubes=384, rounds=4, evaluations=50, blurred=30)  # second, finer preview
 
 
 class Outdated(Exception):

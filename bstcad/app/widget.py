@@ -3,7 +3,7 @@
     bench = bstcad.workbench("my-lens.toml")   # shown by the cell
     design = bstcad.design(bench.scene)
 
-Widgets talk to the notebook's kernel, on whatever machine it runs; a page in a frame would need the local machine.
+Widgets work with a kernel on any machine; a page of the workbench's server would need a kernel on the local machine.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from bstcad.scene.schema import Node, records
 BARE = re.compile(r"[A-Za-z0-9_-]+")  # name that TOML allows without quotes
 MAX_DIGITS = 300  # largest length of a number (characters)
 SPACES = re.compile(r"(?<=\d)[ \u00a0\u2009\u202f'’_](?=\d{3}(?!\d))")  # separators of thousands, before three digits
-THOUSANDS = {mark: re.compile(rf"[+-]?\d{{1,3}}(\{mark}\d{{3}})+") for mark in ",."}  # integer, by separator
+THOUSANDS = {mark: re.compile(rf"[+-]?\d{{1,3}}(\{mark}\d{{3}})+") for mark in ",."}  # integer: 1.000.000, by separator
 DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")  # number with a decimal point
 BOOLEAN_WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 

@@ -213,8 +213,8 @@ class Workspace:
     def adopt(self, design: str, folder: Path, written: Path | None = None) -> str:
         """Write a new scene file for the scene in a folder, with the files that it names; return the scene's name.
 
-        written: file with the original text of the scene.  The new file is a copy of `written` or, if that describes
-        another scene, of the scene file with the design's name; otherwise, of the folder's scene.toml.
+        written: file with the original text of the scene.  The new file has the first of these texts that describes the
+        scene: `written`, the scene file with the design's name, the folder's scene.toml.
         """
         text = self._text(folder / "scene.toml")
         loaded = self._loaded(folder / "scene.toml", text)

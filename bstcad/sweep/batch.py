@@ -179,7 +179,7 @@ def _initial_entries(scenes: Sequence[BatchScene], folder: Path, earlier: Sequen
         name, key = each.scene.name, f"{folders.hash_of(folders.scene_files(each.scene))} {environment.version()}"
         row, reason = BatchEntry(scene=each.path, name=name, key=key), ""
         if same := path_of.get(name):
-            reason = f"name: {name!r} is also the name of {same}, but a folder contains one design; give another name"
+            reason = f"name: {name!r} is also the name of {same}, whose design has the same folder; give another name"
         path_of.setdefault(name, each.path)
         try:
             files.check_free(folder / name)

@@ -218,7 +218,7 @@ class ColdRun(StoredRecord):
     status: str  # DONE, FAILED or NOT_RUN
     reason: str = ""  # reason of the failure
     label: str = ""  # description, such as "Flux tubes per side: 768"
-    knobs: tuple[str, ...] = ()  # keys of the knobs with a point at these settings; "base" for the base scene
+    knobs: tuple[str, ...] = ()  # keys of the knobs (tradeoff.Knob) with these settings; "base": the base scene
     where: str = THIS_MACHINE  # "here", or the address of a worker; "": not run
     seconds: float | None = 0.0  # wall time of the whole command
     cpu_seconds: float | None = 0.0  # CPU time of the command and of all processes that it started
@@ -236,7 +236,7 @@ class ColdRun(StoredRecord):
     net: str = ""  # SHA-256 of the control nets; equal nets are equal lenses to the last bit
     stages: tuple[dict[str, Any], ...] = ()  # stages: name, seconds and rrmsd at the end (null: not measured)
     on_front: bool = False  # true if the run is on the Pareto front of the sweep
-    # not in tradeoff.json
+    # The following fields are not written to tradeoff.json.
     allowed_seconds: float | None = None  # time limit at which the run was stopped; null: the run ended by itself
     history: tuple[HistoryPoint, ...] = ()  # convergence curve of the run
     machine: dict[str, Any] = {}  # machine of the run

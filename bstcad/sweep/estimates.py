@@ -90,8 +90,8 @@ DEFAULT_DIAMETER = 0.1  # assumed diameter of a point source, mm
 DEFAULT_DIVERGENCE = 0.1  # assumed divergence of parallel light, degrees
 # Assumed sizes for each Emitter.size_key: (size, shape, unit).
 DEFAULT_SIZES = {"diameter": (DEFAULT_DIAMETER, "disc", "mm"), "divergence": (DEFAULT_DIVERGENCE, "cone", "degrees")}
-LINE_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # (offset / half width, weight), uniform line
-DISC_POINTS = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # (x, y in radii, weight) of a disc
+LINE_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # uniform line: (offset / half width, weight)
+DISC_POINTS = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # (x, y, weight) of a disc of radius 1
 FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"  # scene keys
 
 

@@ -39,7 +39,7 @@ MAX_SQUARE_ASPECT = 1.25  # largest aspect ratio of an outline with a square net
 # Factors (reduction of the RRMSD, increase of the time): a larger net that reduces less and takes longer is rejected.
 MIN_GAINS = ((1.25, 1.0), (2.0, 3.0))
 MEMORY_FRACTION = 0.8  # fraction of the machine's memory that a design may use
-DENSITY_TUBES = 256  # flux tubes per side for the flux density
+DENSITY_TUBES = 256  # flux tubes per side for the flux density at the back
 # Coefficients of the error bound (ControlCells.floor) of the net, and of a net with half as many cells per side.
 FLOOR_FACTOR, HALVED_FACTOR = 0.68, 0.43
 QUALITY_TERMS = {"draft": (1.5, 0.012), "standard": (1.0, 0.002), "fine": (0.7, 0.004)}  # (factor, offset) of the RRMSD
@@ -102,7 +102,7 @@ class Choice:
 
 
 def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
-    """Return (scene with a net, choice or None if it states net or levels).  SceneError: no light on the back."""
+    """Return (scene with a net, choice of the net; None if the scene states it).  SceneError: no light on the back."""
     if scene.lens.back.control_points is not None:
         return scene, None
     levels = scene.tailoring.levels

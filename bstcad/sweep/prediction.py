@@ -130,7 +130,7 @@ def replace_net(scene: Scene, net: Sides, changes: Mapping[str, object] = {}) ->
 
 
 def detail(picture: np.ndarray, pixels: int) -> float:
-    """Return the fraction of a picture's RMS in waves with over `pixels` half waves per length of its longer side."""
+    """Return the relative RMS of a picture's cosines with more than `pixels` half waves along its longer side."""
     from scipy.fft import dctn
 
     energy = dctn(picture, norm="ortho") ** 2
@@ -199,7 +199,7 @@ ADAM_SECONDS = 0.1  # time of a step of the paper's procedure
 START_SECONDS = 2.8  # time of the imports and of the end of the process
 WRITE_SECONDS, NET_SECONDS, PICTURE_SECONDS = 1.5, 2.4, 1.1  # time of writing: constant part, net, pixels
 MOUNT_SECONDS = 2.5  # time of cutting and verifying the mounted part
-RAY_SECONDS, DRAFT_RAY_SECONDS = 1.6, 1.0  # time to trace rays of parallel light, per target and line; else twice
+RAY_SECONDS, DRAFT_RAY_SECONDS = 1.6, 1.0  # time of rays of parallel light, per target and line; twice for other light
 WITNESS_SECONDS, DRAFT_WITNESS_SECONDS = 6.0, 2.5  # time to verify two nets with flux tubes, per target
 LIBRARIES_GB = 1.5  # memory of the libraries in both processes
 TUBES_GB, NET_GB, PIXELS_GB = 0.12, 0.27, 0.02  # memory of tubes, net and pixels

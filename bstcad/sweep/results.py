@@ -44,7 +44,7 @@ TRADEOFF_COLUMNS = (
     "knobs", "settings", "status", "seconds", "cpu_seconds", "kernel_seconds", "units", "rrmsd", "rrmsd_noise",
     "rrmsd_reported", "peak_memory_gb", "on_front", "predicted_seconds", "cost_seconds", "where", "reason",
 )  # fmt: skip
-PRIVATE_FIELDS = {"allowed_seconds", "history", "machine", "versions", "version"}  # not written: they are in RunFile
+PRIVATE_FIELDS = {"allowed_seconds", "history", "machine", "versions", "version"}  # fields of ColdRun in RunFile only
 
 
 class KnobPoint(StoredRecord):
