@@ -13,8 +13,8 @@ The picture for display is the mean of all sets, smoothed as long as this remove
 (tubes.py) give a second picture without noise, the witness; rays and tubes share only the trace.  Tubes interpolate
 linearly between their corners: with two tubes per side of a cell of the net the error is about the RRMSD that remains
 after tailoring with tubes, with four a third of this error, with eight a tenth (measured).  The tubes are therefore
-halved in width until the pictures agree, or until their error cannot explain the difference.  `rrmsd_by_tubes` is a
-few per cent too low for a lens tailored with tubes.  A ghost (light reflected twice in a lens) is traced once.
+halved in width until the pictures agree, or the error of the tubes cannot explain the difference.  `rrmsd_by_tubes` is
+a few per cent too low for a lens tailored with tubes.  A ghost (light reflected twice in a lens) is traced once.
 
 An extended source forms an image of itself through each point of the lens (`ImageSamples`).  All rays through one point
 of the back meet the same slope, whichever source point they come from: no lens can unite them in one point.

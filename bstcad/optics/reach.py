@@ -48,7 +48,7 @@ def grazing_of(index: float, others: Iterable[float], spread: float = 0.0) -> fl
 def spread_at(source: Emitter, lens: Lens) -> float:
     """Return half the angle (rad) that an extended source subtends in front of the last freeform face; 0 for a point.
 
-    It is the largest angle at the centre of the face between light from the centre of the source and from its edge.
+    It is the largest angle at the face's centre between light from the source's centre and from the ends of its axes.
     """
     if source.extent is None:
         return 0.0

@@ -250,10 +250,10 @@ class Conic(_Revolved):
 
 @dataclass(frozen=True)
 class Toroid(Surface):
-    """z = z0 + R - sqrt((R - f)² - y²), R = 1 / c_y, f = c_x x² / (1 + sqrt(1 - c_x² x²)); c_y = 0: z = z0 + f.
+    """z = z0 + R (1 - sqrt((1 - f / R)² - y² / R²)), R = 1 / c_y, f = c_x x² / (1 + sqrt(1 - c_x² x²)).
 
     It is the circle of curvature c_x in the plane y = 0, rotated about the line parallel to x at z = z0 + R (a toric
-    surface of ISO 10110-12).  With one curvature 0 it is a cylinder, with two equal ones a sphere.
+    surface of ISO 10110-12).  It is a cylinder if one curvature is 0 (c_y = 0: z = z0 + f), a sphere if both are equal.
     """
 
     z: float  # vertex (mm)
