@@ -19,7 +19,7 @@ from bstcad.runs.files import MachineError, SceneError, first_line
 
 CONNECTION_TIMEOUT = 30.0  # timeout (s) for the scheduler's answer, and for the first worker
 JOB_INTERVAL = 0.5  # time (s) between two checks for finished jobs
-RETRIES = 2  # number of retries of a job after an error of a worker
+RETRIES = 2  # number of retries of a job that raises an error on a worker
 MAX_WORKERS = 1000  # largest value of --workers
 THIS_MACHINE = "here"  # value of `Answer.where` for a job on this machine; for others, the address of the worker
 

@@ -1,8 +1,8 @@
 """Other processes: the second process, which runs OCC and draws figures, and bstcad commands as child processes.
 
-The second process loads OCC while the lens is still being tailored.  A damaged file that crashes OCC does not end the
-user's process.  The second process starts at the first `submit`, imports nothing of the user's script, serves all
-designs of a session, and ends after IDLE_TIMEOUT.  No process outlives its parent.
+The second process loads OCC (Open CASCADE, the CAD kernel) while the lens is still being tailored.  A damaged file that
+crashes OCC does not end the user's process.  The second process starts at the first `submit`, imports nothing of the
+user's script, serves all designs of a session, and ends after IDLE_TIMEOUT.  No process outlives its parent.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from bstcad.optics.outlines import inside
 from bstcad.optics.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 
-PENALTY_MARGIN = 0.01  # relative distance from a bound at which the penalty begins (thickness: relative to `unit`)
+PENALTY_MARGIN = 0.01  # relative distance from a bound at which the penalty begins (thickness: / unit of its excess)
 QUARTER_RIM_POINTS = 1025  # number of points along a quarter of the rim
 CELL_POINTS = 4  # control points per axis on which a cell may depend: it lies in at most two knot spans
 TILE_CELLS = 16  # number of cells per axis in a tile
@@ -34,7 +34,7 @@ CELL_ROUNDING = 1e-9  # allowance in the number of cells per axis, so that round
 
 
 def unit(lens: Lens, bounds: Bounds) -> float:
-    """Return max(thinnest, PENALTY_MARGIN |z_back - z_front|) (mm), the unit of the excess; 1 if this is 0.
+    """Return max(thinnest, PENALTY_MARGIN |z_back - z_front|) (mm), the unit of the excess in `clearance`; 1 if 0.
 
     The unit does not depend on the heights of the faces, and so does not contribute to the gradient.
     """
@@ -69,9 +69,9 @@ def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], flo
 
 
 def _points_near_bounds(lens: Lens, bounds: Bounds, margin: float) -> Iterator[tuple[Tensor, Tensor, float, float]]:
-    """Yield (x, y, weight of a point, minimum thickness), in mm, for points within `margin` of a bound and some others.
+    """Yield (x, y, weight of a point, minimum thickness) for points of a thickness near a bound, and some others.
 
-    The points along the rim come last; their weights sum to 1.
+    Near: within `margin` (mm).  The points along the rim come last; their weights sum to 1.
     """
     grid = CellGrid.over(lens)
     for x, y in grid.near(lens, bounds, margin):
@@ -82,7 +82,7 @@ def _points_near_bounds(lens: Lens, bounds: Bounds, margin: float) -> Iterator[t
 
 
 def _excess(lens: Lens, x: Tensor, y: Tensor, bounds: Bounds) -> tuple[Tensor, Tensor]:
-    """Return the excess (mm) of the thickness over the nearer bound, and 1 if that is the maximum, else -1."""
+    """Return the excess (mm) of the thickness over the nearer bound, and 1 for the maximum or -1 for the minimum."""
     front, back = (evaluate(net.heights, *net.along_net(x, y))[0] for net in (lens.front_net, lens.back_net))
     glass = (lens.back.z - lens.front.z) + back - front
     thin = bounds.thinnest - glass
@@ -117,7 +117,7 @@ class CellGrid:
         return math.prod(self.count) * len(QUARTERS) ** 2
 
     def near(self, lens: Lens, bounds: Bounds, margin: float) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield x and y (mm) of the points inside the outline in cells that may be within `margin` mm of a bound.
+        """Yield x, y (mm) of points inside the outline, in cells whose thickness may be within `margin` mm of a bound.
 
         Points up to half of a cell's diagonal outside the outline are included, so that the rim is covered.
         """
@@ -157,7 +157,7 @@ class CellGrid:
 
 
 def _tile_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: np.ufunc) -> np.ndarray:
-    """Return the lowest or highest control point (mm) of each tile; begins: first points of the cells, by axis."""
+    """Return the lowest or highest control point (mm) of each tile; begins: see `_first_points`."""
     for axis, begin in enumerate(begins):
         tiles = np.split(begin, range(TILE_CELLS, len(begin), TILE_CELLS))
         windows = [slice(tile[0], tile[-1] + CELL_POINTS) for tile in tiles]
@@ -167,7 +167,7 @@ def _tile_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: n
 
 
 def _cell_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: np.ufunc) -> np.ndarray:
-    """Return the lowest or highest control point (mm) of each cell; begins: first points of the cells, by axis."""
+    """Return the lowest or highest control point (mm) of each cell; begins: see `_first_points`."""
     for axis, begin in enumerate(begins):
         heights = np.moveaxis(heights, axis, 0)
         for step in (1, 2):  # extremes of two neighbouring control points, then of four

@@ -32,7 +32,7 @@ from bstcad.tailoring.two_faces import front_map
 from bstcad.transport.mapping import Solver
 
 TRIAL_CELLS, TRIAL_PIXELS = 64, 128  # transport grid of the trial (cells per side), pixels on the pictures' longer side
-TRIAL_ITERATIONS = 100  # iterations of the trial's maps
+TRIAL_ITERATIONS = 100  # largest number of iterations of the trial's map between two targets
 MAX_UNSERVED = 0.5  # largest fraction of the light whose rays may miss the back's aperture or cross each other
 REPORTED_FRACTION = 1e-3  # smallest reported fraction of light that misses the aperture or whose rays cross
 MAX_GENTLE_DEFLECTION = 30.0  # largest deflection at the front for which the furthest picture needs no floor (degrees)

@@ -46,12 +46,12 @@ from bstcad.tailoring.slope_map import centroid, pixel_corners, resample_picture
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Points, Solver, grid_coordinates, solve
 
-MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds; cells per side before the last one: max(n / 4, 64)
+MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds; max(n / 4, 64) cells per side before the last
 MAX_WAVE_ITERATIONS = 40  # largest number of iterations for the point of a wave that sends a ray to a given point
 WAVE_TOLERANCE = 1e-9  # change (mm) below which the iterations for a point of the wave have converged
 SOURCE_FLOOR = 0.02  # smallest irradiance of the map's source picture, relative to its mean: black would leave holes
 # Standard deviations (pixels) of the blur of the source picture; maps are computed in this order.  For a portrait with
-# dark parts beside bright ones, Newton's method ends at a mass error of 0.06 to 0.25 without, and at 0.003 with it.
+# dark parts beside bright ones, Newton's method ends at a mass error of 0.003, and without blur at 0.06 to 0.25.
 SOURCE_BLURS = (4.0, 2.0, 1.0)
 FINE_FACTOR = 2  # cells per side of the last map, relative to the transport grid: few cells light a thin letter
 # Solver with floors under the map's target picture, relative to its mean, used one after another
@@ -136,7 +136,7 @@ class LightBehind:
 
 
 def light_for_task(task: Task) -> LightBehind:
-    """Return the rays behind the lens for the nearest target and the wavefront, or the nearest and furthest target."""
+    """Return the rays behind the lens for the nearest target and the wavefront or, without one, the furthest target."""
     # twice, so that a single goal is both the nearest and the furthest
     near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.receiver.plane.throw(0.0))
     if any(goal.receiver.plane.frame is None for goal in (near, far)):
@@ -272,7 +272,7 @@ def without_crossings(light: LightBehind, screen: Screen, surface: Surface, n: i
 
 
 def _inverted(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return True for each inverted quad of a grid of points (m, n), (m - 1, n - 1)."""
+    """Return a mask (m - 1, n - 1) of the inverted quads between points x, y (m, n)."""
     return (x[1:, 1:] - x[:-1, :-1]) * (y[:-1, 1:] - y[1:, :-1]) - (x[:-1, 1:] - x[1:, :-1]) * (
         y[1:, 1:] - y[:-1, :-1]
     ) <= 0

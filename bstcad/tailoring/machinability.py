@@ -36,7 +36,7 @@ from bstcad.tailoring.minimise import lbfgs, minimise
 THICKNESS_POINTS = 513  # points per side at which the thickness is computed
 RELIEF_RESERVE = 0.02  # additional thickness for the changes of stage 2, relative to the sag range (PV) of the back
 BOUNDS_STAGE = "bounds on the back"  # name in the record of the stage that enforces the bounds
-BOUND_RESERVE = 1e-3  # distance kept from a bound, relative to the bound: files are rounded, the grid misses extremes
+BOUND_RESERVE = 1e-3  # distance kept from a bound, relative like PENALTY_MARGIN: files are rounded, grids miss extremes
 # Weights of the mean squared relative excess, relative to RRMSD²: by round, from the last one of a stage backwards,
 # and for a stage of one round.  (A large weight from the start keeps the search near its start: a small lens that
 # needs a radius of 20 mm but has a minimum of 50 mm ends at an RRMSD of 0.015 with 1000, and at 0.0033 with 10.)
@@ -105,7 +105,7 @@ class Excess:
 
     mean_square: float  # penalty E of `excess`
     gradients: tuple[Tensor, ...]  # gradients of the penalty in the heights (1/mm), (m, n) for each of Lens.nets
-    worst: float  # largest excess, relative to its bound; negative: every bound is met
+    worst: float  # largest excess, relative to its bound (thickness: see PENALTY_MARGIN); negative: every bound is met
 
 
 def excess(lens: Lens, bounds: Bounds) -> Excess:
@@ -206,9 +206,9 @@ def _thickness_excess(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]
 def enforce_bounds(lens: Lens, bounds: Bounds) -> Lens:
     """Return the lens with its tailored faces and the position of its back changed as little as the bounds require.
 
-    The penalty alone is minimised, in the variables of stage 2.  If REPAIR_EVALUATIONS do not suffice, the faces are
-    flattened.  If the front is tailored, the back is shifted only if changes of the faces do not suffice, since a shift
-    changes the picture.  SceneError if even a flat back exceeds a bound.
+    The penalty alone is minimised, in Sobolev variables (merit.py).  If REPAIR_EVALUATIONS do not suffice, the faces
+    are flattened.  If the front is tailored, the back is shifted only if changes of the faces do not suffice, since a
+    shift changes the picture.  SceneError if even a flat back exceeds a bound.
     """
     for place in (_unmoved, _with_back_moved) if lens.shapes("front") else (_with_back_moved,):
         lens = place(lens, bounds)

@@ -74,12 +74,12 @@ WEIGHT_SMOOTHING = 1.5  # standard deviation of the smoothing of the weight's lo
 MAX_LOCAL_WEIGHT = 4.0  # largest local weight; the smallest is 1 / MAX_LOCAL_WEIGHT, before division by the leverage
 # Range of the leverage / median in which the weight is proportional to 1 / leverage.
 MIN_LEVERAGE, MAX_LEVERAGE = 3.0, 96.0
-LEVERAGE_STEP = 1e-6  # shift of t for the difference quotients of p(b, t), relative to the distance to the target
+LEVERAGE_STEP = 1e-6  # shift of t for difference quotients of the slopes p(b, t), relative to the target's distance
 LEVERAGE_STRIDE = 8  # every 8th control point is checked first, since few lenses have a large leverage anywhere
 
 
 def mean_square_miss(rays: Landed, aim: Tensor) -> Tensor:
-    """Return the mean of |P_t - P|² (mm²) over rays that land at P with the aim P_t (Wang et al. 2023, Eq. 14: sum)."""
+    """Return the mean of |P_t - P|² over rays that land at P with the aim P_t (Wang et al. 2023, Eq. 14: sum)."""
     lit = rays.alive & (rays.flux > 0)
     miss = (rays.position[0] - aim[0]) ** 2 + (rays.position[1] - aim[1]) ** 2
     return total(torch.where(lit, miss, torch.zeros_like(miss))) / lit.sum()
@@ -220,7 +220,7 @@ class Merit:
 
 
 def _from_source(lens: Lens, wave: Wave | None) -> Lens:
-    """Return the lens; for a wavefront goal, marked so that tubes start at the source, as optical paths require."""
+    """Return the lens; for a wavefront goal `freeform` begins with interface 0: paths need tubes that start there."""
     if wave is None or lens.freeform[0] == 0:
         return lens
     return replace(lens, shaped=(0, *lens.freeform))

@@ -66,8 +66,8 @@ class Iterate:
 def minimise(problem: Objective, method: Method, evaluations: int, best: Best = Best()) -> Iterator[Iterate]:
     """Answer the queries of a method until it ends or the evaluations are used up; yield the state after each.
 
-    An evaluation that is not finite is counted as skipped.  best: best evaluation before the method's state.
-    evaluations: limit of their number, including those that `best` counts.
+    An evaluation that is not finite is counted as skipped.  best: best evaluation of the run that the method resumes.
+    evaluations: largest number of evaluations, including those that `best` counts.
     """
     if best.evaluations >= evaluations:
         return
@@ -145,8 +145,8 @@ Values = Generator[Query, Evaluation, tuple[float, Tensor]]  # returns the merit
 class LbfgsState:
     """State of L-BFGS between two steps."""
 
-    x: Tensor
-    value: float
+    x: Tensor  # all parameters, as one vector
+    value: float  # merit at x
     gradient: Tensor
     pairs: tuple[tuple[Tensor, Tensor, float], ...] = ()  # (s, y, s · y): s change of x, y of gradient; oldest first
     steps: int = 0

@@ -80,7 +80,7 @@ def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT
 
 
 def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
-    """Return the goal with at most `pixels` pixels along the longer side: means of the old pixels, of a sum below 1."""
+    """Return the goal with at most `pixels` pixels on its longer side, means of the old ones (the sum decreases)."""
     screen, picture = goal.receiver, goal.picture
     shrunk = max(1.0, max(screen.shape) / pixels)
     rows, columns = (max(round(n / shrunk), 1) for n in screen.shape)
@@ -92,7 +92,7 @@ def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
 def reach_from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver, law: Law, grazing: float) -> Tensor:
     """Return `optics.reach.reach_margin` from every FACE_STRIDE-th lit point of the face to each aim, (points, …).
 
-    aims: x and y of the aims (mm), of one shape (…).
+    aims: x and y of the aims, in the receiver's unit, of one shape (…).
     """
     t, some = torch.from_numpy(np.stack(aims)), grid.density[::FACE_STRIDE, ::FACE_STRIDE] > 0
     position, direction = (
@@ -104,7 +104,7 @@ def reach_from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver,
 
 
 def same_order(grid: FaceGrid, aims: Points) -> Points:
-    """Return the points (mm) of the lit window at the relative positions of aims x and y (mm) in their rectangle."""
+    """Return the points (mm) of the lit window at the relative positions of the aims (x, y) in their rectangle."""
     x, y = ((along - along.min()) / (along.max() - along.min()) - 0.5 for along in aims)
     return grid.window.width * x, grid.window.height * y
 

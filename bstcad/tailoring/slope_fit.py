@@ -27,7 +27,7 @@ from bstcad.optics.unfolding import image_from_last_net
 from bstcad.tailoring.merit import Spectrum
 
 BLOCK_POINTS = 1 << 22  # number of points whose slopes and residuals are in memory together: 0.3 GB
-DEPENDENCE_TOLERANCE = 1e-12  # fraction of a monomial's squared slopes below which the orthogonal rest is rounding
+DEPENDENCE_TOLERANCE = 1e-12  # orthogonal part / whole of a monomial's squared slopes, below which the part is rounding
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def fit_slopes(
         return z_x[some] - now_x, z_y[some] - now_y
 
     def adjoint(of: Callable[[slice], tuple[Tensor, Tensor]]) -> Tensor:
-        """Apply the weighted transpose of `slopes`, block by block."""
+        """Apply the weighted transpose of `slopes` to the slopes `of(block)`, block by block."""
         g = torch.zeros_like(start)
         for some in blocks(len(u)):
             r_x, r_y = of(some)
@@ -152,7 +152,7 @@ def monomials(surface: BSplineSurface, degree: int) -> list[Tensor]:
 
 
 def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: Receiver, repeats: int = 3) -> Lens:
-    """Return the lens whose last net sends `rays` (…) to `aim` (2, …) mm on the plane, by fits of the slopes.
+    """Return the lens whose last net sends `rays` (…) to `aim` (2, …) on a receiver, by fits of the slopes.
 
     repeats: number of fits; each fit changes the sag, and so the points where the rays meet the face.
     """

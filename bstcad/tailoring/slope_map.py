@@ -52,7 +52,7 @@ from bstcad.transport.mapping import Frame, Mapping, Points, TransportMap, nodes
 from bstcad.transport.mapping import Solver as Solver  # exported to packages that may not import transport
 
 SUBCELLS = 2  # samples of the light per axis in a transport cell, since a rim may cross the cell
-SUBPIXELS = 8  # parts of pixels per axis in a transport cell; a pixel has at least one part
+SUBPIXELS = 8  # number of pixel parts per axis in a transport cell; a pixel has at least one part
 SLOPE_FLOOR = 1e-3  # smallest density of light over slopes, relative to its mean: the solver needs some in black parts
 GATHERING_NET, GATHERING_SAMPLES = 33, 96  # control points per side of g, and samples per side for its fit
 GATHERING_WIDTH = (GATHERING_NET - 1) / (GATHERING_NET - 5)  # width of g / width of the window: end spans lie outside
@@ -211,7 +211,7 @@ def fit_to_map(
 
 
 def centroid(picture: np.ndarray, screen: Screen) -> tuple[float, float]:
-    """Return the centroid (x, y) (mm) of a picture on its screen, row 0 = y max."""
+    """Return the centroid (x, y) of a picture on its screen, in the receiver's unit; row 0 = y max."""
     sums = picture.sum(0), picture.sum(1)[::-1]
     share_x, share_y = (float(((np.arange(len(s)) + 0.5) * s).sum() / s.sum()) / len(s) for s in sums)
     (left, right), (low, high) = screen.x, screen.y
@@ -223,7 +223,7 @@ def gathering(
 ) -> BSplineSurface:
     """Return g, the net of GATHERING_NET points per side whose slopes fit p(b, m) best over the lit part of a grid.
 
-    The slopes p(b, m) themselves are in general not exactly the gradient of a surface.  middle: m (mm).
+    The slopes p(b, m) themselves are in general not exactly the gradient of a surface.  middle: m on the receiver.
     """
     count, fit = (PREVIEW_SAMPLES, PREVIEW_FIT) if preview else (GATHERING_SAMPLES, GATHERING_FIT)
     few, law = grid.thinned(count), lens.last_freeform.law
@@ -344,7 +344,7 @@ def map_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> Transport
 
 
 def aim_points(mapping: Mapping, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Tensor:
-    """Return the points of the screen (2, …), in its unit, to which `map_to_target`'s map sends points x, y (…) mm."""
+    """Return the points of the screen (2, …), in its unit, to which the map of `map_to_target` sends x, y (…) mm."""
     screen, sent = image_screen(lens, screen), mapping(*(p.detach().cpu().double().numpy() for p in (x, y)))
     if not screen.plane.is_level:
         sent = screen.plane.from_level_plane(*sent, lens.front.z)

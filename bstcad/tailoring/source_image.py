@@ -212,7 +212,7 @@ def _hats(side: int, border: int) -> np.ndarray:
 
 @torch.no_grad()
 def blur_error(by_images: Tensor, draw: Draw, lens: Lens, screen: Screen, *, border: int, seed: int) -> Tensor:
-    """Return the error of B in a picture, (rows, columns), measured with two sets of rays; 0 if noise hides it.
+    """Return the error E_rays - B E_0 of a picture, (rows, columns), by two sets of rays; 0 if noise hides it.
 
     by_images: the picture B E_0, divided by the transmitted flux.  border: border of B (pixels).
 

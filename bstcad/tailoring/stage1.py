@@ -82,7 +82,7 @@ class FrontSearch:
     repeats: int = 3  # slope fits of the back for each front
 
 
-PREVIEW_NET, PREVIEW_SEARCH = 17, FrontSearch(cells=32, iterations=40, repeats=1)  # net and effort in a preview
+PREVIEW_NET, PREVIEW_SEARCH = 17, FrontSearch(cells=32, iterations=40, repeats=1)  # points per side; effort in previews
 
 
 def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
@@ -199,7 +199,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
 def aimed_rays(
     source: Emitter, lens: Lens, goal: Goal, n: int, side: int, iterations: int
 ) -> tuple[Rays, Tensor, Mapping]:
-    """Return side x side rays in the `clear_window`, their aims on the target (mm), and the map on n x n cells."""
+    """Return side x side rays in `clear_window`, their aims in the target's unit, and the map on n x n cells."""
     mapping = slope_map.map_to_target(source, lens, goal, n, solver=Solver(iterations))
     area = clear_window(source, lens)
     x, y = (t.to(lens.like) for t in sampling.grid(area, side))

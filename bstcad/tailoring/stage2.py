@@ -116,7 +116,7 @@ class TubeRound:
     def run(
         self, problem: Problem, variables: NetVariables, position: SearchPosition, total: int, state: TubeSearch | None
     ) -> Iterator[tuple[Iterate, StageStep]]:
-        """Yield (iterate, step) of a minimisation from a lens or a saved state, until the RRMSD is `goal_by_tubes`.
+        """Yield (iterate, step) of a minimisation from a lens or saved state, until the RRMSD falls to `goal_by_tubes`.
 
         total: evaluations of all rounds.
         """
@@ -126,7 +126,7 @@ class TubeRound:
             best, reason = iterate.best, iterate.reason
             step = StageStep(partial(with_best_nets, lens, variables, best), work=work, skipped=iterate.skipped)
             if not iterate.skipped:
-                done = min(position.done + best.evaluations, total)  # a line search may exceed the limit
+                done = min(position.done + best.evaluations, total)
                 detail = f" on {self.pixels} pixels" if self.pixels else ""
                 if self.source_size < 1:
                     detail += f", with {100 * self.source_size:.0f} % of the source's size"
