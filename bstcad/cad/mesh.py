@@ -5,7 +5,7 @@ The chordal error falls with the square of the node spacing; the grid is refined
 
 Files: STL, which states no unit (its user must set mm), 3MF, which states millimetres, and previews for web pages and
 slicers.  CPU seconds for two million triangles, with those of this module in parentheses: trimesh writes STL in 2
-(0.3), reads it in 8 (1) and tests in 2 (0.7) whether it is closed; lib3mf writes 3MF in 2.3 (2.5).
+(0.3), reads it in 8 (1) and tests in 2 (0.7) whether the mesh is closed; lib3mf writes 3MF in 2.3 (2.5).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from bstcad.scene.scene import FLOAT32_ROUNDING
 MIN_MESH_CELLS = 16  # number of grid cells per side of the first mesh that `fit_mesh` tries
 DEFAULT_MAX_TRIANGLES = 2_000_000  # largest number of triangles by default: 100 MB of STL
 MAX_TRIANGLES = 32_000_000  # largest number of triangles if a scene states a tolerance: 1.6 GB of STL
-GOAL_FRACTION = 0.95  # goal of the chordal error, as a fraction of the tolerance, because float32 rounds vertices
+GOAL_FRACTION = 0.95  # largest goal of the chordal error, relative to the tolerance: float32 rounding needs a margin
 CELL_MARGIN = 1.1  # ratio of estimated to allowed cells per side above which no finer mesh is tried; estimates err
 WALL_NORMAL_Z = 1e-6  # largest |z| component of the unit normal of a facet of the wall
 MAX_FACET_SAMPLES = 100_000_000  # largest number of points at which the facets of a mesh are compared with the lens
@@ -274,7 +274,7 @@ class FaceNumbers(NamedTuple):
     curvature: float  # curvature c at the vertex (1/mm)
     bend: float  # (1 + k) c² (1/mm²), k the conic constant
     equator: float  # smallest 1 - (1 + k) c² r²: surfaces.MIN_COS2
-    ends2: float  # r² (mm²) of Surface.outline, outside of which the face is a plane
+    ends2: float  # r² (mm²) of Surface.outline, outside of which the face is a plane; infinite: no outline
     per_detail: float  # smooth parts per mm: 1 / Surface.detail
     net: np.ndarray  # heights h of the control points, (m, n), mm; (0, 0): a surface of revolution
     x: float  # x of the net's first corner (mm)
@@ -285,7 +285,7 @@ class FaceNumbers(NamedTuple):
 
 @njit(inline="always")
 def _basis(u, m):
-    """Return (k, B_k, B_{k+1}, B_{k+2}) at u, in pitches: a copy of bspline.basis, since numba caches per file."""
+    """Return (k, B_k, B_{k+1}, B_{k+2}) at u (pitches), m control points: bspline.basis, as numba caches per file."""
     if u < 1.5:
         k, s = 0, 2.0 - math.sqrt(4.0 - 2.0 * u)
     elif u > m - 2.5:

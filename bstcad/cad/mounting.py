@@ -66,7 +66,7 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[PlacedLe
     given, kind = shape_in(body)
     if not isinstance(given, cadquery.Shape):
         raise ValueError(f"mount: the body is {kind}; give one cadquery solid, such as Workplane().box(30, 30, 2)")
-    # OCC tapers and chamfers with left-handed planes and cones; its STEP writer reverses them and loses their names
+    # tapers and chamfers by OCC have left-handed planes and cones; its STEP writer reverses these without their names
     rest = cadquery.Solid(TopoDS.Solid_s(ShapeCustom.DirectFaces_s(_solid(given, "the body").wrapped)))
     for opening in openings:
         rest = _solid(rest.cut(opening.prism(rest)), "the rest of the body")

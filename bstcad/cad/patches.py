@@ -31,7 +31,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Conic, Sphere
 
-PATCH_MARGIN = 1.02  # ratio of a patch's width to the outline's, so that the rim does not touch the patch's boundary
+PATCH_MARGIN = 1.02  # ratio of a conic patch's width to the rim's, so that the rim does not touch the patch's boundary
 PARABOLA_TOLERANCE = 1e-10  # deviation (mm) of a sphere from a parabola, below which the parabola is written
 
 ParameterMap = Callable[[np.ndarray, np.ndarray], np.ndarray]  # map from (x, y) in mm to (u, v) of a patch, (…, 2)
@@ -126,7 +126,7 @@ def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]
 
     With K = (1 + k) c², w = 1 + K (u² + v²) / 4: x = u / w, y = v / w, z = z0 + c/2 (u² + v²) / w.  Since w x, w y, w z
     and w are quadratic in u and v, a rational patch of degree 2 x 2 is exactly the conic; (u, v) is the projection
-    of (x, y, z) from the conic's far vertex.  The blossom of u² on [-a, a] is a² (1, -1, 1).
+    of (x, y, z) from the conic's far vertex onto the plane z = z0.  The blossom of u² on [-a, a] is a² (1, -1, 1).
     """
     ends, blossom = np.array([-1.0, 0.0, 1.0]), np.array([1.0, -1.0, 1.0])
     square = a * a * blossom[:, None] + b * b * blossom[None, :]

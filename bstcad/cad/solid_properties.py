@@ -126,7 +126,7 @@ def _edge_in_space(edge: TopoDS_Edge) -> tuple[np.ndarray, ...]:
 
 
 def _edge_in_parameters(edge: TopoDS_Edge, face: TopoDS_Face) -> tuple[np.ndarray, ...]:
-    """Return u, v and weight times du at the Gauss points of an edge of a face; none of a piece where u is constant."""
+    """Return u, v and weighted du at the Gauss points of an edge of a face, except points where u does not change."""
     curve = BRepAdaptor_Curve2d(edge, face)
     curves = [curve] if BRep_Tool.Degenerated_s(edge) else [curve, BRepAdaptor_Curve(edge)]
     t, weight = _gauss_points(edge, curves)
@@ -149,7 +149,7 @@ def _evaluate(
 def _gauss_points(
     edge: TopoDS_Edge, curves: Sequence[BRepAdaptor_Curve | BRepAdaptor_Curve2d], over_net: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return parameters and weights of Gauss points between knots, in an edge's direction; over_net: True on a net."""
+    """Return parameters and weights of Gauss points between knots of `curves`; over_net: True for an edge of a net."""
     first, last = curves[0].FirstParameter(), curves[0].LastParameter()
     knots = {first, last}
     for curve in curves:

@@ -42,7 +42,7 @@ from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, sag
 from bstcad.step_text.placement import Placement, identity, own_frame
 
 GRID_TOLERANCE = 1e-9  # largest deviation (mm) of a net from a uniform grid in x and y, or from the net of a conic
-AXIAL_TOLERANCE = 1e-9  # largest offset (mm) of a surface from the axis, and largest 1 - cosine of its angle to it
+AXIAL_TOLERANCE = 1e-9  # largest offset (mm) of a surface from the axis, and largest 1 - cosine of its tilt
 CIRCLE_TOLERANCE = 1e-6  # largest deviation (mm) of an edge from its circle or rectangle
 LEVEL_TOLERANCE = 1e-7  # largest distance (mm) of the plane around a front from the front's edge
 APERTURE_DECIMALS = 9  # decimals of a clear aperture (mm); further ones are rounding errors of the coordinates
@@ -250,8 +250,8 @@ def _uniform_net(surface: BRepAdaptor_Surface, net: np.ndarray) -> BSplineSurfac
     if not off.max() <= GRID_TOLERANCE:
         i, j = divmod(int(off.argmax()), n)
         raise ValueError(
-            f"control points deviate by {off.max():.1e} mm from a uniform grid, the worst at ({i}, {j}); "
-            "give a file written by bstcad"
+            f"control points deviate by up to {off.max():.1e} mm from a uniform grid, most at point ({i}, {j}), "
+            "counted from 0; give a file written by bstcad"
         )
     return found
 
@@ -384,7 +384,7 @@ def _outline_of_walls(walls: Sequence[BRepAdaptor_Surface]) -> Outline | None:
 
 
 def _radius(wall: BRepAdaptor_Surface) -> float:
-    """Return the radius (mm) of a cylinder on the axis; infinite if it is off the axis."""
+    """Return the radius (mm) of a cylinder about the axis of the lens; infinite for any other cylinder."""
     axis = wall.Cylinder().Axis()
     off = max(abs(axis.Location().X()), abs(axis.Location().Y()), 1 - abs(axis.Direction().Z()))
     return wall.Cylinder().Radius() if off <= AXIAL_TOLERANCE else math.inf
@@ -470,7 +470,7 @@ def _largest(distance: np.ndarray, points: np.ndarray) -> tuple[float, str]:
 
 
 def _distance_from_wall(points: np.ndarray, lens: Lens) -> np.ndarray:
-    """Return the distance (mm) of each point from the wall of the lens between its faces."""
+    """Return the distance (mm) of each point from the lens's wall or, if nearer, from the rim of a recessed front."""
     x, y, z = points.T
     outside = np.maximum(z - sag(lens.back, x, y), sag(lens.front.around, x, y) - z)
     off = np.maximum(np.abs(lens.outline.depth(x, y)), outside)

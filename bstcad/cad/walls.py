@@ -352,7 +352,7 @@ class LeaningPiece:
     def lower_edge(self) -> LoopPiece:
         """Return the lower edge of the wall or, if there is one, of its bevel: on the front, projected along z."""
         straight = self.piece.straight and _is_level_on(self.front, self.piece)
-        return replace(self.piece, points=lambda t: self.ends(t)[1][:, :2], straight=straight)  # no curve needs `left`
+        return replace(self.piece, points=lambda t: self.ends(t)[1][:, :2], straight=straight)  # `left` is unused
 
     def curves(self) -> list[RailCurve]:
         """Return the parting line and the lower edges of wall and bevel: lines, arcs, or cubics with equal knots."""
@@ -425,7 +425,7 @@ def _check(pieces: Sequence[LeaningPiece], holes: Sequence[Sequence[LoopPiece]],
         worst = int((top - upper[:, 2]).argmin())
         if not top[worst] - upper[worst, 2] > MIN_WALL:
             raise ValueError(
-                "{0}: below ({1:.4g}, {2:.4g}) mm no wall is left between z = {3:.4g} mm, where it begins, and the "
+                "{0}: at ({1:.4g}, {2:.4g}) mm no wall is left between z = {3:.4g} mm, where it begins, and the "
                 "front's edge at {4:.4g} mm; reduce the {0}, or make the lens thicker at its edge".format(
                     name, *rim[worst], top[worst], lower[worst, 2]
                 )
@@ -434,9 +434,9 @@ def _check(pieces: Sequence[LeaningPiece], holes: Sequence[Sequence[LoopPiece]],
         onwards = (on_front * along).sum(axis=1) / (along * along).sum(axis=1)
         if not onwards.min() > SMOOTH_TURN:
             position = "({:.4g}, {:.4g}) mm".format(*rim[onwards.argmin()])
-            raise ValueError(f"{name}: below {position} the walls meet before they reach the front; reduce the {name}")
+            raise ValueError(f"{name}: at {position} the walls meet before they reach the front; reduce the {name}")
     edge = [each.lower_edge() for each in pieces]
     if fault := wires.fault(wires.polygon(edge)):
-        raise ValueError(f"{name}: below {fault[1]} the walls meet before they reach the front; reduce the {name}")
+        raise ValueError(f"{name}: at {fault[1]} the walls meet before they reach the front; reduce the {name}")
     if fault := wires.fault(wires.polygon(edge, *holes)):
         raise ValueError(f"{name}: near {fault[1]} a hole crosses the walls where they lean inwards; move the hole")

@@ -1,7 +1,7 @@
 """Comparison of bstcad's picture of a lens with pictures by independent programs, called judges.
 
 A judge traces the lens of a STEP file and returns a picture in two halves.  It is compared with bstcad's picture of the
-same light, which has many more rays, on pixels coarse enough for the noise of the judge's rays.
+same light, which has several times as many rays, on pixels coarse enough for the noise of the judge's rays.
 
 The module of a judge has three functions.  `cannot(lens, channels)` returns why the judge cannot trace this light, in a
 sentence, or "".  `light(lens, channels)` returns the channels with the losses that the judge simulates.  `trace(lens,
@@ -200,7 +200,7 @@ def _difference(one: np.ndarray, other: np.ndarray, target: np.ndarray) -> float
 
 
 def _effective_pixels(noise: np.ndarray) -> float:
-    """Return the effective number of noisy pixels: all if the noise is normal and uniform, few if few are lit."""
+    """Return the effective number of noisy pixels: all if the noise is normal and uniform, few if few have noise."""
     second, fourth = float((noise**2).sum()), float((noise**4).sum())
     return min(3 * second**2 / fourth, noise.size) if fourth > 0 else float(noise.size)
 

@@ -23,7 +23,7 @@ from bstcad.optics.surfaces import Surface
 from bstcad.optics.unfolding import per_radian
 
 PARAMETER_STEPS = 6  # steps of Newton's method for a parameter; the first guess has an error of at most half a span
-GRID_CELLS = 512  # number of cells per side of the grid over a face without knots
+GRID_CELLS = 512  # number of cells per side of the coarsest grid over a curved face without knots
 PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # ring radii / rim radius; many, as slim triangles leak
 
 
@@ -197,7 +197,7 @@ def rim(outline: Outline, points: int = 512) -> np.ndarray:
 
 
 def clip_to_rim(outline: Outline, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a mask of points inside an outline, and x, y (mm) with points outside moved to the nearest on it."""
+    """Return a mask of points inside an outline, and x, y (mm) with points outside moved to the nearest rim point."""
     a, b, r2 = outline.limits
     r, core_x, core_y = math.sqrt(r2), np.clip(x, -a, a), np.clip(y, -b, b)
     distance = np.hypot(x - core_x, y - core_y)
@@ -228,7 +228,7 @@ def face_mesh(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Trime
     """Return a mesh of a face inside the outline, and its error; exact normals at corners, towards +z (up) or -z.
 
     The grid (Face.lines(parts)) has lines through all knots.  Between corners, normals are interpolated linearly,
-    nearly as on a quadratic spline.  Cells outside the rim are omitted; outer corners of cells on it are moved onto it.
+    nearly as on a quadratic spline.  Cells outside the rim are omitted; cells that the rim crosses end on the rim.
     """
     x, y = face.lines(parts)
     shape = face.on_grid(x, y)

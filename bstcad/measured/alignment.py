@@ -2,7 +2,7 @@
 
 The residuals are the signed distances d of all points except outliers, along the face's normals n.  A small motion,
 with translation τ and rotation ω about the pivot c, changes the distance of a point q by n · τ + ((q - c) × n) · ω.
-These are six columns; rotations are measured in mm at the rim of the lens, so that they compare with translations.
+The factors of τ and ω are six columns; rotations are in mm at the rim of the lens, to compare with translations.
 Motions that hardly change any distance (rotating a round face about its axis, shifting a plane along itself) are not
 determined and stay zero.
 
@@ -40,7 +40,7 @@ SCALE_PATCHES = 16  # assumed number of independent patches of form errors that 
 MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty from form errors, in half widths, above which a motion is not determined
 MIN_SENSITIVITY = 1e-7  # smallest change of distance per motion (mm per mm); smaller values are rounding errors
 RIM_MARGIN = 2e-3  # width, in half widths, of the rim that is ignored: points there may lie on the edge
-FACE_DISTANCE_FRACTION = 0.25  # largest distance along z of a point from the face, as a fraction of the thickness
+FACE_DISTANCE_FRACTION = 0.25  # largest distance along z of a point from the face, per smallest thickness of the lens
 MOTION_NAMES = ("shift in x", "shift in y", "shift in z", "rotation about x", "rotation about y", "rotation about z")
 
 
@@ -105,7 +105,7 @@ class Pose:
         return (points - self.pivot - self.shift) @ self.rotation + self.pivot
 
     def compose(self, motion: np.ndarray, reach: float) -> Pose:
-        """Return the pose whose `to_design` moves points by this pose, then by `motion` (6,), see BackFace.columns."""
+        """Return the pose whose `to_design` is this pose's, followed by `motion` (6,); see BackFace.columns."""
         turn = Rotation.from_rotvec(motion[3:] / reach).as_matrix()
         rotation = self.rotation @ turn.T
         return Pose(rotation, self.shift - rotation @ motion[:3], self.pivot)
@@ -238,7 +238,7 @@ def scale(face: BackFace, alignment: Alignment) -> tuple[float, float]:
 
 NEIGHBOURS = 24  # number of nearest points with which each point is compared
 MIN_CLUSTER = 8  # smallest number of neighbours with 50 to 150 % of a point's deviation that shows form, not an outlier
-OUTLIER_THRESHOLD = 6.0  # minimum deviation of an outlier, in standard deviations of neighbours or of all, if larger
+OUTLIER_THRESHOLD = 6.0  # minimum deviation of an outlier, in standard deviations of neighbours or (if larger) of all
 MAD_TO_SIGMA = 1.4826  # ratio of standard deviation to median absolute deviation (MAD) of a normal distribution
 CAUCHY_SCALE = 2.0  # residual, in standard deviations, at which a neighbour's weight is one half
 REWEIGHTING_ROUNDS = 3  # iterations of the neighbours' weights

@@ -30,7 +30,7 @@ POLYNOMIAL_DEGREE = 2  # degree of the polynomial in x and y
 NET_MARGIN = 0.2  # margin of the field's net beyond the lens's, relative to its side, since cosines end with zero slope
 POINTS_PER_NET_CELL = 6.0  # mean number of points in a cell of the net
 FIELD_NET_LIMITS = (9, 513)  # limits of the number of control points per side, before the FFT rounds it up
-MAX_REFINEMENT = 4  # refinement factor per side of a lens's net before a finer field is added; the nets are not nested
+MAX_REFINEMENT = 4  # factor by which each side of a lens's net is refined to add a finer field; the nets are not nested
 BANDS_PER_OCTAVE = 4  # number of bands of the spectrum per octave of frequency
 SPECTRUM_ROUNDS = 8  # number of alternating estimates of field and spectrum
 FIRST_MOTION_ROUND = 3  # round, from 0, in which the motion is fitted; the spectrum is then good enough to weight it
@@ -52,7 +52,7 @@ class FormError:
     random_field: BSplineSurface = field(repr=False)
     spread: np.ndarray = field(repr=False)  # standard deviations (m, m) of the field's cosine amplitudes, mm
     noise: float  # RMS noise of the points, mm
-    motion: np.ndarray  # correction (6,) by fine relief, since form errors bias the alignment; see BackFace.columns
+    motion: np.ndarray  # correction (6,) of the alignment by fine relief, mm; see BackFace.columns
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return δz (mm) at (x, y) in mm, relative to the alignment by least squares."""
@@ -126,7 +126,7 @@ def _field(
     """Return the field's heights (m, m), standard deviations (m, m) of its amplitudes, the noise (mm) and motion (k,).
 
     rows: basis functions (n, m²).  off: deviations (n,), mm; motions: their changes (n, k); both without polynomials.
-    Generalised least squares give the motion.  A fit of the field leaves σ² V⁻¹ off (V: covariance of field + noise).
+    Generalised least squares give the motion: a fit of the field has the residual σ² V⁻¹ off, V: covariance of `off`.
     """
     (m, _), n = net.shape, len(off)  # the net is square
     gram = (rows.T @ rows).tocsr()
@@ -198,8 +198,8 @@ def _posterior_mean(
 ) -> np.ndarray:  # fmt: skip
     """Return the posterior mean (m, m) of the amplitudes c, by conjugate gradients.
 
-    (1 + sqrt(S) Cᵀ G C sqrt(S) / σ²) c / sqrt(S) = sqrt(S) Cᵀ b / σ² is solved for c / sqrt(S), preconditioned
-    with the root of the diagonal for evenly spaced points.  C: inverse cosine transform; G: `gram`; b: `right_side`.
+    (1 + sqrt(S) Cᵀ G C sqrt(S) / σ²) c / sqrt(S) = sqrt(S) Cᵀ b / σ² is solved for c / sqrt(S), preconditioned as if
+    Cᵀ G C were `per_mode` (even points).  C: inverse cosine transform; G: `gram`; b: `right_side`; S: `variance`.
     """
     m, even = len(variance), 1 + variance * per_mode / noise2
     root = np.sqrt(variance / even)

@@ -31,7 +31,7 @@ NOMINAL_WORDS = {"nom", "nominal", "soll", "sollwert", "theo", "theoretical", "c
 HEADING_LINES = 50  # number of lines that are searched for a heading
 SAMPLE_LINES = 200  # number of lines from which the columns are inferred if there is no heading
 MAX_POSITION = 1e6  # largest accepted coordinate (mm); a larger one is an error of the file
-FOREIGN_FORMATS = {  # names of formats that are not text, by a file's first bytes
+FOREIGN_FORMATS = {  # names of formats that are not read, by a file's first bytes
     b"PK\x03\x04": "a zip archive, such as X3P", b"aISO-": "an SDF file (ISO 25178-71)", b"bISO-": "an SDF file (ISO "
     "25178-71)", b"VCA DATA": "an OPD file of an interferometer", b"\x89HDF": "an HDF5 file, such as DATX",
 }  # fmt: skip
@@ -327,8 +327,8 @@ def _columns_without_heading(lines: list[tuple[int, str]], layout: _Layout) -> t
         numbers = numbers[1:]
     if len(numbers) > 3:
         raise ValueError(
-            f"line {first} has {count} columns, but no heading names x, y and z; add one, such as "
-            "x,y,z,nx,ny,nz, or give these three columns only"
+            f"the table from line {first} on has {count} columns, but no heading names x, y and z; add one, such as "
+            "x,y,z,nx,ny,nz, or give only the columns x, y and z"
         )
     if len(numbers) < 3:
         raise ValueError(f"line {first} has {len(numbers)} number{'s' * (len(numbers) != 1)}; {INPUT_HINT}")

@@ -171,7 +171,7 @@ def _frame(name: str, entities: Entities) -> Placement:
 
 
 def _axes(location: str, axis: str | None, reference: str | None, entities: Entities) -> Placement:
-    """Return the placement with an origin, z direction and x direction; None: the z or x axis of the representation.
+    """Return the placement at entity `location`, z along `axis`, x along `reference`; None: axis of the representation.
 
     A z direction other than +z needs an x direction: ISO 10303-42 projects the x axis, some readers choose another.
     """

@@ -12,10 +12,10 @@ BYTES_READ = 65_536  # number of bytes read from a file; comments before the fir
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"  # byte order mark of UTF-8
 STEP_BEGINNING = re.compile(rb"(?:\s|/\*(?:[^*]|\*(?!/))*+\*/)*+ISO-10303-21\s*;")
 OTHER_FORMATS = {  # faults and remedies of files that are not STEP, by their first bytes
-    b"\x1f\x8b": "it is packed by gzip; unpack it first",
+    b"\x1f\x8b": "it is compressed with gzip; unpack it first",
     b"PK\x03\x04": "it is a zip archive; unpack it first",
-    b"BZh": "it is packed by bzip2; unpack it first",
-    b"\xfd7zXZ": "it is packed by xz; unpack it first",
+    b"BZh": "it is compressed with bzip2; unpack it first",
+    b"\xfd7zXZ": "it is compressed with xz; unpack it first",
     b"\xff\xfe": "it is text in UTF-16; export the lens as STEP again",
     b"\xfe\xff": "it is text in UTF-16; export the lens as STEP again",
 }

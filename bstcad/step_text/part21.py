@@ -167,7 +167,7 @@ def _parse(text: bytes) -> StepText:
     data, entities = read_entities(text.decode("latin-1"))  # Part 21 is ASCII; latin-1 never fails
     lengths, angles = (_units(kind, entities) for kind in ("LENGTH", "PLANE_ANGLE"))
     if len(lengths) != 1:
-        raise ValueError(f"it has {len(lengths)} units of length ({', '.join(lengths)}); export it in millimetres only")
+        raise ValueError(f"it states units of length: {', '.join(lengths) or 'none'}; export it in millimetres only")
     ((unit, number),) = lengths.items()
     size = _unit_size(entities, number)  # mm
     if size is None or not 0 < size < math.inf:

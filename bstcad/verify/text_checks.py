@@ -104,7 +104,7 @@ def _largest_difference(read: np.ndarray, designed: np.ndarray, name: str) -> tu
 def measure_checks(
     stated: ValidationProperties, shape: MassProperties | None, outline: Outline, name: str = SOURCE
 ) -> Iterator[Check]:
-    """Check stated measures against `shape`, those of the faces (None: none is stated); outline: size of the lens."""
+    """Check stated measures against `shape`, found from the faces (None: none is stated); outline: size of the lens."""
     if stated.of_shape:
         assert shape is not None
         measures = ("area", "mm²", stated.areas, shape.area), ("volume", "mm³", stated.volumes, shape.volume)

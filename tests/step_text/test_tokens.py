@@ -44,7 +44,7 @@ def test_comments_and_a_byte_order_mark_are_passed_over():
 
 BEGINNINGS = {
     "empty": (b"", "it is empty"), "blank": (b" \n", "it is empty"), "a mesh": (b"solid x\n", "does not begin with"),
-    "packed": (gzip.compress(b"ISO-10303-21;"), "packed by gzip"), "zip": (b"PK\x03\x04..", "zip archive"),
+    "packed": (gzip.compress(b"ISO-10303-21;"), "compressed with gzip"), "zip": (b"PK\x03\x04..", "zip archive"),
     "UTF-16": ("ISO-10303-21;".encode("utf-16"), "UTF-16"), "comment": (b"/*" * 30_000, "does not begin"),
 }  # fmt: skip
 
