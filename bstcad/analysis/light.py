@@ -287,10 +287,10 @@ class FinestDetail:
     the distance l before it.  At a distance L' it is D L' / L.  The resolution of the control net is not included.
     """
 
-    width: float  # width w, in `unit`
-    source_image: float  # diameter D, in `unit`
-    pixel: float  # side p, in `unit`
-    distance: float  # distance L (mm)
+    width: float  # width w of a point of the picture, in `unit`
+    source_image: float  # diameter D of the image of the source, in `unit`
+    pixel: float  # side p of a pixel, in `unit`
+    distance: float  # distance L from the lens to the target (mm)
     nearer_distance: float | None  # distance L' (mm) of a nearer target that can have the same picture; None: no gain
     nearer_width: float | None  # width w on the nearer target, in `unit`
     of: str  # size of the source: its key in the scene, or the assumption

@@ -43,7 +43,7 @@ FLUX_TOLERANCE = 0.005  # largest difference of the light on the target, as a fr
 
 @dataclass(frozen=True)
 class Judge:
-    """Comparison of a judge's picture with bstcad's, as in report.json; differences relative to the target's RMS."""
+    """Comparison of another program, the judge, with bstcad; differences are relative to the target's RMS."""
 
     name: str  # name of the program
     version: str  # version of the program

@@ -33,7 +33,7 @@ class Collimated(Emitter):
     (d_x, d_y), whose range for a half angle α is an ellipse about cos α (n_x, n_y).
     """
 
-    aperture: Annotated[Outline, Key("Outline of the beam.", example={"shape": "circle", "radius": 12.0})]
+    aperture: Annotated[Outline, Key("Outline of the beam around centre.", example={"shape": "circle", "radius": 12.0})]
     wavelength: WavelengthKey = 587.6
     profile: Annotated[Literal["uniform", "gaussian"], Key("Irradiance over the aperture.")] = "uniform"
     radius_1e2: Annotated[

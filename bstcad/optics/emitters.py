@@ -32,7 +32,7 @@ WavelengthKey = Annotated[  # key of every source
     Key("One wavelength, or lines [[nm, weight], ...] of a spectrum, weights of any sum.", "nm", 100.0, 20_000.0),
 ]
 TiltKey = Annotated[
-    tuple[float, float] | None, Key("Tilt about x and y.", "degrees", -180.0, 180.0, example=[0.0, 10.0])
+    tuple[float, float] | None, Key("Tilt about x, then about y.", "degrees", -180.0, 180.0, example=[0.0, 10.0])
 ]
 PROFILE_NAMES = {"gaussian": "Gaussian", "lambertian": "Lambertian", "uniform": "uniform"}  # profile names in text
 

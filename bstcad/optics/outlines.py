@@ -78,11 +78,11 @@ class _Box(ABC):
 
 @dataclass(frozen=True)
 class Rectangle(_Box):
-    """Rectangle |x| <= width / 2 and |y| <= height / 2, centred on the axis."""
+    """Rectangle |x| <= width / 2 and |y| <= height / 2, with x and y from its centre."""
 
     width: Annotated[float, Key("Extent along x.", "mm", *SIZE_RANGE, example=12.0)]
     height: Annotated[float, Key("Extent along y.", "mm", *SIZE_RANGE, example=12.0)]
-    shape: Annotated[Literal["rectangle"], Key("A rectangle centred on the axis.")] = "rectangle"
+    shape: Annotated[Literal["rectangle"], Key("A rectangle with sides along x and y.")] = "rectangle"
 
     __pydantic_config__ = STRICT
 
@@ -163,10 +163,10 @@ class Rounded(Rectangle):
 
 @dataclass(frozen=True)
 class Circle(_Box):
-    """Circle x² + y² <= radius², centred on the axis."""
+    """Circle x² + y² <= radius², with x and y from its centre."""
 
     radius: Annotated[float, Key("Radius; or give the diameter.", "mm", *SIZE_RANGE, example=12.0)]
-    shape: Annotated[Literal["circle"], Key("A circle centred on the axis.")] = "circle"
+    shape: Annotated[Literal["circle"], Key("A circle.")] = "circle"
 
     __pydantic_config__ = STRICT
 

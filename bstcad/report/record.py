@@ -141,7 +141,7 @@ class DesignCourse:
 class LeftOut:
     """An effect that is not simulated, and its estimated change (analysis.neglected_effects.Change)."""
 
-    kind: str  # key of LEFT_OUT
+    kind: str  # name of the effect (key of LEFT_OUT), such as "fresnel", "source size" or "stray light"
     flux_change: float | None  # change of the flux on the target, as a fraction; None here and below: unknown
     rrmsd_change: float | None  # RRMSD of a lens that would be perfect without the effect
     blur_pixels: float | None  # diameter of the spot to which the effect spreads a point of the picture (pixels)

@@ -118,7 +118,10 @@ class WavefrontStudy:
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Content of tolerance.json: one field per key, in the order of the file; the key of `passed…` is `yield…`."""
+    """Content of tolerance.json: one field per key, in the order of the file.
+
+    Fields named `passed…` have the keys `yield…`.
+    """
 
     __pydantic_config__ = STRICT
 

@@ -340,7 +340,7 @@ class NetFront(_Front):
         Key("Control points per side, or [along x, along y]; the back's if absent.", "", *NET_SIZES, example=513),
         BeforeValidator(lambda given: tuple(given) if isinstance(given, list) else given),  # strict: a tuple
     ] = None
-    reflect: Annotated[bool, Key("Mirror behind glass: light enters and leaves by the back.", example=True)] = False
+    reflect: Annotated[bool, Key("Mirror behind glass: light enters and leaves via the back.", example=True)] = False
     kind: Annotated[Literal["bspline"], Key("A freeform face of an earlier design, or a tailored one.")] = "bspline"
 
     written = leaving_out(optimise=False, reflect=False)
@@ -509,8 +509,8 @@ class Bounds:
 class LensBlank(Record):
     """The lens before tailoring: light enters through the front and leaves through the back.
 
-    A mirror is a plate whose back, the upper face, reflects; no light meets its front.  If the front reflects, light
-    crosses the back before and after the front.
+    A mirror is a plate whose back, the face with the larger z, reflects; no light meets its front.  If the front
+    reflects, light crosses the back before and after the front.
     """
 
     material: Annotated[str | None, Key("Name on refractiveindex.info; or give the index.")] = None

@@ -28,7 +28,7 @@ from bstcad.scene.target import DIRECTIONS, Target, is_faced
 MAX_TILT = 40.0  # largest tilt (degrees): a mirror at 45 reflects light across the axis, neither up nor down along z
 MAX_SPHERE_BEND = 0.85  # largest (c r)² of a sphere at its rim; a hemisphere has 1
 TILT = Key("Tilt about x, then about y.", "degrees", -MAX_TILT, MAX_TILT, example=[0.0, 20.0])
-RIM = Key("Outline of the clear aperture, seen along z.", example={"shape": "circle", "diameter": 40.0})
+RIM = Key("Clear aperture around the axis, seen along z.", example={"shape": "circle", "diameter": 40.0})
 
 
 class Window(Record):

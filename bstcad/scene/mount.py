@@ -137,14 +137,14 @@ class Flange(Record):
     """A plate around the lens, one piece with it; its lower face, at z, rests on the housing."""
 
     outline: Annotated[Shape, Key("Outer outline of the plate.", example={"shape": "circle", "diameter": 40.0})]
-    z: Annotated[float, Key("Position of the lower face of the plate.", "mm", *COORDINATES, example=15.5)]
+    z: Annotated[float, Key("Position of the lower face (smaller z) of the plate.", "mm", *COORDINATES, example=15.5)]
     thickness: Annotated[float, Key("Thickness of the plate.", "mm", 1e-2, 1e5, example=1.5)]
     screws: Annotated[Screws | None, Key("Screw holes, evenly spaced around the axis.")] = None
     holes: Annotated[
         tuple[tuple[float, float, float], ...],
         Key("Further holes [x, y, diameter].", "mm", *COORDINATES, example=[[14.0, 0.0, 3.2]]),
     ] = ()
-    draft: Annotated[float, Key("Draft of the outer walls; the plate narrows upwards.", "degrees", 0.0, 45.0)] = 0.0
+    draft: Annotated[float, Key("Draft of the outer walls; the plate narrows towards +z.", "degrees", 0.0, 45.0)] = 0.0
     bevel: Annotated[float, Key("Height of each of two bevels (45 degrees) of the outer walls.", "mm", 0.0, 1e5)] = 0.0
 
     def all_holes(self) -> list[tuple[float, float, float]]:
@@ -160,7 +160,7 @@ class Mount(Record):
         Key("Origin z = 0 of part.step: the origin of the scene, the vertex of the front or the flange's lower face."),
     ] = "source"
     rim: Annotated[Shape | None, Key("Rim of the lens after cutting; lens.outline if absent.")] = None
-    draft: Annotated[float, Key("Draft of the walls; the lens narrows downwards.", "degrees", 0.0, MAX_DRAFT)] = 0.0
+    draft: Annotated[float, Key("Draft of the walls; the lens narrows towards -z.", "degrees", 0.0, MAX_DRAFT)] = 0.0
     bevel: Annotated[float, Key("Height of the bevel (45 degrees) between walls and front.", "mm", 0.0, 1e5)] = 0.0
     flange: Annotated[Flange | None, Key("A plate around the lens, one piece with it.")] = None
 

@@ -50,7 +50,7 @@ class BatchEntry(StoredRecord):
 
     scene: str  # path of the scene file, as given by the user
     name: str = ""  # name of the scene and of the design's folder
-    status: str = STOPPED  # verdict (verify.verdict.VERDICTS), REFUSED, BROKEN or STOPPED
+    status: str = STOPPED  # verdict of report.json, or without a lens "refused", "broken" or "not done"
     rrmsd: float | None = None  # RRMSD of the report; this and the next three: of the target with the largest RRMSD
     rrmsd_noise: float | None = None  # standard error of rrmsd
     leak: float | None = None  # fraction of the light on the target that falls where the target is dark

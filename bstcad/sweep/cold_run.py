@@ -215,7 +215,7 @@ class ColdRun(StoredRecord):
     """Result of one run; times are in seconds on the machine of the run, and null if it was not run."""
 
     settings: StoredSettings  # changes relative to the base scene
-    status: str  # DONE, FAILED or NOT_RUN
+    status: str  # "done", "failed" or "not run: budget"
     reason: str = ""  # reason of the failure
     label: str = ""  # description, such as "Flux tubes per side: 768"
     knobs: tuple[str, ...] = ()  # keys of the knobs (tradeoff.Knob) with these settings; "base": the base scene
@@ -236,12 +236,11 @@ class ColdRun(StoredRecord):
     net: str = ""  # SHA-256 of the control nets; equal nets are equal lenses to the last bit
     stages: tuple[dict[str, Any], ...] = ()  # stages: name, seconds and rrmsd at the end (null: not measured)
     on_front: bool = False  # true if the run is on the Pareto front of the sweep
-    # The following fields are not written to tradeoff.json.
-    allowed_seconds: float | None = None  # time limit at which the run was stopped; null: the run ended by itself
-    history: tuple[HistoryPoint, ...] = ()  # convergence curve of the run
-    machine: dict[str, Any] = {}  # machine of the run
-    versions: dict[str, str] = {}  # versions of the libraries, by name
-    version: str = ""  # version of bstcad, with a hash of its sources
+    allowed_seconds: float | None = None  # only in runs/*.json: time limit that stopped the run; null: it ended itself
+    history: tuple[HistoryPoint, ...] = ()  # only in runs/*.json: convergence curve of the run
+    machine: dict[str, Any] = {}  # only in runs/*.json: machine of the run
+    versions: dict[str, str] = {}  # only in runs/*.json: versions of the libraries, by name
+    version: str = ""  # only in runs/*.json: version of bstcad, with a hash of its sources
 
     @property
     def done(self) -> bool:

@@ -128,9 +128,10 @@ def command_line() -> str:
     page = get_docs_for_click(obj=group, ctx=click.Context(group, info_name="bstcad"), name="bstcad")
     page = page.replace("# `bstcad`", "# Command line", 1).replace("```console", "```text")
     exits = (
-        "Exit codes: 0, every check passed, or no limit on the light was asked; 1, the lens is written, but a check\n"
-        "failed; 2, the input is wrong; 70, a fault of bstcad; 129, 130, 143, ended by SIGHUP, Ctrl-C, SIGTERM.\n"
-        "`bstcad tolerance` exits with 0 at any yield, also below the yield that `--yield` asks for.\n\n"
+        "Exit codes: 0, no check failed; 1, a check failed, an error ended a design of `batch`, or no run of\n"
+        "`tradeoff` has a lens; 2, wrong input, or the machine cannot do the work (such as a full disk); 70, a\n"
+        "fault of bstcad; 129, 130, 143, ended by SIGHUP, Ctrl-C, SIGTERM. `bstcad tolerance` exits with 0 at any\n"
+        "yield, also below the yield that `--yield` requests.\n\n"
     )
     return page.replace("## `bstcad generate`", exits + "## `bstcad generate`", 1)
 
@@ -143,8 +144,11 @@ def json_files() -> str:
     page = [
         "# JSON files",
         "",
-        "Programs read these files; each is written from, and read back into, the records below. `None` is `null`;",
-        "lengths are in mm, angles in degrees, times in s, a `Fraction` is one of 1, unless the meaning names a unit.",
+        "Programs read these files; each is written from, and read back into, the records below. `None` is `null`.",
+        "Lengths are in mm, angles in degrees and times in s, unless the meaning names another unit. `Count`, `Rrmsd`,",
+        "`Seconds`, `Size` and `Width` are numbers, a `Fraction` is a number from 0 to 1, and a `Point` is [x, y, z].",
+        "`Yield`: lower bound, estimate and upper bound (95 % interval). `Spread`: values by the percentiles 5 %, 50 %",
+        "and 95 %. `Disagreement`: median and 95th percentile of the relative error. `StoredSettings`: values by key.",
     ]
     for name, files in RECORDS.items():
         page += ["", f"## {name}", ""]
