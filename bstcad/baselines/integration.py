@@ -96,7 +96,7 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
 
 @torch.no_grad()
 def march(coming: Rays, aim: Tensor, plane: Receiver, law: Law, z: float, first: First = "x") -> SurfacePoints:
-    """Return points of a face that sends rays (n, n), n odd, to aims (2, n, n) mm on the receiver `plane`.
+    """Return points of a face that sends rays (n, n), n odd, to aims (2, n, n) on the receiver `plane`.
 
     coming: rays on the way to the face.  z: z (mm) of the point on the middle ray.  first: axis of the first line;
     all others cross it.  A lost ray, or one parallel to the face, ends its line.  SceneError if the middle ray is lost.
@@ -132,7 +132,7 @@ class _Grid:
 
     origin: Tensor  # (3, rays, lines) mm, intersection with the plane of the initial point; z is zero
     direction: Tensor  # (3, rays, lines) unit vectors
-    aim: Tensor  # (2, rays, lines) mm, coordinates on the receiver
+    aim: Tensor  # (2, rays, lines) coordinates on the receiver, in its unit
     alive: Tensor  # (rays, lines) bool
     rays: Rays  # bundle that states sense and plane of the rays
 
@@ -192,7 +192,7 @@ def _outwards(grid: _Grid, position: Tensor, reached: Tensor, plane: Receiver, l
 
 @torch.no_grad()
 def fit_net(surface: BSplineSurface, points: SurfacePoints, used: Tensor, levels: tuple[Sides, ...]) -> BSplineSurface:
-    """Fit nets by least squares, min Σ |h(x, y) - z|² over the points `used` (n, n) bool, one level after another.
+    """Fit nets with `levels` control points per side by least squares (`fit_heights`) to the points `used` (n, n) bool.
 
     Each net starts from the surface of the previous net, the first from a plane; only the last uses all points.
     """

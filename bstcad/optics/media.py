@@ -29,7 +29,7 @@ MAX_NAMES_LISTED = 8  # largest number of page names listed in a message
 MAX_NAME_LENGTH = 60  # characters of a material name that a message quotes; names of up to twice as many are found
 RANGE_TOLERANCE = 1e-9  # relative tolerance of the wavelength range, for rounding by a change of unit
 
-_NAMES = re.compile(r"^ *(?:- )?(SHELF|BOOK|PAGE|data): (.*)$", re.MULTILINE)
+_NAMES = re.compile(r"^ *(?:- )?(SHELF|BOOK|PAGE|data): (.*)$", re.MULTILINE)  # names and files of pages
 _DENSITY = re.compile(r"^ +density:\n +- (?:temperature: .*\n +)?value: ([\d.eE+]+) *$", re.MULTILINE)  # density, kg/m³
 
 

@@ -28,7 +28,7 @@ MM_PER_NM = 1e-6  # millimetres per nanometre
 MIN_FOCUS_DISTANCE = 1e-3  # mm, smallest distance of a focus from the plane
 MAX_RAY_ANGLE = math.radians(89.0)  # rad, angle to the axis above which a ray counts as parallel to the plane
 SAMPLES_PER_SIDE = 129  # grid points per side of the square around a Zernike circle, for the largest |∇W|
-Place = tuple[float, float]
+Place = tuple[float, float]  # (x, y), mm
 
 Z = Key("Plane behind the lens on which the wavefront is stated and measured.", "mm", -1e8, 1e8, example=40.0)
 WEIGHT = Key("Weight of the wavefront relative to the pictures.", "", 0.0, 1e9, example=2.0)
