@@ -146,7 +146,7 @@ def page(sheet: DataSheet) -> Figure:
 
 
 def _form(sheet: DataSheet) -> str:
-    """Return the form of the front in a few words: CX, convex, if a centre of curvature is on the +z side, else CC."""
+    """Return the form of the front in a few words: CX (convex) if a centre of curvature is on the +z side, else CC."""
     front = sheet.record["front"]
     radii = {name.removeprefix("radius"): radius for name, radius in front.items() if name[:6] == "radius" and radius}
     words = [f"R{way} {abs(radius):.5g} {'CX' if radius > 0 else 'CC'}" for way, radius in radii.items()]

@@ -395,7 +395,7 @@ FRONTS: dict[str, tuple[type[Any], Callable[..., Any]]] = {
 def as_front(value: Any, outline: Outline | None = None) -> Any:
     """Return the front of a scene for a surface of optics; return any other value as it is.
 
-    outline: outline of the lens, inside which a net is fitted to a surface of a kind not in FRONTS; None: ValueError.
+    outline: outline of the lens, inside which a net is fitted to a surface not in FRONTS; None: it raises ValueError.
     """
     if not hasattr(value, "relative_sag_and_slope"):
         return value

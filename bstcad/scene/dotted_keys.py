@@ -47,7 +47,7 @@ def override(data: dict[str, Any], key: str, value: Any, shown: str) -> None:
 
 
 def tables_at(node: Any, key: str, shown: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield (key, value) of `key` in `node`, once per table of a list; shown: prefix of each key, the key of `node`."""
+    """Yield (full key, value) of `key` in `node`, once per table of a list; shown: full key of `node`."""
     name, _, rest = key.partition(".")
     if isinstance(node, list):
         for k, part in enumerate(node):

@@ -60,7 +60,7 @@ class Part:
         return replace(self, **{name: value for name, value in known.items() if getattr(self, name) is None})
 
     def complaints(self, lens: LensBlank) -> Iterator[str]:
-        """Yield the faults of the table, alone and for this lens."""
+        """Yield the faults of the table, and its conflicts with the lens."""
         for field in fields(self):
             text = getattr(self, field.name)
             if isinstance(text, str) and not (text.strip() and text.isprintable() and len(text) <= MAX_TEXT):

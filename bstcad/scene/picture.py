@@ -315,7 +315,7 @@ class Photo:
 
 
 def strips(box: PixelBox) -> Iterator[PixelBox]:
-    """Divide a box into strips of STRIP_ROWS rows, the last of the remaining rows, and yield them from the top."""
+    """Yield strips of STRIP_ROWS rows of a box, from the top; the last strip has the remaining rows."""
     left, top, right, bottom = box
     return ((left, start, right, min(start + STRIP_ROWS, bottom)) for start in range(top, bottom, STRIP_ROWS))
 
@@ -424,7 +424,7 @@ def _profile(image: Image.Image) -> Conversion | None:
 
 
 def _grey_curve(profile: Conversion) -> Curve:
-    """Return the curve of a grey profile of 8 bits, interpolated for finer numbers."""
+    """Return the curve of a grey profile: its values for 8-bit pixels, interpolated for finer pixel values."""
     ramp = Image.fromarray(np.arange(256, dtype=np.uint8)[None])
     seen = from_srgb(np.asarray(profile(ramp)) / 255.0).mean(-1)[0]
     return lambda number: np.interp(number, np.arange(256) / 255.0, seen)
@@ -444,7 +444,7 @@ def letters(text: str, width: int, height: int) -> Image.Image:
 
 
 def _ink(text: str, size: float) -> Image.Image:
-    """Draw the letters, cropped to their ink (the box of a font has empty margins)."""
+    """Draw a text of this font size (pixels), cropped to its ink (the box of a font has empty margins)."""
     font = _font(size, text)
     left, top, right, bottom = ImageDraw.Draw(Image.new("L", (1, 1))).textbbox((0, 0), text, font=font, align="center")
     image = Image.new("L", (int(right - left) + 8, int(bottom - top) + 8))
@@ -455,7 +455,7 @@ def _ink(text: str, size: float) -> Image.Image:
 
 
 def _font(size: float, text: str) -> ImageFont.FreeTypeFont:
-    """Return DejaVu Sans Bold from matplotlib's files, without importing matplotlib."""
+    """Return DejaVu Sans Bold of a size (pixels) from matplotlib's files; SceneError if it lacks a letter of `text`."""
     spec = importlib.util.find_spec("matplotlib")
     assert spec is not None and spec.submodule_search_locations  # bstcad requires this package
     font = ImageFont.truetype(f"{spec.submodule_search_locations[0]}/mpl-data/fonts/ttf/DejaVuSans-Bold.ttf", size)

@@ -88,8 +88,8 @@ class Tailoring(Record):
     def resolved(self, net: Sides) -> ResolvedTailoring:
         """Return the settings with all values set; net: control points per side of the back, or along x and along y.
 
-        Levels of an oblong net are pairs, with cells in its proportions.  Defaults: at least two rays per cell of
-        the net along x and along y (draft: √2); a map of up to twice the net's cells, or COARSEST_GRID (paper: any).
+        Levels of an oblong net become pairs with its proportions.  Defaults: at least two rays per cell of the net
+        along x and along y (draft: √2); a map of up to twice the net's cells per side or COARSEST_GRID (paper: any).
         """
         levels = tuple(level if isinstance(level, tuple) else coarser(net, level) for level in self.levels or ())
         preset = dict(PRESETS[self.quality], levels=levels or coarse_to_fine(net))

@@ -420,7 +420,7 @@ def _method_complaints(scene: Scene) -> Iterator[str]:
 
 
 def _doubts_of_goals(scene: Scene) -> Iterator[str]:
-    """Yield warnings: with fewer goals than tailored faces a face is idle, with more no goal is met exactly."""
+    """Yield warnings: with fewer goals than tailored faces a face is idle; with more, no goal is met exactly."""
     lens, wave = scene.lens, scene.wavefront
     different: list[Target] = []
     for target in scene.targets:  # light parallel to the axis makes one picture on every plane, which is one goal

@@ -264,7 +264,7 @@ class Target(Record):
 
 
 def is_faced(plane: PlaneReceiver, vertex: Vector) -> bool:
-    """Return True if a point (mm) sees the front of a plane more than a degree (EDGE_ON) from edge-on."""
+    """Return True if the line of sight from a point (mm) meets a plane's front at more than a degree (EDGE_ON)."""
     return -plane.height(vertex) > EDGE_ON * math.dist(plane.middle, vertex)
 
 
