@@ -257,7 +257,7 @@ def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> Cro
 def _flange(
     flange: Flange, half: float, upright: bool, low: float
 ) -> tuple[list[shapely.Polygon], shapely.Geometry, list[np.ndarray]]:
-    """Return (flange outside the rim |u| = half, holes, edges of its upper and lower face) as (z, u); low: its least z."""
+    """Return (flange outside the rim |u| = half, holes, edges of its upper and lower face) as (z, u); low: least z."""
     high, lean, b = low + flange.thickness, math.tan(math.radians(flange.draft)), flange.bevel
     reach = flange.outline.outline.half_extent[upright]
     foot, head = reach - lean * b, reach - lean * (flange.thickness - b)  # ends of the wall with draft
