@@ -359,7 +359,7 @@ class Design:
         return f"RRMSD {number(values[-1])} as tailored; not verified yet" if values else "not verified yet"
 
     def _irradiance(self, number: int = 0) -> np.ndarray:
-        """Return the flux per pixel (rows, columns; sum 1) on target[number], as verified or else a preview."""
+        """Return the flux per pixel (rows, columns; sum 1) on target[number], verified or else by PREVIEW_TUBES."""
         if self.report is not None:
             return self.report.irradiances[number]
         goal = self._made.goals[number]

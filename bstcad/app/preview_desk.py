@@ -1,4 +1,4 @@
-"""The thread that makes previews.  Quick previews come first; slower answers follow while no page waits for one.
+"""The thread that makes previews.  Quick previews come first; slower answers follow if no page waits for a quick one.
 
 A request of a page replaces the page's earlier request, whose work ends at the next step.  The answers come in the
 order of STAGES: a quick preview, a refined preview, the effects that are left out, and predictions for each quality.

@@ -72,7 +72,7 @@ class Pilot:
     rrmsd: float  # largest RRMSD of all goals
     factor: float  # pixels per side of the full scene / pixels per side of the pilot
     detail: float  # relative RMS of the detail of the full picture that is finer than the pilot's pixels
-    blur: float  # RRMSD by blur of the source on the pixels of the full scene, minus that on the pixels of the pilot
+    blur: float  # RRMSD by blur of the source: on pixels of the full scene, minus RRMSD on pixels of the pilot
     steep: Steepness  # steepness that the map requires of the back
 
 
