@@ -94,10 +94,10 @@ class TargetStudy:
     rrmsd: Rrmsd  # RRMSD of the design on this target
     passed: Annotated[Yield, Field(alias="yield")]  # yield on this target alone, by superposed pictures
     passed_full: Annotated[Yield, Field(alias="yield_full")]  # yield of the trials traced in full
-    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of the full trials, screen adjusted
+    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of the full trials by rrmsd_adjusted
     rrmsd_trials: Spread  # RRMSD of the trials by superposed pictures
     rrmsd_full: Spread  # RRMSD of the trials traced in full
-    rrmsd_adjusted: Spread  # RRMSD of the full trials by superposed pictures, with this screen adjusted
+    rrmsd_adjusted: Spread  # RRMSD of the full trials by superposed pictures, this screen at its best position
     model_off: Disagreement  # disagreement of superposed pictures with full traces
     sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # the worst first
 
@@ -137,10 +137,10 @@ class Tolerances:
     # yield by superposed pictures: lenses within `limit` on all targets and within the limit of the wavefront
     passed: Annotated[Yield, Field(alias="yield")]
     passed_full: Annotated[Yield, Field(alias="yield_full")]  # yield of the trials traced in full
-    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of the full trials, screen adjusted
+    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of the full trials by rrmsd_adjusted
     rrmsd_trials: Spread  # RRMSD of the trials by superposed pictures
     rrmsd_full: Spread  # RRMSD of the trials traced in full
-    rrmsd_adjusted: Spread  # RRMSD of the full trials by superposed pictures, with the screen adjusted
+    rrmsd_adjusted: Spread  # RRMSD of the full trials by superposed pictures, the screen at its best position
     model_off: Disagreement  # disagreement of superposed pictures with full traces
     sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # largest change of the RRMSD first
     worst: Annotated[tuple[Trial, ...], Field(max_length=100)]  # worst of the fully traced trials

@@ -147,7 +147,7 @@ def _along_axes(net: np.ndarray) -> np.ndarray:
 
 
 VERTEX_Z = Key("Position of the vertex on the axis.", "mm", *COORDINATES, example=8.0)
-CURVATURE = Key("Curvature (1 / radius) at the vertex; positive: bent towards +z.", "1/mm", *CURVATURES)
+CURVATURE = Key("Curvature (1 / radius) at the vertex; positive: rim at larger z.", "1/mm", *CURVATURES)
 OUTLINE = Key("Outline of the curved part; around it the face is plane.", example={"shape": "circle", "diameter": 10.0})
 OPTIMISE = Key("Parameters that tailoring finds: true for all, or a list of names.")
 FrontFile = Annotated[FileNet, *from_file(FileNet, read_net, "file = 'outputs/earlier'")]
@@ -314,8 +314,8 @@ class ToroidFront(_FittedFront):
     """A toroid, with different curvatures along x and y."""
 
     z: Annotated[float, VERTEX_Z]
-    curvature_x: Annotated[float, Key("Curvature along x; positive: bent towards +z.", "1/mm", *CURVATURES)] = 0.0
-    curvature_y: Annotated[float, Key("Curvature along y; positive: bent towards +z.", "1/mm", *CURVATURES)] = 0.0
+    curvature_x: Annotated[float, Key("Curvature along x; positive: rim at larger z.", "1/mm", *CURVATURES)] = 0.0
+    curvature_y: Annotated[float, Key("Curvature along y; positive: rim at larger z.", "1/mm", *CURVATURES)] = 0.0
     kind: Annotated[Literal["toroid"], Key("A toroid; a cylinder if one curvature is 0.")] = "toroid"
 
     __pydantic_config__ = STRICT

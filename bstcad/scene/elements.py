@@ -85,7 +85,7 @@ class Mirror(Record):
     kind: Annotated[Literal["mirror"], Key("A mirror, which reverses the direction of light along z.")]
     z: Annotated[float, Key("Position of the face on the axis.", "mm", *COORDINATES, example=120.0)]
     outline: Annotated[Outlined, RIM]
-    curvature: Annotated[float, Key("Curvature; positive: bent towards +z.", "1/mm", *CURVATURES, example=0.002)] = 0.0
+    curvature: Annotated[float, Key("Curvature; positive: rim at larger z.", "1/mm", *CURVATURES, example=0.002)] = 0.0
     tilt: Annotated[tuple[float, float] | None, TILT] = None
 
     written = leaving_out(curvature=0.0)

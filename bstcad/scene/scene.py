@@ -105,7 +105,7 @@ class Scene(Record):
     accept: Annotated[Accept, Key("The limits of the checks in the report.")] = Accept()
     tolerance: Annotated[tuple[Tolerance, ...], Key("Tolerances of part, mount and source: [[tolerance]].")] = ()
     output: Annotated[Output, Key("Accuracy of the meshes, and files for the shop.")] = Output()
-    part: Annotated[Part, Key("The title block in lens.step.")] = Part()
+    part: Annotated[Part, Key("Data of the part for STEP files and data sheet.")] = Part()
     mount: Annotated[Mount | None, Key("Mount of the lens; with this table bstcad writes part.step.")] = None
 
     @model_validator(mode="after")
