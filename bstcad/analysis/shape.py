@@ -127,7 +127,7 @@ class Ripple:
 def ripple(face: BSplineSurface) -> Ripple:
     """Return the ripple of a face: the part of its highest octave that a smooth net does not have.
 
-    The octaves are those of the net, minus its best cubic polynomial, times a Hann window, sin² from rim to rim.
+    The octaves are computed from the net minus its best cubic polynomial, times a Hann window (sin² from rim to rim).
     (Without the window the kink of a smooth net along its rim may give the highest octave some hundred µrad.)  With E
     the slope energy of the highest octave and E' that of the octave below, the fraction 1 - SMOOTH_RATIO E' / E is the
     ripple.  Mean squares over the face follow from overlaps of the basis functions of degree 2 and of their slopes.
@@ -156,7 +156,7 @@ def slope_octaves(face: BSplineSurface) -> np.ndarray:
 
     It is Σ λ |ĥ|² over the cosine transform ĥ of the net minus its best cubic polynomial (the even continuation of a
     tilt has kinks), λ the eigenvalue of the negative Laplacian.  Octave k, 0 the finest, has the frequencies whose
-    larger index is in (m / 2^(k+1), m / 2^k], m the control points of the longer side; the other index is scaled to m.
+    larger index is in (m / 2^(k+1), m / 2^k], m the longer side's points; indices of the other side are scaled to m.
     """
     energy, octave = _energy(face, scipy.fft.dctn(_without_cubic(face), norm="ortho")), _octave(face)
     return np.array([energy[octave == k].sum() for k in reversed(range(int(np.log2(max(face.shape)))))])

@@ -56,7 +56,7 @@ class Demand:
 
     @property
     def rank(self) -> tuple[float, float]:
-        """Sort key, smallest for the best solution: `crossed` + `outside` (0 up to REPORTED_FRACTION), RMS angle."""
+        """Sort key, smallest for the best solution: (crossed + outside, or 0 up to REPORTED_FRACTION; RMS angle)."""
         lost = self.crossed + self.outside
         return (lost if lost > REPORTED_FRACTION else 0.0), self.rms_angle
 

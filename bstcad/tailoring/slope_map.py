@@ -53,7 +53,7 @@ from bstcad.transport.mapping import Solver as Solver  # exported to packages th
 
 SUBCELLS = 2  # samples of the light per axis in a transport cell, since a rim may cross the cell
 SUBPIXELS = 8  # number of pixel parts per axis in a transport cell; a pixel has at least one part
-SLOPE_FLOOR = 1e-3  # smallest density of light over slopes, relative to its mean: the solver needs some in black parts
+SLOPE_FLOOR = 1e-3  # smallest density of light over slopes, relative to its mean: the solver needs light in black parts
 GATHERING_NET, GATHERING_SAMPLES = 33, 96  # control points per side of g, and samples per side for its fit
 GATHERING_WIDTH = (GATHERING_NET - 1) / (GATHERING_NET - 5)  # width of g / width of the window: end spans lie outside
 GATHERING_FIT = Fit(bending=1e-3, steps=40, degree=5)  # fit of g
@@ -90,7 +90,7 @@ def face_grid(source: Emitter, lens: Lens, window: Rectangle, cells: Sides) -> F
     """Return the rays that meet the last freeform face at the cell centres of a window; cells: number per side.
 
     The flux density is the irradiance from the source on the vertex plane of the first surface times |∂q/∂b|, where
-    the ray through b crosses this plane at q, minus the losses at the faces and in the glass.
+    the ray through b crosses this plane at q, minus the losses before and at this face.
     """
     x, y = (t.to(lens.like.device) for t in sampling.grid(window, cells))
     number = lens.freeform[-1]

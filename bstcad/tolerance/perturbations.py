@@ -320,9 +320,9 @@ def _decentre_front(axis: int, setup: Setup, by: float) -> Setup:
 def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
     """Rotate the back about its vertex v by `by` degrees; front, rim and all other parts stay fixed.
 
-    A point p = v + (x, y, ζ) of the rotated face was at v + q before, with q = Rᵀ (p - v).  The unrotated face is
-    replaced by its tangent plane at (x, y), with an error of curvature · (angle · sag)², 1 nm at a tenth of a degree:
-    q_z = h - h_v + ∇h · ((q_x, q_y) - (x, y)), linear in ζ.
+    A point p = v + (x, y, ζ) of the rotated face was at v + q before, with q = Rᵀ (p - v).  In place of the
+    unrotated face of height h, its tangent plane at (x, y) is used: q_z = h - h(v) + ∇h · ((q_x, q_y) - (x, y)), linear
+    in ζ.  The error of this is curvature · (angle · sag)², 1 nm at a tenth of a degree.
     """
     back = setup.lens.back_net
     turn = Motion.of(turn=_along(axis, by)).inverse.rotation.tolist()

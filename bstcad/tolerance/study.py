@@ -1,8 +1,8 @@
 """Monte Carlo study of a lens with errors: sensitivities, trials, yield, loosest tolerances, gain by adjustment.
 
-The RRMSD of a trial is computed from superposed pictures.  Near its minimum it is nearly quadratic in the errors, and
-its derivatives are of little use, but the derivatives of the picture can be superposed.  With the amounts z in standard
-deviations and the picture E(z), normalised to the flux of the target,
+The RRMSD of a trial is computed from superposed pictures.  Near its minimum the RRMSD is nearly quadratic in the
+errors, and its derivatives are of little use, but the derivatives of the picture can be superposed.  With the amounts z
+in standard deviations and the picture E(z), normalised to the flux of the target,
 
     E(z) ≈ E(0) + Σ_k f_k(ξ_k),   ξ = Vᵀ z,
 
@@ -300,7 +300,7 @@ class Study:
         return np.argsort(self.full)[::-1][:WORST_SHOWN].tolist()
 
     def fraction_within(self, rrmsds: np.ndarray) -> Yield:
-        """Return the fraction of trials, with these RRMSDs, that are within the limit."""
+        """Return (low, estimate, high) of the fraction within the limit, for trials with these RRMSDs."""
         return estimate_yield(rrmsds <= self.limit)
 
     @property
@@ -314,7 +314,7 @@ class Study:
 
 
 def estimate_yield(good: np.ndarray) -> Yield:
-    """Return the fraction of trials (trials,) that are True, with its confidence interval."""
+    """Return (low, estimate, high) of the fraction of trials (trials,) that are True; low, high: 95 % interval."""
     interval = binomtest(int(good.sum()), len(good)).proportion_ci(method="wilson")
     return float(interval.low), int(good.sum()) / len(good), float(interval.high)
 
