@@ -48,8 +48,8 @@ class WholePart:
     """A part with walls other than those over the lens's outline: with a flange, draft, a bevel or a cut."""
 
     edge: np.ndarray  # points along the edge of the back, (n, 2), mm
-    low: Coordinates  # smallest x, y and z (mm) of all faces except freeform ones, whose edges other faces share
-    high: Coordinates  # largest x, y and z (mm)
+    low: Coordinates  # smallest x, y and z (mm) of the part's faces except freeform ones, whose extent the lens gives
+    high: Coordinates  # largest x, y and z (mm) of these faces
     properties: MassProperties | None  # None: a face is of a kind that cannot be integrated
 
 

@@ -112,7 +112,7 @@ def _variant() -> str:
 
 
 def _render(scene: Any, screen: Screen, photons: float, seed: tuple[int, ...]) -> tuple[np.ndarray, int]:
-    """Return the flux in each pixel, area x π radiance / reflectance, row 0 = y max, and the number of photons."""
+    """Return the flux per pixel (its area x π radiance / reflectance; row 0 = y max) and the number of photons."""
     pixels, passes = math.prod(screen.shape), math.ceil(photons / PHOTONS_PER_PASS)
     spp = max(1, round(photons / pixels / passes))
     numbers = np.random.SeedSequence([abs(part) for part in seed]).generate_state(passes)

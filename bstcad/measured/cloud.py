@@ -75,4 +75,4 @@ def in_millimetres(points: np.ndarray, outline: Outline) -> tuple[np.ndarray, st
     lens_width = f"and the lens is {width:.3g} mm wide"
     if unit:
         raise ValueError(f"its points cover {extent:.3g} {lens_width}, as if they were in {unit}; give them in mm")
-    raise ValueError(f"its points cover {extent:.3g} mm {lens_width}; give a cloud of its back face, in mm")
+    raise ValueError(f"its points cover {extent:.3g} mm {lens_width}; give a cloud of the lens's back face, in mm")

@@ -172,9 +172,9 @@ def _motion_by_relief(
 def _variances(energy: np.ndarray, modes: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Return the variance (mm²) of the form in each band.
 
-    energy: mean square of amplitudes relative to `noise`, their variance due to noise (mm²); modes: their number.
-    Bands beyond the last detected one continue the last detected ones with a power law of the frequency, which polished
-    and turned faces follow, but stay below the limit of detection.
+    energy: mean square of a band's amplitudes relative to `noise`, their variance due to noise (mm²); modes: number of
+    amplitudes.  Beyond the last detected band, the variance is extrapolated with a power law of the frequency, which
+    polished and turned faces follow, but stays below the limit of detection.
     """
     least = DETECTION_SIGMAS * np.sqrt(2 / modes)
     detected = energy > 1 + least

@@ -335,7 +335,7 @@ def _check_knots(counts: np.ndarray, knots: np.ndarray, points: int, degree: int
         raise damaged(f"a spline has degree {degree}, but 1 to {MAX_DEGREE} are possible")
     rising = np.isfinite(knots).all() and (np.diff(knots) > 0).all()
     if not rising or len(counts) != len(knots) or counts.min() < 1 or counts.sum() != points + degree + 1:
-        raise damaged(f"the knots do not rise, or {counts.sum()} do not fit {points} control points of degree {degree}")
+        raise damaged(f"{counts.sum()} knots do not increase, or do not fit {points} control points of degree {degree}")
 
 
 # ---- stated properties of the part ---------------------------------------------------------------------------------
