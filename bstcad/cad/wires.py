@@ -61,7 +61,7 @@ class LoopPiece:
 
 
 def outline_loop(outline: Outline) -> list[LoopPiece]:
-    """Return the loop of an outline, counterclockwise."""
+    """Return the loop of a circle or of a rectangle with sharp corners, counterclockwise."""
     if isinstance(outline, Circle):
         return circle(0.0, 0.0, outline.radius)
     a, b = outline.half_extent

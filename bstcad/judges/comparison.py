@@ -5,7 +5,7 @@ same light, which has several times as many rays, on pixels coarse enough for th
 
 The module of a judge has three functions.  `cannot(lens, channels)` returns why the judge cannot trace this light, in a
 sentence, or "".  `light(lens, channels)` returns the channels with the losses that the judge simulates.  `trace(lens,
-channels, screen, rays, seed)` returns the picture on a screen of square pixels as faces.Traced.
+channels, screen, rays, seed)` returns the picture on a screen of nearly square pixels as faces.Traced.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class OwnJudge(Protocol):
         """Return the channels with the losses that the judge simulates."""
 
     def trace(self, lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int) -> Any:
-        """Trace `rays` rays and return the picture on a screen of square pixels, as faces.Traced."""
+        """Trace `rays` rays and return the picture on a screen of nearly square pixels, as faces.Traced."""
 
 
 def choose_judges(names: Sequence[str | OwnJudge]) -> tuple[str | OwnJudge, ...]:
