@@ -37,7 +37,7 @@ STEP_TOLERANCE = 1e-10  # largest component (mm at the rim) of a step that ends 
 FOOT_ITERATIONS = 3  # iterations for the foot of a perpendicular; each multiplies the error by distance x curvature
 INDEPENDENT_PATCHES = 100  # assumed number of patches of a face with independent form errors
 SCALE_PATCHES = 16  # assumed number of independent patches of form errors that resemble a scale error, such as power
-MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty from form errors, in half widths, above which a motion is not determined
+MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty from form errors / BackFace.reach, above which a motion is not determined
 MIN_SENSITIVITY = 1e-7  # smallest change of distance per motion (mm per mm); smaller values are rounding errors
 RIM_MARGIN = 2e-3  # width, in half widths, of the rim that is ignored: points there may lie on the edge
 FACE_DISTANCE_FRACTION = 0.25  # largest distance along z of a point from the face, per smallest thickness of the lens
@@ -55,7 +55,7 @@ class BackFace:
 
     lens: Lens
     pivot: np.ndarray  # centre of rotations (3,), mm, on the axis of the face
-    reach: float  # half of the larger side, mm
+    reach: float  # half of the larger side of the outline, mm
     max_distance: float  # distance along z (mm) above which a point does not belong to the face
 
     @classmethod
@@ -294,12 +294,12 @@ def _neighbour_planes(
 
 # --- starting poses ---------------------------------------------------------------------------------------------------
 
-START_TOLERANCE = 1e-4  # distance, in half widths, below which a start is accepted at once
+START_TOLERANCE = 1e-4  # distance / BackFace.reach, below which a start is accepted at once
 START_SAMPLE, AXES_SAMPLE = 3000, 1000  # number of points for the starts, and for exchanges of axes
 START_STEPS, AXES_STEPS = 40, 15  # Gauss-Newton steps from each start, and for exchanges of axes
 START_FRACTION = 0.25  # minimum fraction of the points that a start brings onto the face
 IMPROVEMENT_RATIO = 0.5  # ratio of distances below which a later start replaces the best earlier one
-DECENTRE_RING = 0.15  # decentre of further starts, in half widths, if the first ones do not fit
+DECENTRE_RING = 0.15  # ratio of the decentre of further starts to BackFace.reach, used if the first ones do not fit
 
 
 def first_pose(face: BackFace, cloud: np.ndarray) -> tuple[Pose, float]:

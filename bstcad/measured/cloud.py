@@ -25,7 +25,7 @@ class Cloud:
     """Measured points before alignment."""
 
     points: np.ndarray = field(repr=False)  # positions of the points (n, 3), mm, in the frame of the instrument
-    unit: str  # unit, "mm" or "inches", that fits the extent of the numbers, in mm if a heading states a unit
+    unit: str  # "mm" or "inches", whichever fits the lens, after conversion to mm if a heading states a unit
     path: Path
     sha256: str = ""  # hash of the file
     without_data: int = 0  # number of points of the file that lack a coordinate and are left out
