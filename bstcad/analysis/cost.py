@@ -22,7 +22,7 @@ from bstcad.optics.irradiance import Screen
 # --- the end of the convergence curve ---------------------------------------------------------------------------------
 
 LAST_TENTH_RATIO = 1.1  # RRMSD divided by its final value, below which time counts for the last tenth of the error
-FITTED_FRACTION = 0.5  # end of the curve, as a fraction of its time, to which the power law is fitted
+FITTED_FRACTION = 0.5  # fraction of the time, at the end of the curve, to which the power law is fitted
 MIN_FIT_POINTS = 5  # smallest number of points for a fit
 MIN_R_SQUARED = 0.9  # smallest R² of the fit in logarithms that counts as a power law
 MAX_HALVING = 10.0  # largest reported factor by which the time grows if the error is halved

@@ -85,7 +85,7 @@ def ray_map(source: Emitter, lens: Lens, plane: Receiver) -> tuple[np.ndarray, n
 # --- clear apertures needed -------------------------------------------------------------------------------------------
 
 NEEDED_RAYS = 513  # rays per side for `needed_apertures`
-ROUND_RATIO = 1.01  # largest radius of light that counts as round, relative to its half width and half height
+ROUND_RATIO = 1.01  # largest radius / smaller half side of a patch of light that counts as round
 EXTENT_POINTS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # points of an extended source, in half extents
 FULL_APERTURE = 0.99  # smallest extent of the light / clear aperture at which light fills the face
 
@@ -243,7 +243,7 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
 
 # --- blur by an extended source ---------------------------------------------------------------------------------------
 
-MIN_DISTANCE_RATIO = 2.5  # smallest target distance / width of lens or picture, for a plate of thickness width / 10
+MIN_DISTANCE_RATIO = 2.5  # smallest suggested distance / longest side of lens and picture (plate: side / 10 thick)
 MAX_NEARER_RATIO = 0.9  # largest reported ratio of the finest detail on a nearer target to the one on the target
 
 

@@ -23,7 +23,7 @@ from bstcad.optics.sampling import sample_rim
 
 GRID_POINTS = 1025  # points per side of the grid for thickness, and along a quarter of the rim
 HEIGHT_ROUNDING = 1e-13  # rounding of the heights, relative to the largest height
-SMOOTH_RATIO = 2.0  # largest ratio of the slope energies of the highest octave and the next one without ripple
+SMOOTH_RATIO = 2.0  # largest slope energy of the highest octave / octave below it, for a net without ripple
 AT_BOUND = 0.97  # fraction of a bound above which a point counts as at the bound (the penalty begins at 0.99)
 MIN_CURVATURE, MAX_RADIUS = 1e-9, 1e9  # curvature (1/mm) below which a face is flat; its radius then (mm)
 OUTLINE_ROUNDING = 1e-9  # relative rounding of the outline, so that the last points of a net that ends there are inside

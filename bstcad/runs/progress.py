@@ -19,7 +19,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 ProgressFunction = Callable[[str, int, int, str], None]
 LINE_INTERVAL = 3.0  # shortest time (s) between two lines of a stage, if the output is not a terminal
-REDRAW_INTERVAL = 0.2  # shortest time (s) between two updates of a stage in a notebook
+REDRAW_INTERVAL = 0.2  # shortest time (s) between two updates of the table in a notebook, unless a stage ends
 
 
 class Throttled:

@@ -77,7 +77,7 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
 def ignored_by_children() -> Iterator[None]:
     """Make processes that start in the block ignore a terminal's signals; this process receives them after the block.
 
-    In the block, the signals are blocked, so that they are kept; a system that cannot block signals loses them.
+    Until its end the signals are masked, so that they are kept; a system that cannot mask signals loses them.
     """
     masks = hasattr(signal, "pthread_sigmask")
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL_SIGNALS) if masks else ()

@@ -26,7 +26,7 @@ from bstcad.optics.outlines import inside
 from bstcad.optics.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 
-PENALTY_MARGIN = 0.01  # relative distance from a bound at which the penalty begins (thickness: / unit of its excess)
+PENALTY_MARGIN = 0.01  # relative distance from a bound at which the penalty begins (thickness: in units of its excess)
 QUARTER_RIM_POINTS = 1025  # number of points along a quarter of the rim
 CELL_POINTS = 4  # control points per axis on which a cell may depend: it lies in at most two knot spans
 TILE_CELLS = 16  # number of cells per axis in a tile

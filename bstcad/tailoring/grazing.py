@@ -32,7 +32,7 @@ from bstcad.tailoring.slope_map import face_grid, interpolate, lit_window, rays_
 
 PENALTY_WEIGHT = 100.0  # weight of the penalty relative to RRMSD²
 MAX_LIGHT_CELLS = 257  # largest number of cells per side of the grid from which the light is interpolated
-PENALTY_START = 0.6  # value of u above which `without_reflection` adds its penalty
+PENALTY_START = 0.6  # value of u at which the penalty of `without_reflection` begins
 ACCEPTED_EXCESS = 0.5  # largest accepted (u - PENALTY_START) / (1 - PENALTY_START) after `without_reflection`
 MAX_EVALUATIONS = 60  # largest number of evaluations of the penalty in `without_reflection`
 

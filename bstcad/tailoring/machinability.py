@@ -169,7 +169,7 @@ def _shape_excess(net: BSplineSurface, outline: Outline, bounds: Bounds) -> tupl
 def _spans_near_bounds(
     net: BSplineSurface, outline: Outline, bounds: Bounds
 ) -> Iterator[tuple[Spans, Tensor, float, Callable[[Jet], Tensor]]]:
-    """Yield (spans, True for their points inside the outline, bound, quantity) for spans that may be near a bound."""
+    """Yield (spans, mask of their points inside the outline, bound, function for its quantity) for spans near it."""
     for bound, upper_limit, quantity in (
         (bounds.concave, partial(bspline.curvature_bounds, net, 1.0), lambda jet: jet.curvatures[0]),
         (bounds.convex, partial(bspline.curvature_bounds, net, -1.0), lambda jet: -jet.curvatures[1]),

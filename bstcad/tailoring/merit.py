@@ -364,7 +364,7 @@ def control_point_axes(net: BSplineSurface) -> tuple[Tensor, Tensor]:
 def _excess_leverage(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, on_screen: np.ndarray) -> np.ndarray | None:
     """Return the leverage relative to MIN_LEVERAGE times its median (m, n), at least 1; None if it is 1 everywhere.
 
-    The leverage is the largest singular value of ∂t/∂p (mm), the inverse of the smallest one of ∂p/∂t; p(b, t) are the
+    The leverage is the largest singular value of ∂t/∂p, the inverse of the smallest one of ∂p/∂t; p(b, t) are the
     slopes that send light from b to the target point t.
     """
     for some in (slice(None, None, LEVERAGE_STRIDE), slice(None)):

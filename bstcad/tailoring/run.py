@@ -122,7 +122,7 @@ class Task:
     # error of a picture relative to the target in the merit, both (rows, columns) and of sum <= 1; None: RRMSD²
     merit: Callable[[Tensor, Tensor], Tensor] | None = None
     wave: Wave | None = None  # required wavefront behind the lens; None: no wavefront goal
-    preview: bool = False  # preview: one round per stage, no RRMSD by rays, no costly alternative
+    preview: bool = False  # preview: one round in stages 2 and 3, no RRMSD by rays, no costly alternative
     solution: float | None = None  # sign σ of light_behind.py, +1 or -1; None: feasibility.py chooses
     floor: float = 0.0  # smallest irradiance, relative to the mean, of the furthest picture in stage 1 of two faces
     # control points per side of the front as a function of those of the back; None: the front is not freeform

@@ -38,7 +38,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import point_pairs
 
-IMAGE_NODES = 5  # nodes per side; the outermost lie on the edges of the screen
+IMAGE_NODES = 5  # nodes t_n per side of the screen; the outermost lie on its edges
 IMAGE_GRID = 32  # cells per side of the back through which the images of the source are traced
 POINT_DISTANCE = 0.7  # spacing of the 3 x 3 points of the source along each axis, in half widths of the source
 IMAGE_PAIRS = 256  # pairs of source points that represent an image
@@ -119,7 +119,7 @@ class LocalImages:
     """Images of the source through points of the back, relative to the landing point of the centre's light."""
 
     at: Tensor  # (2, points) landing points of the centre's light (column, row) in pixels
-    offset: Tensor  # (2, 9, points) displacement δ of 3 x 3 points of the source, in pixels
+    offset: Tensor  # (2, 9, points) displacement δ of the light from 3 x 3 points of the source, in pixels
     flux: Tensor  # (9, points) flux from each of the 3 x 3 points, relative to the flux from the centre
 
     @classmethod

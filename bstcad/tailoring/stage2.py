@@ -206,7 +206,7 @@ def round_shares(task: Task) -> RoundFractions | None:
 
 
 def sheet_sizes(knobs: ResolvedTailoring, shares: RoundFractions | None = None) -> Iterator[tuple[int, int]]:
-    """Yield (tubes per side, evaluations) of each round; tubes: at least min(control points, knobs.rays)."""
+    """Yield (tubes per side, evaluations) of each round; tubes: at least min(knobs.side, knobs.rays)."""
     shares = shares or (DENSE_ROUNDS if knobs.rays >= DENSE_TUBES * knobs.side else SPARSE_ROUNDS)
     if knobs.stage2_iterations < MIN_EVALUATIONS:
         shares = ((1.0, 1.0),)

@@ -127,7 +127,7 @@ def _names_error(table: Sequence[Tolerance], error: str) -> bool:
 
 
 def _face_errors(lens: Lens, table: Sequence[Tolerance]) -> Iterator[Perturbation]:
-    """Yield form errors and ripple; those of the front only if the table names them, since they double the time."""
+    """Yield form errors and ripple; form of the front only if the table names it, since it doubles the time."""
     for name in (*FORM, *RIPPLE):
         values, by_name = settings_of(table, name), _names_error(table, name)
         face = name.partition(".")[0]

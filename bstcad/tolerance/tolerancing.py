@@ -161,7 +161,7 @@ def _of_wavefront(study: Study) -> WavefrontStudy:
 
 
 def _joint_yield(goals: Sequence[Study], trials: str) -> Yield:
-    """Return the fraction of the trials ("linear", "full" or "adjusted") that are within the limits of all goals."""
+    """Return (low, estimate, high) of the fraction of trials ("linear", "full" or "adjusted") within all limits."""
     return estimate_yield(np.logical_and.reduce([getattr(goal, trials) <= goal.limit for goal in goals]))
 
 
