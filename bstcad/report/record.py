@@ -122,7 +122,7 @@ class DesignCourse:
     history: tuple[CurvePoint, ...] = ()
     machine: Mapping[str, Scalar] | None = None
     versions: Mapping[str, str] | None = None  # versions of the libraries
-    # record of the transport solver: grid, iterations, mass error, reason to stop; steepness (analysis.steepness)
+    # grid (cells per side), iterations, mass_error and stopped (reason) of the transport; steep_share, steepest_deg
     transport: Mapping[str, Scalar] | None = None
     skipped_steps: int | None = None  # number of steps skipped because merit or gradient was not finite
     stopped: str | None = None  # reason why tailoring ended
@@ -187,7 +187,7 @@ class Contents:
     contrast: Size | None = None  # mean irradiance of lit divided by dark pixels; None: no dark pixels, or no leak
     optic: Literal["lens", "mirror"] = "lens"  # kind of the design
     quality: str | None = None  # tailoring.quality of the scene
-    # record of the transport solver: grid, iterations, mass error, reason to stop; steepness (analysis.steepness)
+    # grid (cells per side), iterations, mass_error and stopped (reason) of the transport; steep_share, steepest_deg
     transport: Mapping[str, Scalar] | None = None
     skipped_steps: Annotated[int, Field(ge=0)] | None = None  # steps skipped: merit or gradient not finite
     stopped: str | None = None  # reason why tailoring ended
@@ -195,7 +195,7 @@ class Contents:
     rrmsd_asked: Size | None = None  # accept.rrmsd of the scene; None: no limit
     rays_traced: int | None = None  # number of rays that measured the light on the target with the largest RRMSD
     shape: Mapping[str, float | None] | None = None  # dimensions (analysis.shape.describe) and volume (mm³)
-    # margin to total reflection (deg), smallest divisor in Newton's method, largest curvature (1/mm), non-finite values
+    # tir_margin_deg, newton_slope_min (smallest divisor in Newton's method), curvature_max (1/mm), non_finite (number)
     stability: Mapping[str, float | int | None] | None = None
     blur: Blur | None = None  # blur by the source's size; None: a point source or parallel light
     finest_detail: FinestDetail | None = None  # finest detail on the target; None: no size of the source
@@ -204,7 +204,7 @@ class Contents:
     given_up: tuple[str, ...] = ()  # text of the remarks
     remarks: tuple[str, ...] = ()  # ids of the remarks, in the order of given_up
     estimates: tuple[LeftOut, ...] = ()  # changes by effects that are not simulated, the largest first
-    # end of the convergence curve, fields of analysis.cost.ConvergenceEnd; None: there is no curve
+    # end of the curve: rrmsd, last_tenth_seconds, last_tenth, power, fit, halving (ConvergenceEnd); None: no curve
     convergence: Mapping[str, Size | None] | None = None
     # distribution of the remaining error: parts [{name, error, pixels}] (fractions of the squared error and of the
     # pixels), octaves [{frequency (cycles per pixel), period (in the target's unit), error}], outside (fraction of the

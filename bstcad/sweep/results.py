@@ -60,7 +60,7 @@ class KnobPoint(StoredRecord):
 
 
 class TableKnob(StoredRecord):
-    """Knob with its points that were run."""
+    """Setting of a scene that was varied (knob), with its points that were run."""
 
     key: str  # name for programs, such as "tubes"
     title: str  # name in words
@@ -109,7 +109,7 @@ class TradeoffTable(StoredRecord):
     reference: dict[str, Any]  # reference for the RRMSD: rays (numbers of rays, ascending), what (in words)
     calibration: Calibration  # time of the calibration kernel
     runs: tuple[ColdRun, ...]  # ended runs, then the others, both in order of importance
-    knobs: tuple[TableKnob, ...]  # knobs that were varied
+    knobs: tuple[TableKnob, ...]  # settings that were varied
     front: tuple[StoredSettings, ...]  # settings of the runs on the Pareto front, the fastest first
     front_halving: float | None  # factor of the time that halves the error along the front
     presets: tuple[Preset, ...]  # quality presets that were run
