@@ -176,7 +176,7 @@ def _octaves(error: np.ndarray, per_unit: float) -> list[dict[str, Any]]:
 
 DARK_LEVEL = 0.01  # a pixel of the target is dark below this irradiance, as a fraction of the mean
 UNLIT_LEVEL = 0.1  # a lit pixel counts as unlit below this fraction of its target irradiance
-MIN_UNLIT_FRACTION = 5e-3  # smallest unlit fraction of the lit area that is reported
+MIN_UNLIT_FRACTION = 5e-3  # smallest reported unlit fraction, both of the lit area and of its light
 
 
 def unlit(target: np.ndarray, irradiance: np.ndarray, screen: Screen) -> dict[str, Any]:

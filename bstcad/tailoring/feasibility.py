@@ -74,8 +74,8 @@ class Demand:
         if self.crossed > REPORTED_FRACTION:
             yield (
                 f"rays of {100 * self.crossed:.3g} % of the light would have to cross between the lens and the nearest "
-                "target, so the further targets get their pictures only approximately; bring the nearest target closer "
-                "to the lens, or move the others further away"
+                "target, so the lens makes the further pictures or the wavefront only approximately; bring the nearest "
+                "target closer to the lens, or move the others further away"
             )
         if self.outside > REPORTED_FRACTION:
             yield (
