@@ -70,7 +70,7 @@ COMPARISON_STAGE = "float32 beside float64"  # name of the stage that compares p
 # picture of 512 x 512 pixels, and per target for the finer flux tubes that two nets need.
 BASE_SECONDS, SECONDS_PER_NET, SECONDS_PER_PICTURE, SECONDS_PER_WITNESS = 4.0, 5.0, 3.0, 15.0
 REACH_NET = 33  # control points per side of the flat back with which the reach of light is computed
-MIN_REACHABLE = 1e-3  # smallest fraction of a target's light that must be reachable
+MIN_REACHABLE = 1e-3  # reachable fraction of a target's light up to which a scene is refused
 REACH_REMEDIES = {  # advice for a target that light cannot reach completely, for each optic
     "lens": "move the target nearer to the axis or further away, raise lens.index, or use a mirror",
     "mirror": "move the target nearer to where a flat mirror would send the light, or further away",
@@ -123,12 +123,12 @@ def design(
 
     hooks: functions that are called during the design.  Once `hooks.interrupted` returns True, tailoring ends with the
     best lens so far, or with KeyboardInterrupt if there is no lens yet.
-    began: start of tailoring.max_time (time.perf_counter(), default now), which includes writing and verification.
+    began: time.perf_counter() when tailoring.max_time began (None: now); this time includes writing and verification.
     start: state that `hooks.save` received; the design continues from this state and has the same result.
     """
     began, merit = time.perf_counter() if began is None else began, options.merit
     if merit is not None and (len(scene.targets) > 1 or scene.wavefront is not None):
-        raise SceneError("merit: needs a scene with one goal, but this one has several; omit merit, or the other goals")
+        raise SceneError("merit: it needs a scene with one goal, not several; omit merit, or omit the other goals")
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
     goals, edge = within_reach(scene, hooks.progress)
@@ -291,7 +291,7 @@ def _with_comparison(making: DesignCourse, task: Task, lens: Lens, before: int) 
 
 
 def _design_course(result: Stage1Result, record: DesignRecord, stopped: str, steep: Steepness) -> DesignCourse:
-    """Return the record of a tailoring for the report."""
+    """Return the course of a design for the report; stopped: reason why tailoring ended."""
     solved = result.mapping.transport
     return DesignCourse(
         seconds_total=record.seconds,

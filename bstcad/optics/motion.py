@@ -18,7 +18,7 @@ ORIGIN: Vector = (0.0, 0.0, 0.0)  # origin, mm
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Rigid motion x -> p + R (x - p) + t."""
+    """Rigid motion of points x -> p + R (x - p) + t: a rotation R about p, then a shift t."""
 
     rotation: np.ndarray  # rotation matrix R, (3, 3)
     about: Vector = ORIGIN  # fixed point p of the rotation, mm
@@ -26,7 +26,7 @@ class Motion:
 
     @classmethod
     def of(cls, shift: Vector = ORIGIN, turn: Vector = ORIGIN, about: Vector = ORIGIN) -> Motion:
-        """Return a rotation by `turn` (degrees) about the x, then y, then z axis through `about`, then a shift (mm)."""
+        """Return rotations by `turn` (degrees) about fixed axes x, y, z through `about`, then a shift (mm)."""
         return cls(Rotation.from_euler("xyz", turn, degrees=True).as_matrix(), about, shift)
 
     @property
@@ -36,7 +36,7 @@ class Motion:
         return Motion(back, self.about, tuple((-back @ np.array(self.shift)).tolist()))
 
     def after(self, first: Motion | None) -> Motion:
-        """Return the motion that applies `first` and then this motion; first None: this motion."""
+        """Return the motion that applies `first` and then this motion; this motion alone if `first` is None."""
         if first is None:
             return self
         return Motion(self.rotation @ first.rotation, shift=self.point(first.point(ORIGIN)))
@@ -52,5 +52,5 @@ class Motion:
         return tuple((about + self.rotation @ (np.array(place) - about) + np.array(self.shift)).tolist())
 
     def direction(self, vector: Vector) -> Vector:
-        """Return a direction vector after the motion."""
+        """Return a direction vector after the motion, which only rotates it."""
         return tuple((self.rotation @ np.array(vector)).tolist())

@@ -1,10 +1,10 @@
 """Registry of the functions of optics that have a kernel, by device.
 
 A kernel returns the values of the plain form (torch code) of its function to rounding and accepts the same tensors.
-The caller requests it by name and runs the plain form where there is none, as on a GPU.  A kernel for a GPU is one more
-entry in the row of its function.  On every device some computations run on the CPU: the blur by the image of a source,
-stage 1's transport, the map between two faces, the bounds and checks of a net's shape, and the rays by which a design
-is verified.  The cosine transform of stage 2 is scipy's on the CPU and a product of matrices elsewhere.
+The caller requests a kernel by name and runs the plain form if there is none, as on a GPU.  A kernel for a GPU is one
+more entry in the row of its function.  On every device some computations run on the CPU: the blur by the image of a
+source, stage 1's transport, the map between two faces, the bounds and checks of a net's shape, and the rays by which a
+design is verified.  The cosine transform of stage 2 is scipy's on the CPU and a product of matrices elsewhere.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ WHOLE_PATHS = [("net", True)], [("revolved", False), ("net", False)]
 
 
 def kernel(name: str, *tensors: Tensor) -> Callable[..., Any] | None:
-    """Return the kernel of a function for these tensors (of one device and one of DTYPES); None: use the plain form."""
+    """Return the kernel for a function and tensors of one device and one of DTYPES; None: there is no such kernel."""
     device, dtype = tensors[0].device.type, tensors[0].dtype
     found = KERNELS[name].get(device) if ENABLED else None
     if found is None or dtype not in DTYPES or any(t.device.type != device or t.dtype != dtype for t in tensors):
@@ -48,7 +48,7 @@ def kernel(name: str, *tensors: Tensor) -> Callable[..., Any] | None:
 
 
 def whole_kernel(name: str, interfaces: Sequence[Any]) -> Callable[..., Any] | None:
-    """Return the kernel that traces rays across all of these Interfaces (WHOLE_PATHS); None if there is none."""
+    """Return the kernel `name` that traces rays across all these Interfaces (WHOLE_PATHS); None: there is none."""
     path = [(SURFACE_FORMS.get(interface.surface.kind), interface.law.reverses) for interface in interfaces]
     if path not in WHOLE_PATHS or not all(loss.fused for interface in interfaces for loss in interface.losses):
         return None

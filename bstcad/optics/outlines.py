@@ -20,12 +20,12 @@ STRICT = {"extra": "forbid", "arbitrary_types_allowed": True, "revalidate_instan
 # (a, b, r²) of an outline in mm, mm and mm²: the interior is max(|x| - a, 0)² + max(|y| - b, 0)² <= r².  All outlines
 # are boxes with round corners; a circle (a = b = 0) and a rectangle (r = 0) are the limiting cases.
 Limits = tuple[float, float, float]
-SIZE_RANGE = (1e-3, 1e6)  # range of the size of an outline in a scene, mm
+SIZE_RANGE = (1e-3, 1e6)  # smallest and largest width, height or radius of an outline in a scene, mm
 OUTLINE_POINTS = 720  # rim points on the arcs of an outline together, and about as many on its straight sides together
 
 
 class _Box(ABC):
-    """Methods of all outlines that follow from their limits."""
+    """Base of the outlines: the methods that follow from `limits`."""
 
     is_round = False  # True for a circle
 
@@ -36,7 +36,7 @@ class _Box(ABC):
 
     @property
     def farthest(self) -> tuple[float, float]:
-        """Point (x, y) of the rim that is farthest from the axis (mm): in line with the axis and an arc's centre."""
+        """Point (x, y) (mm) of the rim that is farthest from the axis, with x, y >= 0: a corner, or an arc's middle."""
         a, b, r2 = self.limits
         r, d = math.sqrt(r2), math.hypot(a, b)
         return (a * (1 + r / d), b * (1 + r / d)) if d else (r, 0.0)
@@ -46,7 +46,7 @@ class _Box(ABC):
         return inside(self.limits, x, y)
 
     def depth(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the distance (mm) of points from the rim, positive inside and negative outside."""
+        """Return the distance (mm) of points (x, y) (mm) from the rim, positive inside and negative outside."""
         a, b, r2 = self.limits
         x, y = np.abs(x) - a, np.abs(y) - b
         return math.sqrt(r2) - np.hypot(np.maximum(x, 0.0), np.maximum(y, 0.0)) - np.minimum(np.maximum(x, y), 0.0)
@@ -68,7 +68,7 @@ class _Box(ABC):
         return x, y
 
     def inset_direction(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the shift (mm) of rim points for an inset of 1 mm: along the normal; (-x/a, -y/b) on a rectangle."""
+        """Return the shift (x, y) of rim points per mm of inset: along the normal, on a rectangle (-x/a, -y/b)."""
         a, b, r2 = self.limits
         if r2 == 0:
             return -x / a, -y / b
@@ -93,7 +93,7 @@ class Rectangle(_Box):
 
     @property
     def limits(self) -> Limits:
-        """Limits (a, b, r²) of the interior: mm, mm and mm², as in `Limits`."""
+        """Limits (a, b, r²), see `Limits`: half the sides (mm) and r = 0."""
         return self.width / 2, self.height / 2, 0.0
 
     @property
@@ -107,7 +107,7 @@ class Rectangle(_Box):
         return f"{self.width:.6g} x {self.height:.6g} mm"
 
     def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """Map points (a, b) of the square from -1 to 1 onto the outline (mm), rim to rim."""
+        """Map points (a, b) of the square |a|, |b| <= 1 to points (x, y) (mm) of the outline, rim to rim."""
         return a * (self.width / 2), b * (self.height / 2)
 
     def scaled(self, by: float) -> Rectangle:
@@ -121,13 +121,13 @@ class Rectangle(_Box):
 
 @dataclass(frozen=True)
 class Rounded(Rectangle):
-    """A rectangle with rounded corners, of a radius of at most half the width and half the height."""
+    """A rectangle with rounded corners, whose radius is at most half the shorter side."""
 
     corner_radius: float = 0.0  # radius of the corners, mm
 
     @property
     def limits(self) -> Limits:
-        """Limits (a, b, r²) of the interior: mm, mm and mm², as in `Limits`."""
+        """Limits (a, b, r²), see `Limits`: half the straight sides (mm), and the square of the corner radius (mm²)."""
         r = self.corner_radius
         return self.width / 2 - r, self.height / 2 - r, r * r
 
@@ -142,7 +142,7 @@ class Rounded(Rectangle):
         return f"{super().words} with corners of {self.corner_radius:.4g} mm"
 
     def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """Map points (a, b) of the square from -1 to 1 onto the outline (mm), smaller squares onto scaled outlines."""
+        """Map points (a, b) of the square |a|, |b| <= 1 to (x, y) (mm), and smaller squares onto scaled outlines."""
         ring = torch.maximum(a.abs(), b.abs()).clamp(min=1e-300)
         x, y = a.abs() / ring * (self.width / 2), b.abs() / ring * (self.height / 2)  # on the rectangle's rim
         c, d, r2 = self.limits
@@ -179,7 +179,7 @@ class Circle(_Box):
 
     @property
     def limits(self) -> Limits:
-        """Limits (a, b, r²) of the interior: mm, mm and mm², as in `Limits`."""
+        """Limits (a, b, r²), see `Limits`: a = b = 0, and the square of the radius (mm²)."""
         return 0.0, 0.0, self.radius**2
 
     @property
@@ -193,7 +193,7 @@ class Circle(_Box):
         return f"Ø{2 * self.radius:.6g} mm"
 
     def map_square(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """Map points (a, b) of the square from -1 to 1 onto the disc (mm), equal-area (Shirley and Chiu 1997)."""
+        """Map points (a, b) of the square |a|, |b| <= 1 to (x, y) (mm), equal-area (Shirley and Chiu 1997)."""
         steep = b.abs() > a.abs()
         long, short = torch.where(steep, b, a), torch.where(steep, a, b)
         turn = (math.pi / 4) * short / torch.where(long == 0, torch.ones_like(long), long)

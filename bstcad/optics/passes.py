@@ -80,7 +80,7 @@ class Passes:
         return (-1) ** sum(law is Reflect for _, law in self.steps)
 
     def deflection(self, face: Face, index: float) -> float:
-        """Return the ratio of a ray's deflection by a face to the slope angle of the face, for small angles."""
+        """Return the deflection, by all passes at a face, divided by the slope angle of the face, for small angles."""
         by_law = {Reflect: 2.0 * (index if self.enters else 1.0), Refract: abs(index - 1)}
         return sum(by_law[self.steps[k].law] for k in self.numbers_of(face))
 
@@ -90,7 +90,7 @@ class Passes:
 
     @property
     def optic(self) -> Literal["lens", "mirror"]:
-        """Name of the solid."""
+        """Name of the solid: "mirror" if a face reflects the light."""
         return "mirror" if self.reflects else "lens"
 
     @property
@@ -99,12 +99,12 @@ class Passes:
         return f"by a {self.optic}'s {', '.join(step.face for step in self.steps)}"
 
     def name(self, face: Face) -> str:
-        """Return "front" or "back" for a face that refracts, "mirror face" if it only reflects, "rear" if dark."""
+        """Return "front" or "back" if a face refracts, "mirror face" if it only reflects, "rear" if light misses it."""
         laws = [self.steps[k].law for k in self.numbers_of(face)]
         return face if Refract in laws else "mirror face" if laws else "rear"
 
     def role(self, face: Face) -> str:
-        """Return in words what light does at a face."""
+        """Return what light does at a face, such as "light enters and leaves"; "dark" if no light meets it."""
         crossings = [k for k in self.numbers_of(face) if self.steps[k].law is Refract]
         ends = {0: "enters", len(self.steps) - 1: "leaves"}
         does = " and ".join(ends[k] for k in crossings if k in ends)

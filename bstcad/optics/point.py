@@ -30,8 +30,8 @@ MAX_CONE_HALF_ANGLE = math.radians(89.0)  # rad, half angle below which light ha
 class Point(Emitter):
     """Rays from one point into the half space on the side of the lens.
 
-    gaussian: irradiance on z = const ∝ exp(-2 r² / w²), w = distance · tan(half_angle_1e2); lambertian: radiant
-    intensity ∝ cos θ, up to half_angle if there is one; uniform: constant radiant intensity up to half_angle.
+    gaussian: irradiance on z = const ∝ exp(-2 r² / w²), r from the axis, w = distance · tan(half_angle_1e2).
+    lambertian: radiant intensity ∝ cos θ, up to half_angle if stated.  uniform: constant intensity up to half_angle.
     A tilt rotates the whole distribution, with its half space, about the point (`_tilted_irradiance`); light that then
     leads away from the lens misses it.  A disc or rectangle of points is perpendicular to the axis of the source.
     """
@@ -66,7 +66,7 @@ class Point(Emitter):
 
     @property
     def start_plane(self) -> float:
-        """z (mm) of the centre."""
+        """z (mm) of the point, or of the centre of the disc or rectangle."""
         return self.position[2]
 
     def nearest_z(self, upwards: bool) -> float:
@@ -75,7 +75,7 @@ class Point(Emitter):
         return self.position[2] + (reach if upwards else -reach)
 
     def complaints(self, z: float, optic: str) -> Iterator[str]:
-        """Yield a sentence per missing or superfluous size, and for a size larger than the distance from the lens."""
+        """Yield "key: sentence" for a missing, superfluous or too large size, larger than the distance to z (mm)."""
         given = [name for name in ("width", "height") if getattr(self, name) is not None]
         if given and self.diameter is not None:
             yield f"diameter: the source also has a {given[0]}; give a diameter, or width and height"
@@ -88,7 +88,7 @@ class Point(Emitter):
             yield f"{name}: {sizes[name]:g} mm is more than {far}; make the source smaller or move it away"
 
     def reference(self, place: Tensor, z: float, sense: int) -> Tensor:
-        """Return the path (mm) from the sphere about the source through o = (0, 0, z) to points o + place, (3, …)."""
+        """Return the path (mm) from a sphere about the source, with o = (0, 0, z) on it, to points o + place (3, …)."""
         x, y, start = self.position
         return path_from_sphere(place, (x, y, start - z))
 
@@ -103,7 +103,7 @@ class Point(Emitter):
         return ", ".join([f"{kind} at ({position}) mm", PROFILE_NAMES[self.profile], *sizes])
 
     def sizes(self) -> Iterator[tuple[str, float, str]]:
-        """Yield diameter, width and height, if stated."""
+        """Yield (key, value, unit) of diameter, width and height, if stated."""
         yield from ((key, size, "mm") for key in SIZE_KEYS if (size := getattr(self, key)))
 
     @property
@@ -112,12 +112,12 @@ class Point(Emitter):
         return self.extent is None or self.extent.is_round
 
     def moved(self, motion: Motion, entrance: float) -> Point:
-        """Return the point source after a motion."""
+        """Return the point source after a motion; entrance: not used."""
         tilt = self.tilt if not motion.rotates else tilt_of(motion.direction(self.axes[2]))
         return replace(self, position=motion.point(self.position), tilt=tilt)
 
     def with_wider_cone(self, by: float) -> Point | None:
-        """Return the source with the tangent of its half angle larger by the fraction `by`; None: no cone."""
+        """Return the source with the tangent of its half angle larger by the fraction `by`; None: no half angle."""
 
         def wider(angle: float) -> float:
             return math.degrees(math.atan((1 + by) * math.tan(math.radians(angle))))
@@ -156,11 +156,11 @@ class Point(Emitter):
         return replace(self, position=position, diameter=None, width=None, height=None)
 
     def irradiance(self, x: Tensor, y: Tensor, z: float) -> Tensor:
-        """Return E(x, y) (1/mm²) on the plane z; the flux into the half space is 1.
+        """Return E(x, y) (1/mm²) on the plane z (mm); the flux into the half space is 1.
 
-        gaussian: 2 / (π w²) exp(-2 r² / w²).  lambertian: I = cos θ / (π sin² θ_max) and E = I cos θ / d², so
-        E = D² / (π sin² θ_max d⁴), D and d the distances of plane and (x, y, z) from the source.  uniform:
-        I = 1 / (2π (1 - cos θ_max)), E = I D / d³.  The last two are zero beyond θ_max, the half angle `edge`.
+        gaussian: 2 / (π w²) exp(-2 r² / w²), r and w as in `Point`.  lambertian: I = cos θ / (π sin² θ_max) and
+        E = I cos θ / d², so E = D² / (π sin² θ_max d⁴), D and d the distances of plane and (x, y, z) from the source.
+        uniform: I = 1 / (2π (1 - cos θ_max)), E = I D / d³.  The last two are zero beyond θ_max, the half angle `edge`.
         """
         distance = abs(z - self.position[2])
         if self.tilted:
@@ -191,11 +191,11 @@ class Point(Emitter):
 
     @property
     def is_cone(self) -> bool:
-        """True if the light has an edge on planes before the lens."""
+        """True if the light is a cone with an edge on planes before the lens."""
         return self.edge < MAX_CONE_HALF_ANGLE
 
     def towards(self, z: float) -> Vector:
-        """Return the axis of the light towards the plane z, in a frame in which that plane lies ahead along +z."""
+        """Return the unit vector of the light's axis towards the plane z, in a frame whose +z points to that plane."""
         n, sense = self.axes[2], 1 if self.position[2] <= z else -1
         return sense * n[0], sense * n[1], n[2]
 
@@ -252,7 +252,7 @@ class Point(Emitter):
         return distance / (2 * math.pi * (1 - math.cos(self.edge))), 0.0, 3, min_cosine
 
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
-        """Return the rectangle on the plane z with all rays that can meet the first surface inside its outline.
+        """Return the rectangle on the plane z (mm) with all rays that can meet the first surface inside its outline.
 
         The surface lies between the planes at `sags` (mm) above the plane z.  Seen from the source, a surface appears
         larger if it bends towards the source, and may appear shifted if it bends away and the source is off the axis.
@@ -272,7 +272,8 @@ class Point(Emitter):
     def _cone_slopes(self, z: float) -> tuple[float, float]:
         """Return the largest |dx/dz| and |dy/dz| of the cone's rays to the plane z; inf if a ray is parallel to it.
 
-        At the limits of X = dx/dz the plane of rays with this X touches the cone: (1 + X²) sin² θ_max = (n_x - n_z X)².
+        At the limits X of dx/dz the plane of rays with this X touches the cone about n: (1 + X²) sin² θ_max =
+        (n_x - n_z X)².
         """
         edge = self.edge
         if not self.tilted:
@@ -292,7 +293,7 @@ class Point(Emitter):
         return Circle(abs(z - self.position[2]) * math.tan(self.edge)), centre
 
     def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
-        """Return rays from the point through (x, y) of the plane z."""
+        """Return rays from the point through (x, y) of the plane z (mm), each with the flux of a cell of `area` mm²."""
         start_x, start_y, start_z = self.position
         towards = torch.stack([x - start_x, y - start_y, torch.full_like(x, z - start_z)])
         direction = towards / torch.sqrt(towards[0] ** 2 + towards[1] ** 2 + towards[2] ** 2)

@@ -17,15 +17,15 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Surface
 
-MIN_SPANS = 128  # smallest number of parts per axis of a net; the spans of a coarser net are divided
-GAUSS_POINTS_PER_PART = 3  # Gauss points in each part of a chord or of an edge
+MIN_SPANS = 128  # smallest number of parts of a chord across a whole net; the spans of a coarser net are divided
+GAUSS_POINTS_PER_PART = 3  # Gauss points in each part of a chord or of a border
 FINE_NET = 400  # smallest number of control points per side at which FINE_POINTS give the area to 1e-9
-FINE_POINTS = 2  # Gauss points in each part of a chord or of an edge of a net of at least FINE_NET points per side
-CHORD_POINTS = 96  # Gauss points of a chord over a smooth face; exact to rounding on a sphere to 0.95 of its radius
+FINE_POINTS = 2  # Gauss points in each part of a chord or of a border on a net of at least FINE_NET points per side
+CHORD_POINTS = 96  # Gauss points of a chord over a face without net; exact to rounding on a sphere to 0.95 radii
 END_PARTS = 12  # minimum number of parts of an end span, where heights are not polynomial; gives volumes to 1e-12
-BORDER_POINTS_PER_STRIP = 512  # border points evaluated at a time
-MIN_RELATIVE_DX = 1e-14  # |dx| / ds up to which border points are left out, since they add nothing
-EDGE_PARTS = 256  # minimum number of parts of an edge's curve
+BORDER_POINTS_PER_STRIP = 512  # number of border points evaluated at a time
+MIN_RELATIVE_DX = 1e-14  # |dx| / ds up to which border points are left out, since they add nothing to ∮ … dx
+EDGE_PARTS = 256  # minimum number of parts of a curve of a border
 
 gauss_rule = functools.cache(np.polynomial.legendre.leggauss)  # points and weights on [-1, 1], by their number
 
@@ -58,9 +58,10 @@ class Sums:
 
 
 def of_face(face: Surface, border: Border, raised: float = 0.0) -> Sums:
-    """Return the sums over z = h(x, y) + raised (mm) inside a border, n dA = (-h_x, -h_y, 1) dx dy; face: in float64.
+    """Return the sums over z = h(x, y) + raised (mm) inside a border, with n dA = (-h_x, -h_y, 1) dx dy.
 
-    ∫∫ g dx dy = -∮ G dx with G = ∫ g dy along a chord of constant x from y = 0 to the border; two Gauss quadratures.
+    ∫∫ g dx dy = -∮ G dx, where G = ∫ g dy along a chord of constant x from y = 0 to the border; a Gauss quadrature
+    each.  h: heights of the face, in float64.
     """
     total = Sums()
     counted = np.flatnonzero(np.abs(border.dx) > MIN_RELATIVE_DX * border.ds)
@@ -78,7 +79,7 @@ def of_wall(face: Surface, border: Border, raised: float = 0.0) -> Sums:
 
 
 def _sums_of_points(face: Surface, raised: float, x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> Sums:
-    """Return the sums over points (x, y) of a face with weights (mm²)."""
+    """Return the sums over points (x, y) (mm) of a face, raised by `raised` (mm); weight: dx dy of each point (mm²)."""
     h, h_x, h_y = (part.numpy() for part in face.relative_sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
     area, h = weight * np.sqrt(1 + h_x * h_x + h_y * h_y), h + raised
     cone = weight * (h - x * h_x - y * h_y)
@@ -106,14 +107,14 @@ def rim_breaks(surface: BSplineSurface, radius: float) -> np.ndarray:
 
 
 def gauss_points(breaks: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return Gauss points and weights, `count` in each interval between breaks."""
+    """Return Gauss points and their weights, `count` points in each interval between neighbouring `breaks`."""
     point, weight = gauss_rule(count)
     half = np.diff(breaks)[:, None] / 2
     return (breaks[:-1, None] + half * (1 + point)).ravel(), (half * weight).ravel()
 
 
 def divided(breaks: np.ndarray, parts: int) -> np.ndarray:
-    """Divide the intervals between breaks evenly into at least `parts` parts in total."""
+    """Return breaks that divide each interval between `breaks` into equal parts, at least `parts` in total."""
     each = math.ceil(parts / (len(breaks) - 1))
     return np.interp(np.arange((len(breaks) - 1) * each + 1) / each, np.arange(len(breaks)), breaks)
 
@@ -143,7 +144,7 @@ def outline_border(outline: Outline, face: Surface) -> Border:
 
 
 def _chords(face: Surface, x: np.ndarray, y: np.ndarray, dx: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (x, y, weights) of points on the chords from y = 0 to points of the border."""
+    """Return (x, y, weights in mm²) of points on the chords from y = 0 to border points (x, y) of weight dx (mm)."""
     ends, count = _chord_ends(face, y)
     chord, part = np.nonzero(np.diff(ends, axis=1) > 0)
     low, high = ends[chord, part], ends[chord, part + 1]
@@ -154,7 +155,7 @@ def _chords(face: Surface, x: np.ndarray, y: np.ndarray, dx: np.ndarray) -> tupl
 
 
 def _chord_ends(face: Surface, y: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return the ends of the parts of each chord, (n, parts + 1), some of length 0, and the Gauss points per part."""
+    """Return y of the ends of each chord's parts, (n, parts + 1), some parts of length 0; and the points per part."""
     low, high = np.minimum(y, 0.0)[:, None], np.maximum(y, 0.0)[:, None]
     if not is_net(face):
         return np.hstack([low, high]), CHORD_POINTS
@@ -189,7 +190,7 @@ class MassProperties:
 
     @classmethod
     def of(cls, total: Sums, z: float) -> MassProperties:
-        """Return the properties of a solid from the sums over its surface, with their origin at z (mm) on the axis."""
+        """Return the properties of a solid from the sums over its surface, whose origin is at z (mm) on the axis."""
         c_x, c_y, c_z = (total.moment / total.volume).tolist()
         return cls(total.area, total.volume, (c_x, c_y, z + c_z))
 

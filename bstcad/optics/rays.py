@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 NO_LOSSES: Mapping[str, Tensor] = MappingProxyType({})
-MIN_AXIAL_COSINE = 1e-9  # smallest cosine of the angle between a ray and the normal of a screen that it can reach
+MIN_AXIAL_COSINE = 1e-9  # cosine of the angle between a ray and a receiver's normal up to which the ray misses it
 
 
 class Status(IntEnum):
@@ -129,5 +129,5 @@ def clocking_of(frame: Frame) -> float:
 
 
 def tilt_of(n: Vector) -> tuple[float, float]:
-    """Return (α, β) in degrees of the frame whose third axis is the unit vector n, n_z > 0."""
+    """Return the tilt (α, β) in degrees whose `axes` have the unit vector n as the third axis."""
     return math.degrees(math.asin(max(-1.0, min(1.0, -n[1])))), math.degrees(math.atan2(n[0], n[2]))

@@ -31,14 +31,14 @@ MAX_SLOPE = math.tan(math.radians(70))  # largest slope: a steeper face cannot b
 
 
 def largest_deflection(index: float, grazing: float = MAX_EXIT_ANGLE) -> float:
-    """Return the angle (rad) by which a face deflects a ray that leaves at `grazing` (rad) from the normal in air."""
+    """Return the deflection (rad), by a face of relative index `index`, of a ray that leaves at the angle `grazing`."""
     return grazing - math.asin(math.sin(grazing) / index)
 
 
 def grazing_of(index: float, others: Iterable[float], spread: float = 0.0) -> float:
-    """Return the exit angle (rad) of a ray up to which no other light at the same point exceeds MAX_EXIT_ANGLE.
+    """Return the largest exit angle (rad) of a ray at which all other light at the point leaves within MAX_EXIT_ANGLE.
 
-    index, others: relative indices at its wavelength and at the others; the largest reaches its critical angle first.
+    index, others: relative indices at the ray's wavelength and at the others; the largest limits the angle.
     spread: largest angle (rad) in the glass between a ray and the other rays that meet the face at the same point.
     """
     largest = math.asin(math.sin(MAX_EXIT_ANGLE) / max((index, *others)))  # incidence at the wavelength deflected most
@@ -46,7 +46,7 @@ def grazing_of(index: float, others: Iterable[float], spread: float = 0.0) -> fl
 
 
 def spread_at(source: Emitter, lens: Lens) -> float:
-    """Return half the angle (rad) that an extended source subtends in front of the last freeform face; 0 for a point.
+    """Return half the angle (rad) of an extended source's light that meets the last freeform face; 0 for a point.
 
     It is the largest angle at the face's centre between light from the source's centre and from the ends of its axes.
     """
@@ -62,7 +62,7 @@ def spread_at(source: Emitter, lens: Lens) -> float:
 
 
 def directions(at_face: Rays, aim: Tensor, plane: Receiver) -> tuple[Tensor, Tensor, Tensor]:
-    """Return (d, d', d · d'): unit vectors (3, …) along rays at a face and from it to aims (2, …) on the receiver."""
+    """Return (d, d', d · d'): unit vectors (3, …) of rays at a face, and from there to aims (2, …) on the receiver."""
     out = plane.vector_to(at_face, aim)
     d, out = at_face.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
     return d, out, dot(d, out)
@@ -78,8 +78,8 @@ def slopes_towards(at_face: Rays, out: Tensor, law: Law) -> tuple[Tensor, Tensor
     """Return the slopes (∂z/∂x, ∂z/∂y) that deflect each ray into the direction d' of `out`, unit vectors (3, …).
 
     By the laws of refraction and reflection the normal (-z_x, -z_y, 1) is parallel to ±(η d - d') (`normal_towards`).
-    If no face can deflect a ray by so large an angle, the slope deflects it to the same side by the largest: that of a
-    ray which meets or leaves the face at MAX_EXIT_ANGLE.  No slope is steeper than MAX_SLOPE.
+    If no face can deflect a ray by so large an angle, the slope deflects it to the same side by the largest angle: that
+    of a ray which meets or leaves the face at MAX_EXIT_ANGLE.  No slope is steeper than MAX_SLOPE.
     """
     d = at_face.direction
     along = dot(d, out)
@@ -100,7 +100,7 @@ def limit_refraction(
 ) -> tuple[Tensor, Tensor]:
     """Limit slopes (∂z/∂x, ∂z/∂y) so that no angle of refraction at a face into air exceeds `grazing` (rad).
 
-    A normal at too large an angle to the ray is rotated towards it in their common plane; other slopes do not change.
+    A normal at too large an angle to its ray is rotated towards the ray in their common plane; others do not change.
     """
     if law.reverses or law.eta <= 1:
         return slopes
@@ -124,7 +124,7 @@ def reach_margin(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing:
     """Return the margin of each ray (a cosine) to the limits of the face; negative: the aim is out of reach.
 
     Minimum of three: d · d' minus the cosine of the largest deflection (not for a mirror); n_z - |(n_x, n_y)| /
-    MAX_SLOPE of `normal_towards`; and the cosine of d' to the receiver's normal away from the lens.
+    MAX_SLOPE of `normal_towards`; and the cosine between d' and the receiver's normal, which points away from the lens.
     """
     _, out, along = directions(at_face, aim, plane)
     normal = normal_towards(at_face, out, law)

@@ -87,7 +87,7 @@ class Receiver(ABC):
     def land(self, rays: Rays) -> Landed:
         """Trace rays from the last interface to the receiver.
 
-        Each component is traced separately, since the gradient of a part of a stacked tensor is as large as the whole.
+        Each component is a tensor of its own: the gradient of a part of a stacked tensor takes the memory of the whole.
         """
         parts = _by_component(rays, rays.position.unbind(0), rays.direction.unbind(0))
         path, status = self.path(parts)
@@ -106,7 +106,7 @@ class Receiver(ABC):
         return torch.stack([x - rays.position[0], y - rays.position[1], z - rays.above(0.0)])
 
     def clearance(self, outline: Outline, z: float) -> float:
-        """Return the least path (mm) along +z from a rim on the plane z to the receiver; -inf if a rim point misses."""
+        """Return the least path (mm) along +z from the rim on the plane z to the receiver; -inf: a point misses it."""
         x, y = (torch.as_tensor(p, dtype=torch.float64) for p in outline.rim_points())
         along = torch.stack([torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)])
         start = torch.stack([x, y, torch.zeros_like(x)])
@@ -115,7 +115,7 @@ class Receiver(ABC):
         return float(path.min()) if bool((status == Status.ALIVE).all()) else -math.inf
 
     def throw(self, z: float) -> float:
-        """Return the distance (mm) from the plane z to the centre, along the axis."""
+        """Return the height (mm) of the centre above the plane z (mm), negative below it."""
         return self.middle[2] - z
 
     def per_radian(self, z: float) -> float:
@@ -123,11 +123,11 @@ class Receiver(ABC):
         return self.throw(z)
 
     def areas(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray | None:
-        """Return areas or solid angles of (rows, columns) cells over x and y, relative to their mean; None: equal."""
+        """Return areas or solid angles of (rows, columns) cells of ranges x, y, relative to their mean; None: equal."""
         return None
 
     def to_level_plane(self, x: Array, y: Array, eye: float) -> tuple[Array, Array]:
-        """Return (x, y) (mm) of coordinates projected from (0, 0, eye) onto the level plane through the centre."""
+        """Return (x, y) (mm) of points of coordinates, projected from (0, 0, eye) onto the centre's level plane."""
         p_x, p_y, p_z = self.point(x, y)
         scale = self.throw(eye) / (p_z - eye)
         return scale * p_x, scale * p_y
@@ -198,7 +198,7 @@ def _rotate(motion: Motion, vector: Array | Sequence[Array]) -> tuple[Array, Arr
 
 
 class PlaneReceiver(Receiver):
-    """Plane of points p = C + (x - o_x) e_x + (y - o_y) e_y: n · (p - C) = 0, with centre C at the coordinates o."""
+    """Plane n · (p - C) = 0 of points p = C + (x - o_x) e_x + (y - o_y) e_y; its centre C has the coordinates o."""
 
     @property
     def frame(self) -> Frame:
@@ -211,7 +211,7 @@ class PlaneReceiver(Receiver):
         return math.fsum(n * (p - c) for n, p, c in zip(self.frame[2], point, self.middle, strict=True))
 
     def clearance(self, outline: Outline, z: float) -> float:
-        """Return the least distance (mm) of an outline on the plane z from this plane; negative: part is behind it."""
+        """Return the least distance (mm) from an outline on the plane z to this plane; negative: part is behind it."""
         return -self.height((0.0, 0.0, z)) - outline.reach(*self.frame[2][:2])
 
     def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
@@ -225,7 +225,7 @@ class PlaneReceiver(Receiver):
         return o_x + dot(e_x, offset), o_y + dot(e_y, offset)
 
     def _from_centre(self, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
-        """Return p - C (mm)."""
+        """Return p - C (mm) of the rays' positions p."""
         x, y, z = self.middle
         return rays.position[0] - x, rays.position[1] - y, rays.above(z)
 
@@ -259,7 +259,7 @@ class LevelPlane(PlaneReceiver):
 
     @property
     def middle(self) -> Vector:
-        """Point on the axis (mm)."""
+        """Point of the plane on the axis (mm)."""
         return 0.0, 0.0, self.z
 
     def _advance(self, rays: Rays) -> tuple[Tensor, Tensor]:
@@ -280,7 +280,7 @@ class LevelPlane(PlaneReceiver):
 
 @dataclass(frozen=True)
 class TiltedPlane(PlaneReceiver):
-    """A tilted plane through C, with x and y measured on it (mm): o = (c_x, c_y).
+    """A tilted plane through C, with x and y measured on it (mm); C has the coordinates (c_x, c_y).
 
     The axes are those of space, rotated first about the x axis by α and then about the y axis by β, right-handed:
     e_x = (cos β, 0, -sin β), e_y = (sin α sin β, cos α, sin α cos β), and the normal, e_x × e_y,

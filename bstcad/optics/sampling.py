@@ -29,7 +29,7 @@ GOLDEN_RATIO, DRAW_SHIFT = 0.6180339887498949, 0.7548776662466927
 
 
 def grid(window: Rectangle, sides: Sides, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """Return x and y (mm), each (n_x, n_y), of the centres of n_x x n_y equal cells; sides: these numbers."""
+    """Return x and y (mm), each (n_x, n_y), of the centres of equal cells; sides: (n_x, n_y) or one number for both."""
     along_x, along_y = ((torch.arange(n, dtype=dtype) + 0.5) / n - 0.5 for n in as_pair(sides))
     x, y = torch.meshgrid(along_x * window.width, along_y * window.height, indexing="ij")
     return x.contiguous(), y.contiguous()
@@ -55,7 +55,7 @@ def hash_seed(seed: int) -> int:
 
 
 def jitter(key: int, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two numbers in (0, 1), from the upper and lower 32 bits of SplitMix64, for each cell; key: hashed seed."""
+    """Return two numbers in (0, 1) per cell number, from both halves of 64 bits of SplitMix64; key: hashed seed."""
     bits = _mix(np.uint64(key) + cell.astype(np.uint64) * np.uint64(SPLITMIX_INCREMENT))
     upper, lower = ((half + 0.5) * 2.0**-32 for half in (bits >> np.uint64(32), bits & np.uint64(0xFFFFFFFF)))
     return upper, lower
@@ -120,7 +120,7 @@ def _with_second_moment(points: list[tuple[float, float]], moment: float) -> lis
 
 
 def sample_rim(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
-    """Return 4 n points (mm) along the rim; the first equals the last."""
+    """Return x and y (mm) of 4 n points along the rim; the last equals the first."""
     turn = torch.linspace(0, 2 * torch.pi, 4 * n, dtype=torch.float64)
     c, s = elementary(torch.cos, turn), elementary(torch.sin, turn)
     a, b = outline.half_extent

@@ -39,7 +39,7 @@ def scaled(net: Sides, share: float) -> Sides:
 
 
 def in_proportion(net: Sides, of: Sides, to: Sides) -> Sides:
-    """Return `to` with its number of point spacings multiplied, on each side, by the ratio of `net` to `of`."""
+    """Return `to` with its point spacings, on each side, multiplied by the ratio of those of `net` to those of `of`."""
     each = zip(as_pair(net), as_pair(of), as_pair(to), strict=True)
     x, y = (max(round((m - 1) * (t - 1) / (o - 1)) + 1, MIN_SIDE) for m, o, t in each)
     return simplified((x, y))

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bstcad.optics.outlines import STRICT, Circle, Outline
 
-MIN_COS2 = 1e-6  # smallest 1 - (1 + k) c² r², for a sphere cos² of its slope's angle; below it a surface is too steep
+MIN_COS2 = 1e-6  # 1 - (1 + k) c² r², for a sphere cos² of its slope angle, up to which a surface is too steep
 
 
 class Surface(ABC):
@@ -134,9 +134,9 @@ class _Revolved(Surface):
         return not isinstance(self.curvature, Tensor) and self.curvature == 0
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; finite but meaningless outside the rim.
+        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; finite but meaningless where there is no surface.
 
-        ∂z/∂x = c x / sqrt(1 - (1 + k) c² r²).
+        ∂z/∂x = c x / sqrt(1 - (1 + k) c² r²), r² = x² + y².
         """
         c = self.curvature
         r2 = x * x + y * y
@@ -167,8 +167,8 @@ class _Revolved(Surface):
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
         """Return (path s in mm along rays from (x, y) on the plane z0, True where they meet the part with the vertex).
 
-        a s² - 2 g s + c r² = 0, a = c (1 + k d_z²), g = d_z - c (x d_x + y d_y), is solved as
-        s = c r² / (g + sqrt(g² - a c r²)), the root at which a ray comes from below, d_z > ∇z · (d_x, d_y).
+        Of a s² - 2 g s + c r² = 0, with a = c (1 + k d_z²), g = d_z - c (x d_x + y d_y) and the unit direction d, it is
+        the root s = c r² / (g + sqrt(g² - a c r²)), at which a ray comes from below, d_z > ∇z · (d_x, d_y).
         sense: -1 for light along -z, which meets the surface at the other root.
         """
         c, (dx, dy, dz) = self.curvature, direction
@@ -264,7 +264,7 @@ class Toroid(Surface):
     __pydantic_config__ = STRICT
 
     def _profile(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (1 - c_x² x², 1 - c_y f, (1 - c_y f)² - c_y² y²); first and last are positive inside the rim."""
+        """Return (1 - c_x² x², 1 - c_y f, (1 - c_y f)² - c_y² y²); first and last are positive on the surface."""
         c = self.curvature_x
         cos2 = 1 - c * c * x * x
         f = c * x * x / (1 + _root(cos2))
@@ -272,7 +272,7 @@ class Toroid(Surface):
         return cos2, left, left * left - (self.curvature_y * y) ** 2
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; finite but meaningless outside the rim.
+        """Return (z - z0 in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm; finite but meaningless where there is no surface.
 
         The form z - z0 = (f (2 - c_y f) + c_y y²) / (1 + sqrt((1 - c_y f)² - c_y² y²)) avoids cancellation.
         """
@@ -334,7 +334,7 @@ class Recess(Surface):
         return torch.where(inside, h, rim), torch.where(inside, z_x, zero), torch.where(inside, z_y, zero)
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Return, lower one first, zero and the sag (mm) at the rim of the optical part, or of `outline` if smaller."""
+        """Return, lower one first, zero and the sag (mm) at the rim of the optical part, or of a smaller `outline`."""
         smaller = math.hypot(*outline.farthest) < self.outline.radius
         return self.face.sags(outline if smaller else self.outline)
 

@@ -1,4 +1,4 @@
-"""A plane or a sphere in any position: c |p - V|² = 2 N · (p - V), V its vertex, N the unit normal there, N_z > 0.
+"""A plane or a sphere in any position: c |p - V|² = 2 N · (p - V), curvature c, unit normal N at vertex V, N_z > 0.
 
 Windows and mirrors around a lens have such faces.  With u = (x, y) - (V_x, V_y) the height h over the plane z = V_z is
 the root nearer to 0 of c h² - 2 N_z h + f = 0, f = c u² - 2 (N_x u_x + N_y u_y).  It is computed as f / (N_z +
@@ -49,7 +49,7 @@ class TiltedSurface(Surface):
         return replace(self, z=z, vertex_xy=(x, y), unit_normal=motion.direction(self.unit_normal))
 
     def _from_vertex(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (u_x, u_y, f)."""
+        """Return (u_x in mm, u_y in mm, f in mm) at (x, y) in mm."""
         (n_x, n_y, _), (v_x, v_y) = self.unit_normal, self.vertex_xy
         x, y = x - v_x, y - v_y
         return x, y, self.face_curvature * (x * x + y * y) - 2 * (n_x * x + n_y * y)
@@ -59,7 +59,7 @@ class TiltedSurface(Surface):
         return self.unit_normal[2] ** 2 - self.face_curvature * f
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (h in mm, ∂h/∂x, ∂h/∂y) at (x, y), ∂h/∂x = (c u_x - N_x) / (N_z - c h); invalid outside the rim."""
+        """Return (h in mm, ∂h/∂x, ∂h/∂y), ∂h/∂x = (c u_x - N_x) / (N_z - c h); meaningless where it has no point."""
         x, y, f = self._from_vertex(x, y)
         cos2 = self._cos2(f)
         root = torch.sqrt(torch.where(cos2 > MIN_COS2, cos2, torch.full_like(cos2, MIN_COS2)))  # no NaN in the gradient
@@ -73,7 +73,8 @@ class TiltedSurface(Surface):
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
         """Return (path s in mm along rays from (x, y) on the plane z = V_z, True where they meet the surface).
 
-        c s² - 2 g s + f = 0, g = N · d - c u · d; the root near the vertex is s = f / (g + sense sqrt(g² - c f)).
+        Of c s² - 2 g s + f = 0, with g = N · d - c u · d and the unit direction d, it is the root near the vertex,
+        s = f / (g + sense sqrt(g² - c f)).
         """
         (n_x, n_y, n_z), (dx, dy, dz) = self.unit_normal, direction
         x, y, f = self._from_vertex(x, y)

@@ -42,7 +42,7 @@ BLOCKED = "stopped beside a window or mirror"  # line of the ledger: light that 
 UNDERSIDE_CELLS = 256  # cells per side of the grid on which light that meets the underside is summed
 WINDOW_CELLS = 96  # cells per side of the grid that finds the light which reaches the lens through windows and mirrors
 MIN_RAYS_FOR_TABLE = 256  # minimum rays per side for which a table of the source's light is worth its cost
-GHOST_RAYS = 1024  # maximum rays per side of a ghost; if it has 1 % of the light, its noise adds 0.0003 to RRMSD
+GHOST_RAYS = 1024  # maximum rays per side for a ghost; the noise of a ghost with 1 % of the light adds 0.0003 to RRMSD
 # Lines of the ledger that a ghost changes, besides losses.REFLECTED.
 GHOST_ON, GHOST_OFF, TOTAL_REFLECTION = "ghost on target", "ghost off target", "total internal reflection"
 
@@ -130,7 +130,7 @@ def _useful(
 ) -> Rectangle:
     """Return the part of `area`, on the plane of the first vertex, whose light meets one of the planes `faces`.
 
-    Two n x n grids are traced; the second covers only the useful part found on the first.
+    Two n x n grids of rays are traced; the second covers only the useful part found on the first.
     """
     z = before[0].surface.z
     for _ in range(2):
@@ -164,7 +164,7 @@ def clear_window(source: Emitter, lens: Lens, n: int = 256) -> Rectangle:
 
 
 def launch_strips(source: Emitter, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Iterator[Rays]:
-    """Yield those of n x n stratified rays over `area` (default: the window) that carry flux, a strip at a time."""
+    """Yield those of n x n stratified rays over `area` (default: `window`) that carry flux, a strip at a time."""
     area, like = area or window(source, lens), lens.like
     for x, y in sampling.stratified_strips(area, n, seed):
         lit = source.irradiance(x, y, lens.entrance.z) > 0
@@ -188,7 +188,7 @@ Lights = Sequence[tuple[float, Emitter, Lens, int]]  # (weight, source, lens at 
 
 @torch.no_grad()
 def simulate(lights: Lights, screen: Screen, n: int) -> Simulation:
-    """Simulate the weighted sum of lights by n x n stratified rays each; by the fused kernel if it supports all.
+    """Simulate the weighted sum of lights by n x n stratified rays each; by the fused kernel if it supports all lights.
 
     Kernel and plain form trace the same rays and agree to rounding.
     """
@@ -204,7 +204,7 @@ def simulate(lights: Lights, screen: Screen, n: int) -> Simulation:
 
 @torch.no_grad()
 def simulate_plain(lights: Lights, screen: Screen, n: int) -> Simulation:
-    """Run `simulate` in plain torch, a strip of the window at a time."""
+    """Simulate as `simulate` does, but in plain torch, with one strip of rays (`launch_strips`) at a time."""
     box = torch.zeros(screen.shape, dtype=torch.float64, device=lights[0][2].like.device)
     tent, count = torch.zeros_like(box), 0
     flux: dict[str, float] = {}
@@ -264,7 +264,7 @@ class Reflection:
     line, in_glass, fused = "transmitted", False, True  # not a line of the ledger: this light leaves the ghost
 
     def share(self, cos_in: Tensor, cos_out: Tensor, path: Tensor) -> Tensor:
-        """Return R at the angle of incidence."""
+        """Return R at the angle of incidence, whose cosine is `cos_in`; the other arguments are those of Loss."""
         _, refracted, beyond = self.law.deflection(cos_in)
         safe = torch.where(beyond, torch.ones_like(refracted), refracted)
         return torch.where(beyond, torch.ones_like(cos_in), 1 - self.through.share(cos_in, safe, path))

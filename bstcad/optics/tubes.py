@@ -33,14 +33,14 @@ SHEET_TUBES = 256  # tubes per side of the sheet from which finer sheets are int
 RIM_SHRINK = 1e-9  # relative shrinkage towards the centre, so that corners on the rim of the light count as lit
 MAX_BAND_ROWS = 256  # maximum rows of tubes traced at a time for a picture; even, since the diagonals alternate
 MAX_BAND_TUBES = 1 << 19  # maximum tubes traced at a time for a picture, which limits its memory
-MAX_RAYS_PER_BAND = 1 << 17  # maximum rays traced at a time in plain torch: a megabyte per quantity
+MAX_RAYS_PER_BAND = 1 << 17  # maximum rays traced at a time in plain torch, a megabyte per coordinate
 PARTS_PER_SIDE = 4  # parts per side of a tube that is partly lit
 MIN_TRIANGLE_AREA = 1e-9  # smallest area of a triangle that is clipped (pixel²); smaller triangles count in one pixel
 COARSE_GRID_POINTS = 65  # points per side of the coarse grid on which `rays_to` solves first
 MAX_BROYDEN_STEPS = 30  # maximum number of Broyden steps of `rays_to`
 RAY_TOLERANCE = 1e-8  # distance of rays from their points at which the search ends, as a fraction of the grid's extent
-RELATIVE_DIFFERENCE_STEP = 1e-6  # step of the difference quotients, as a fraction of the grid's extent
-MIN_BROYDEN_DIVISOR = 0.1  # smallest divisor of a Broyden update, relative to the squared step
+RELATIVE_DIFFERENCE_STEP = 1e-6  # step of the difference quotients of `rays_to`, as a fraction of the grid's extent
+MIN_BROYDEN_DIVISOR = 0.1  # divisor of a Broyden update, relative to the squared step, up to which there is no update
 
 
 @dataclass(frozen=True)
@@ -330,7 +330,7 @@ def rays_to(
 
 
 def _inverse_jacobian(arrive: Callable[..., Rays], step: float, p: Tensor, q: Tensor, height: Tensor) -> list[Tensor]:
-    """Return the inverse of ∂(hit) / ∂(p, q) by difference quotients of `step` (mm): [xx, xy, yx, yy]."""
+    """Return the inverse of ∂(point met) / ∂(p, q) by difference quotients of `step` (mm): [xx, xy, yx, yy]."""
     shifted_p, shifted_q = torch.cat((p + step, p - step, p, p)), torch.cat((q, q, q + step, q - step))
     right, left, above, below = arrive(shifted_p, shifted_q, height.repeat(4, 1)).position.chunk(4, dim=1)
     one, two = right - left, above - below

@@ -82,7 +82,7 @@ class BehindGlass(Receiver):
         return self.rest.middle
 
     def path(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """Return (path along each ray behind the face to the receiver (mm), status)."""
+        """Return (path along each ray behind the face to the receiver (mm), zero for rays that miss it; status)."""
         return self.rest.path(rays)
 
     def coordinates(self, rays: Rays) -> Sequence[Tensor]:
@@ -158,7 +158,7 @@ def image_screen(lens: Lens, screen: Screen) -> Screen:
 
 
 def image_from_lens(lens: Lens, screen: Screen) -> Receiver:
-    """Return the image of a screen's receiver by the windows and mirrors behind the lens; itself if there are none."""
+    """Return the image of a screen's receiver by the elements behind the lens; the receiver if there are none."""
     return image(lens.behind, screen.plane)
 
 

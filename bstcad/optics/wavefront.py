@@ -26,7 +26,7 @@ from bstcad.optics.rays import Vector
 
 MM_PER_NM = 1e-6  # millimetres per nanometre
 MIN_FOCUS_DISTANCE = 1e-3  # mm, smallest distance of a focus from the plane
-MAX_RAY_ANGLE = math.radians(89.0)  # rad, angle to the axis above which a ray counts as parallel to the plane
+MAX_RAY_ANGLE = math.radians(89.0)  # rad, angle to the axis from which on a ray counts as parallel to the plane
 SAMPLES_PER_SIDE = 129  # grid points per side of the square around a Zernike circle, for the largest |∇W|
 Place = tuple[float, float]  # (x, y), mm
 
@@ -167,7 +167,7 @@ class ZernikeWave(_Wave):
         return float(torch.hypot(w_x, w_y)[self.contains(x, y)].max())
 
     def _eikonal(self, x: Tensor, y: Tensor, wavelength: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (W in mm, ∂W/∂x, ∂W/∂y)."""
+        """Return (W in mm, ∂W/∂x, ∂W/∂y) at points (mm) of the plane."""
         x, y = (x - self.centre[0]) / self.radius, (y - self.centre[1]) / self.radius
         w, w_x, w_y = (wavelength * MM_PER_NM * part for part in zernike.series(self.coefficients, x, y))
         return w, w_x / self.radius, w_y / self.radius

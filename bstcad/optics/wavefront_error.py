@@ -37,7 +37,7 @@ from bstcad.optics.wavefront import MM_PER_NM, Wave, length
 RAYS_PER_SIDE = 512  # rays per side of the grid before the lens
 MAX_MAP_CELLS = 256  # largest number of cells per side of the map
 RAYS_PER_BAND = 1 << 17  # rays traced at a time: a megabyte for each quantity
-ROUNDINGS_PER_SEGMENT = 4  # roundings of a path segment: two ends, length and sum
+ROUNDINGS_PER_SEGMENT = 4  # number of roundings of a path segment: two ends, length and sum
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ def optical_path(source: Emitter, lens: Lens, rays: Rays, z: float) -> tuple[Ray
 
 
 def path_from_reference(source: Emitter, z: float, rays: Rays, sense: int) -> Tensor:
-    """Return the path (mm) of rays from the reference of `optical_path` to the first surface; z: its vertex (mm)."""
+    """Return the length (mm) of rays from the wavefront where `optical_path` starts to the first surface (vertex z)."""
     position = torch.stack([*rays.position[:2], rays.above(z)])
     return source.reference(position, z, sense)
 
@@ -178,7 +178,7 @@ def wavefront_error(source: Emitter, lens: Lens, wave: Wave, n: int = RAYS_PER_S
 
 @torch.no_grad()
 def residual(pupil: ExitPupil, wave: Wave, nm: float) -> Tensor:
-    """Return the OPD (n, n) without piston and tilt, in waves, times sqrt(flux / total flux); 0: not compared.
+    """Return the OPD (n, n) without piston and tilt, in waves, times sqrt(flux / total flux); 0 for rays not compared.
 
     nm: wavelength.  The root of the sum of squares is the RMS OPD.  Raises ValueError for fewer than 3 compared rays.
     """
@@ -232,7 +232,7 @@ def _rms(values: Tensor, share: Tensor) -> float:
 def _map(
     x: Tensor, y: Tensor, opd: Tensor, slopes: list[Tensor], cells: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (x (k,), y (k,), OPD (k, k)): OPD of scattered rays on a grid of square cells, NaN where no ray is near.
+    """Return (x (k,), y (k,), OPD (k, k)): the OPD of rays on a grid of k x k square cells, NaN where no ray is near.
 
     Each ray contributes to the four cell centres around it, with bilinear weights and extrapolated by its slope (∇OPD),
     so that the error of the map is of second order in the cell size.

@@ -61,7 +61,7 @@ def _series(coefficients: Sequence[float], x: Tensor, y: Tensor) -> list[Tensor]
 
 
 def _harmonic(zeta: Complex, n: int, m: int, known: tuple[dict[int, Harmonic], dict[int, Harmonic]]) -> Harmonic:
-    """Return V_n^m, m >= 0, from the harmonics of degrees n - 2 and n - 1, by m."""
+    """Return V_n^m, m >= 0, at ζ = zeta; known: harmonics of degrees n - 2 and n - 1, each by m."""
     (x, y), (before, last), zero = zeta, known, torch.zeros_like(zeta[0])
     if n == 0:
         return (torch.ones_like(x), zero), (zero, zero), (zero, zero)

@@ -1,4 +1,4 @@
-"""Data sheet of a part, after ISO 10110-1 and -10: drawing, tables, title block and light on one A4 page, as PDF.
+"""Data sheet of a part, after ISO 10110-1 and -10: drawing, tables, title block, pictures of the light; PDF, one page.
 
 data_sheet.txt.j2 has the text of the tables.  Equal designs give equal bytes: the only date is that of the scene.
 """
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 297.0, 210.0  # size of the page, A4 (mm)
 FRAME = (20.0, 10.0, 287.0, 200.0)  # left, lower, right and upper edge of the frame (mm, ISO 5457)
-TABLE_TOP, TITLE_LEFT, LIGHT_LEFT = 60.5, 205.0, 226.0  # upper edge of tables, left edges of title block and light (mm)
+TABLE_TOP, TITLE_LEFT, LIGHT_LEFT = 60.5, 205.0, 226.0  # top of tables, left of title block and of light (mm)
 ROW_HEIGHT, TABLE_FONT, HEADING_FONT = 3.57, 2.3, 2.6  # height of a table row, font sizes of rows and headings (mm)
-PICTURE_PIXELS = 256  # pixels along the longer side of a picture of the light
+PICTURE_PIXELS = 256  # largest number of pixels along the longer side of a picture of the light
 APERTURE_ROUNDING = 1e-4  # relative amount by which a printed clear aperture may be too small
 
 
@@ -88,7 +88,7 @@ class DataSheet:
 
 
 def _aperture(patch: Outline | None, outline: Outline) -> str:
-    """Return the size of a clear aperture in words, rounded up to three digits; patch None: the whole face."""
+    """Return the size of a clear aperture (None: the whole face) in words, rounded up to 3 digits, within `outline`."""
 
     def up(value: float) -> float:
         return float(rounded_up(value * (1 - APERTURE_ROUNDING)))

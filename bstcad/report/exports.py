@@ -39,7 +39,7 @@ SVG_MARGIN = 3.0  # margin around the drawing in the SVG (mm)
 EDGE_WIDTH, CENTRE_WIDTH = 0.25, 0.13  # line widths of edges and of centre marks (mm, ISO 128)
 CHAIN_LENGTHS = (4.0, 0.8, 0.4, 0.8)  # lengths of dash, gap, dot and gap of a centre line (mm)
 CAPITAL_HEIGHT = 1.8  # height of a capital letter (mm, ISO 3098)
-FONT_SIZE = CAPITAL_HEIGHT / 0.72  # font size at which capital letters have this height (mm)
+FONT_SIZE = CAPITAL_HEIGHT / 0.72  # font size at which capital letters are CAPITAL_HEIGHT high (mm)
 MAX_LINE_LENGTH = 60  # largest number of characters per line of text
 LETTER_WIDTH = 0.56 * FONT_SIZE  # upper bound of the mean width of a letter (mm)
 QUARTER_TURN_BULGE = math.tan(math.pi / 8)  # DXF bulge of an arc of 90 degrees: tan of a quarter of the angle
@@ -144,7 +144,7 @@ def points_table(lens: Lens, face: Surface, points: int) -> str:
 def turning_cloud(lens: Lens, points: int, face: Surface | None = None) -> str:
     """Return a CSV table for slow-tool diamond turning: radius (mm), angle (degrees), height above the vertex (mm).
 
-    face: None is the back.  Angles are from +x towards +y; heights are along +z, which for the front is into the glass.
+    face: None: the back.  Angles are from +x towards +y; heights are along +z, which for the front is into the glass.
 
     There are `points` rings of equal spacing from the axis to the farthest point of the outline.  All rings have the
     same angles; neighbours on the outermost ring are one ring spacing apart.  Points outside the outline are omitted.

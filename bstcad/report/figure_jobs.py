@@ -130,7 +130,7 @@ class NoPictures(Pictures):
 
 
 def draw_lens(source: Emitter, lens: Lens, screens: Sequence[Screen], view: View) -> Pngs:
-    """Return the pictures of the lens except the 3-D one: maps of the back and a tailored front, and a side view."""
+    """Return maps of the back and of a tailored front, and a side view of the lens; `view` is not used."""
     farthest = max(screens, key=lambda screen: screen.plane.throw(0.0))
     of_front = {}
     if lens.shapes("front"):

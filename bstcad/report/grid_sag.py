@@ -2,8 +2,8 @@
 
 OpticStudio interpolates between the points of a grid by bicubic Hermite patches.  Except in the end spans, a net is one
 biquadratic polynomial in each knot span (optics/bspline.py), and the patch over the four corners of the span equals
-this polynomial.  A grid that includes all knots is exact there.  In the end spans x is quadratic in the parameter t, so
-the net is not a polynomial in x; if they lie inside the rim, the grid is refined until the shift is at most MAX_SHIFT.
+this polynomial.  A grid that includes all knots is exact there.  In an end span x is quadratic in the parameter t, so
+the net is not a polynomial in x; if it is inside the rim, the grid is refined until the shift is at most MAX_SHIFT.
 
 `Patches` is the surface that OpticStudio interpolates.  Rays through it and through the exact face give the shift.
 """
@@ -30,11 +30,11 @@ from bstcad.optics.trace import launch_strips, trace
 from bstcad.report.units import number
 
 MIN_POINTS, MAX_POINTS = 3, 4097  # smallest and largest number of points along the wider side of a table
-MIN_ZEMAX_POINTS = 5  # minimum per side: "the nx and ny values must be no smaller than 5" (OpticStudio, Grid Sag)
-MAX_SHIFT = 0.1  # largest shift of the light (target pixels) by a grid or table that is fine enough
+MIN_ZEMAX_POINTS = 5  # minimum along x and y: "nx and ny values must be no smaller than 5" (OpticStudio, Grid Sag)
+MAX_SHIFT = 0.1  # shift of the light (target pixels) by interpolation, up to which a grid or table is fine enough
 CELLS_PER_SPAN = (1, 2, 4, 8, 16)  # grid cells per knot span; tried in this order until the grid is fine enough
 MAX_FLUSH_POINTS = 1_050_000  # number of points up to which a grid that ends at the rim is preferred to a coarser one
-SHIFT_RAYS = 192  # rays per side of the bundle that measures the shift
+SHIFT_RAYS = 192  # rays per side of the bundle by which a shift is measured
 RIM_ROUNDING = 1e-9  # distance from the rim that counts as zero (in pitches of the net, or steps of the grid)
 NEWTON_STEPS = 12  # steps of Newton's method to the intersection with the patches; smooth faces need 5
 MIN_DERIVATIVE = 1e-6  # lower bound of the derivative in a step of Newton's method
@@ -134,7 +134,7 @@ class Patches(Surface):
         return s, residual.abs() < HIT_TOLERANCE
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Return the lowest and the highest height h (mm) of the grid's points, zero included."""
+        """Return the lowest and the highest height h (mm) of all points of the grid, zero included."""
         heights = self.grid.values[0]
         return min(float(heights.min()), 0.0), max(float(heights.max()), 0.0)
 

@@ -199,7 +199,7 @@ def _side_by_side(
 ) -> tuple[Figure, np.ndarray]:
     """Return a figure and its axes: `pictures`, by title, on one grey scale, and the difference of the last two.
 
-    The first picture is the target.  height: height of the figure (inches).  spot: see `_largest`.
+    The first picture is the target.  difference: title.  height: height of the figure (inches).  spot: see `_largest`.
     """
     target, before, last = (list(pictures.values())[k] for k in (0, -2, -1))
     unit, top = lit_mean(target), max(brightest(target, picture) for picture in pictures.values())

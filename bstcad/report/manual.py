@@ -14,10 +14,10 @@ from functools import cache
 from pathlib import Path
 from posixpath import dirname, join, normpath
 
-PLACES = (Path(__file__).parents[1] / "manual", Path(__file__).parents[2] / "docs")  # pages of a wheel, of the sources
-SITES = (Path(__file__).parents[1] / "site", Path(__file__).parents[2] / "docs/_build/html")  # their built pages
+PLACES = (Path(__file__).parents[1] / "manual", Path(__file__).parents[2] / "docs")  # pages in a wheel, in the sources
+SITES = (Path(__file__).parents[1] / "site", Path(__file__).parents[2] / "docs/_build/html")  # built pages, likewise
 FIRST = "index"  # name of the first page
-PAGES = ("checks", "remarks")  # pages of sections, without ".md"
+PAGES = ("checks", "remarks")  # pages beside this file, without ".md", whose sections `bstcad docs` also shows singly
 SECTION = re.compile(r"^\(([\w-]+)\)=\n+(### .+?)(?=\n+^(?:\([\w-]+\)=$|#{1,2} )|\s*\Z)", re.M | re.S)
 TO_A_SECTION = re.compile(r"\[([^]]+)\]\((?:\w+\.md)?#([\w-]+)\)")
 DIRECTIVE = re.compile(r"^```\{.*?^```$\n?", re.M | re.S)

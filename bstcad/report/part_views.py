@@ -80,7 +80,7 @@ class Paper:
         self.axes.plot(*np.asarray(points, dtype=float).T, linewidth=width / TYPE_POINT, **(given | style))
 
     def axis(self, start: Point, end: Point) -> None:
-        """Draw a centre line."""
+        """Draw a centre line from `start` to `end`."""
         self.line([start, end], linestyle=CHAIN, color=GREY, zorder=1.5)
 
     def area(self, points: Sequence[Any], **style: Any) -> None:
@@ -135,7 +135,7 @@ class Paper:
         self.text(x + 0.5 * sense, y + GAP, text, NOTES, ha="left" if sense > 0 else "right", bbox=ground)
 
     def first_angle(self, x: float, y: float, size: float) -> None:
-        """Draw the symbol of first-angle projection (ISO 5456-2): frustum of a cone, and its view from the left."""
+        """Draw the symbol of first-angle projection (ISO 5456-2), `size` mm high; (x, y): middle of its left end."""
         half, end = size / 2, x + 1.4 * size
         centre = end + 0.4 * size + half
         self.line([(x, y - half / 2), (end, y - half), (end, y + half), (x, y + half / 2), (x, y - half / 2)], 0.3)
@@ -273,7 +273,7 @@ def _flange(
 
 
 def _wall(front: Callable[[float], float], z: float, half: float, mount: Mount) -> np.ndarray:
-    """Return points (z, |u|) of the lens's wall from z down to the front, with draft and bevel."""
+    """Return points (z, |u|) of the lens's wall, with draft and bevel, from (z, half) down to the front z(|u|)."""
     lean = math.tan(math.radians(mount.draft))
     depth = _depth(front, z, half, lean) - mount.bevel
     chain = [(z, half), (z - depth, half - lean * depth)]
@@ -483,7 +483,7 @@ def _contours(paper: Paper, views: Views, at: PaperFrame) -> str:
 
 
 def _section(paper: Paper, views: Views, which: int, scale: float, *, left: float, middle: float) -> None:
-    """Draw a section, z to the right from `left` on; which: 0 for x = 0 with y up, 1 for y = 0 with x up."""
+    """Draw section 0 (x = 0, y up) or 1 (y = 0, x up) with z to the right from `left` on, its axis at y = `middle`."""
     cut, half = views.cuts[which], [scale * half for half in views.outermost.half_extent]
     (lowest, highest), _ = cut.ends
     at, right = PaperFrame(scale, left - scale * lowest, middle), left + scale * (highest - lowest)
@@ -518,7 +518,7 @@ def _section(paper: Paper, views: Views, which: int, scale: float, *, left: floa
 def _thicknesses(
     views: Views, which: int, at: PaperFrame, reach: float
 ) -> Iterator[tuple[tuple[float, float], float, tuple[float, float]]]:
-    """Yield (ends in z, level, feet) of dimensions of edge, flange, part and centre along z; see Paper.dimension."""
+    """Yield (ends in z, level, feet) of thicknesses, see Paper.dimension; reach: half the cut's height on paper."""
     cut, flange, (front, back) = views.cuts[which], views.mount.flange, views.vertices
     middle, top, foot = at.y, at.y + reach, at.y - reach
     if flange is None:

@@ -1,10 +1,10 @@
 """Numbers of a lens and its part: the prescription, the order for a shop, and the facts of a STEP file alone.
 
-The prescription states every surface as it was designed, with source and target, with all digits.  It may differ
+The prescription states, with all digits, every surface as it was designed, and source and target.  It may differ
 from the scene, since tailoring may change a free radius and move the back.
 
     lens:    front, glass, back; the vertex of a face is its intersection with the axis
-    signs:   light travels along +z; a radius is positive if the centre of curvature is on the +z side of the vertex
+    signs:   light leaves along +z; a radius is positive if the centre of curvature is on the +z side of the vertex
 
 The order is one record for datasheet.pdf, report.html and report.json.  Its sizes, volume and mass are those of the
 file for the shop, as it was read back: part.step for a scene with a mount.  Lengths in mm, angles in degrees,
@@ -55,7 +55,7 @@ EXACT_FACES = (  # sentence on a freeform back, and on two freeform faces
 )
 SHEET, PART, LENS = "datasheet.pdf", "part.step", "lens.step"
 DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # plane z = 0, by datum
-EDGE_TOLERANCE = 1e-3  # largest fraction of an outline's area outside the back's edge that counts as zero
+EDGE_TOLERANCE = 1e-3  # fraction of an outline's area, outside the back's edge, up to which the back fills the outline
 
 Point = tuple[float, float, float]
 Measures = tuple[Point, Point, float | None]  # smallest and largest x, y, z (mm); volume (mm³), None: unknown
@@ -145,7 +145,7 @@ def scene_text(scene: Scene, lens: Lens) -> str:
 
 
 def _passes(record: Mapping[str, Any]) -> passes.Passes:
-    """Return the kind of the optic; a mirror that light does not enter has the index 1."""
+    """Return the passes of the optic of a prescription; the index of a mirror that light does not enter is 1."""
     mirror = passes.MIRROR if record["index"] == 1 else passes.SECOND_SURFACE
     return mirror if record["reflects"] else passes.LENS
 
@@ -289,7 +289,7 @@ def _volume(lens: Lens, whole: WholePart | None) -> float | None:
 
 
 def _origin(lens: Lens, vertex: float, bare: bool = True) -> str:
-    """Return the position of the file's origin relative to axis and faces, in words.  vertex: z of the back."""
+    """Return where the file's origin is, in words; vertex: z of the back on the axis; bare: a lens without a mount."""
     at = {"passes": lens.passes, "front": lens.front_vertex, "vertex": vertex, "bare": bare}
     return "".join(paragraphs("part_words.txt.j2", "origin", **at))
 

@@ -330,7 +330,7 @@ def _unreached(scene: Scene, goal: Goal) -> dict[str, float | None] | None:
 
 
 def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
-    """Return the contents with a made part and its checks.  place: path of its folder, relative to the report's."""
+    """Return the contents with a made part and its checks.  place: its folder, relative to the report's folder."""
     measured = part.facts | {"deviation_map": [f"{place}{name}" for name in MAP_FILES]}
     passed, checks = contents.passed and part.facts["passed"], (*contents.checks, *part.checks)
     contents = replace(contents, checks=checks, passed=passed, measured=measured)
@@ -345,7 +345,7 @@ def _with_remarks(contents: Contents, *more: Remark) -> Contents:
 
 
 def _finest_detail(scene: Scene, proof: Proof, screen: Screen, estimates: tuple[LeftOut, ...]) -> FinestDetail | None:
-    """Return the finest detail, computed with the source's size in the scene, else in `estimates`; None: no size."""
+    """Return the finest detail by the source's size in the scene, else in `estimates`; None: no size is known."""
     if proof.blur:
         of = ", ".join(f"source.{key} = {size}" for key, size in extent(scene.source))
         return finest_detail(proof.blur.pixels, proof.lens, screen, of)
@@ -380,7 +380,7 @@ def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: 
 
 
 def too_steep(found: Steepness) -> list[str]:
-    """Return the remark on light that needs a face steeper than MAX_SLOPE_DEG (70°); empty up to 0.1 % of it."""
+    """Return the remark on light that needs slopes above 70°; empty if it is at most 0.1 % of the target's light."""
     sent = {"steep_share": found.share, "steepest_deg": found.steepest}
     return [remark.text for remark in written("remarks.txt.j2", "steep", sent=sent)]
 
@@ -422,7 +422,7 @@ def of_json(data: bytes | str, kind: type[Record] = Contents) -> Record:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
         raise ValueError(": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))) from None
     if not _is_printable(plain(found)):
-        raise ValueError("it contains text that is too long or not printable")
+        raise ValueError(f"a text in it has more than {MAX_STRING_LENGTH} characters, or characters that do not print")
     return found
 
 
@@ -483,7 +483,7 @@ def write_json(report: Contents, path: str | Path) -> None:
 
 
 def _rounded(value: Any, where: str) -> Any:
-    """Round floats to DIGITS, except in the prescription, which keeps all digits.  where: path of the value."""
+    """Round floats to DIGITS digits, except in the prescription, which keeps all.  where: path of the value."""
     if isinstance(value, dict):
         return {key: _rounded(part, f"{where}.{key}") for key, part in value.items()}
     if isinstance(value, list):

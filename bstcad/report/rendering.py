@@ -46,14 +46,14 @@ VIEW_WIDTHS = (5, 9)  # relative widths of the two views
 GROUND, INK, SOFT = "#0e1116", "#e6eaee", "#8b96a1"  # colours of the background, of the title, of captions and frames
 GLASS_FINISH = {"color": "#b9d4ea", "specular": 0.9, "opacity": 0.42}
 METAL_FINISH, LAMP = {"color": "#9aa3ad", "specular": 0.4}, "#fff3c4"
-DARKEST = 0.35  # colour of zero flux, as a fraction of the colour map, so that it is visible on the dark background
+DARKEST = 0.35  # place of zero flux in the colour map (0 to 1), whose darker part the background would hide
 ASIDE = (0.95, 0.42, 0.62)  # direction (x, y, z) to the eye for the whole path; z is multiplied by -seen_along
-NEAR = (0.9, 0.5, 0.75)  # direction to the eye in the close view, which faces the back
-TITLE_WIDTH = 46  # letters per line of the title
-PATH_ANGLE = 24.0  # vertical angle of view (degrees)
+NEAR = (0.9, 0.5, 0.75)  # direction (x, y, z) to the eye in the close view, which shows the back
+TITLE_WIDTH = 46  # largest number of letters per line of the title
+PATH_ANGLE = 24.0  # vertical angle of view in both views (degrees)
 PATH_FILL, LENS_FILL = 0.88, 0.6  # fraction of a view filled by the whole path, and by the lens close up
 SCREEN_OPACITY = 0.8  # opacity of a screen in front of another one
-RAY_REACH, RAY_STEP = 2.0, 5  # close view: rays outside the lens are 2 diagonals of it long; every fifth is drawn
+RAY_REACH, RAY_STEP = 2.0, 5  # close view: rays end at most 2 diagonals of the lens away; every fifth ray is drawn
 
 # The model that a reader can rotate.
 FINE, COARSE = 256, 64  # cells per axis of a net, and of a surface without knots
@@ -227,7 +227,7 @@ def _add_text(plotter: Any, words: str, place: tuple[float, float], size: int, c
 
 
 def _close_rays(path: LightPath) -> np.ndarray:
-    """Return every RAY_STEP-th ray, cut to RAY_REACH diagonals of the lens on either side of it."""
+    """Return every RAY_STEP-th ray, cut to RAY_REACH diagonals of the lens before its first and after its last face."""
     reach = RAY_REACH * np.linalg.norm(np.ptp(path.vertices, axis=0))
     rays = path.rays[::RAY_STEP].copy()
     for end, before in ((0, 1), (-1, -2)):
