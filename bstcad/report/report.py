@@ -1,6 +1,7 @@
-"""Report of a design for people: report.html, a summary on the terminal, and report.junit.xml for build servers.
+"""Report of a design: report.html and a summary on the terminal for people, report.junit.xml for build servers.
 
-They show the record of report.json (record.Contents); the terminal also shows the record of a plan or a STEP file.
+All three show the record of report.json (record.Contents).  The terminal also shows the record of a STEP file without a
+design (record.Examined), and a plan, the entries that `bstcad plan --json` prints.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
-Figure = tuple[str, str, str]  # name, value, remark
-BEGIN, END = "<!-- tolerances -->", "<!-- end of tolerances -->"  # comments around the section on tolerances
+Figure = tuple[str, str, str]  # number of the report in words: name, value with its unit, remark or ""
+BEGIN, END = "<!-- tolerances -->", "<!-- end of tolerances -->"  # comments of report.html around a tolerance study
 NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # characters that XML 1.0 forbids
-PAGE_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # the page loads nothing
+PAGE_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # policy of report.html: it loads nothing
 VIEWER = Path(__file__).with_name("solid_view.js")
 BADGES = {  # verdict of a report: (sign, style on the page, style on the terminal)
     "passed": ("✓", "pass", "bold green"),
@@ -38,14 +39,14 @@ BADGES = {  # verdict of a report: (sign, style on the page, style on the termin
 }
 # style on the terminal of each kind of a plan's verdict
 PLAN_STYLES = {"blurred": "bold red", "beyond": "bold red", "within": "bold green", "no limit": "bold cyan"}
-GLASS_LINES = ("lost through the sides", "total internal reflection")  # lines of the ledger that a mirror omits if 0
+GLASS_LINES = ("lost through the sides", "total internal reflection")  # lines of a ledger; omitted for a mirror if 0
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
 
 
 def counts(checks: Sequence[Check]) -> str:
-    """Return the numbers of passed checks, of failed ones, and of values without a limit."""
+    """Return a phrase with the numbers of passed checks, of failed ones, and of passed ones without a limit."""
     failed = sum(not check.passed for check in checks)
     unjudged = sum(check.passed and check.limit is None for check in checks)
     more = ((failed, "failed"), (unjudged, "without a limit (not judged)"))
@@ -54,28 +55,28 @@ def counts(checks: Sequence[Check]) -> str:
 
 
 def explanation(report: Contents) -> str:
-    """Return sentences beside the verdict: numbers of checks, doubts, and for a draft how to reduce the RRMSD."""
+    """Return the sentences beside the verdict: numbers of checks, `doubts`, and for a draft how to reduce the RRMSD."""
     draft = 'A draft has few evaluations: the quality "standard" gives a smaller RRMSD.'
     texts = (f"{counts(report.checks)}.", *(doubt.text for doubt in doubts(report)))
     return " ".join((*texts, draft) if report.quality == "draft" else texts)
 
 
 def doubts(report: Contents | Examined) -> list[Remark]:
-    """Return sentences beside the verdict: the scene sets no limit, or the RRMSD is not resolved."""
+    """Return remarks on the verdict: the scene sets no limit on light or RRMSD, or the RRMSD is not resolved."""
     if isinstance(report, Examined):
         return []
     return written("verdict.txt.j2", "doubts", report=report)
 
 
 def check_line(check: Check) -> str:
-    """Return a check with position, value and limit: "smallest thickness (at (1, 2) mm): 0.7 mm, limit ≥ 1 mm"."""
+    """Return a check as a line, such as "smallest thickness (at (1, 2) mm): 0.7 mm, limit ≥ 1 mm"."""
     limit = f", limit {bound(check)}" if check.limit is not None else ""
     where = f" ({check.where})" if check.where else ""
     return f"{check.name}{where}: {quantity(check.value, check.unit)}{limit}"
 
 
 def machine(facts: Mapping[str, Any]) -> Rows:
-    """Return the known facts of the machine in words; for a GPU, with a note that another run gives another lens."""
+    """Return the known facts of the machine as rows; for a GPU a row says that another run gives another lens."""
     known = {key: value for key, value in facts.items() if value is not None}
     sizes = {
         key: f"{value:.3g} GB" for key, value in known.items() if key.endswith("_gb") and not isinstance(value, str)
@@ -87,7 +88,7 @@ def machine(facts: Mapping[str, Any]) -> Rows:
 
 
 def ledger(flux: Mapping[str, float], of: str) -> dict[str, float]:
-    """Return a flux ledger with its lines in the words of a report; of: lens or mirror."""
+    """Return a flux ledger (fractions of the source's flux by fate) in the words of a report; of: lens or mirror."""
     lines = {line: part for line, part in flux.items() if of == "lens" or part or line not in GLASS_LINES}
     for old, new in (("the lens", f"the {of}"), ("glass", "material"), ("on t", "on the t"), ("off t", "beside the t")):
         lines = {line.replace(old, new): part for line, part in lines.items()}
@@ -95,7 +96,7 @@ def ledger(flux: Mapping[str, float], of: str) -> dict[str, float]:
 
 
 def first_figures(report: Contents | Examined) -> list[Figure]:
-    """Return the first figures of the terminal and of report.html; for a STEP file alone, the figures of the part."""
+    """Return the numbers at the top of report.html and of the terminal; for a STEP file alone, those of the part."""
     if isinstance(report, Examined):
         return [(name, value, "") for name, value in report.part.items()]
     rows = tables("first_figures.txt.j2", report=report)["first"]
@@ -115,12 +116,12 @@ def html(
     tolerances: str = "",
     sections: Sequence[tuple[str, str]] = (),
 ) -> bytes:
-    """Return report.html, one file that contains pictures and styles and loads nothing.
+    """Return the content of report.html, which contains its pictures and styles and loads nothing.
 
-    figures: PNG bytes by name; a picture that is None or absent is omitted, and a sentence replaces the 3-D picture.
-    scene: TOML text with all defaults.  prescription: rows from bstcad.report.prescription.sections.  solid: JSON from
-    bstcad.report.rendering.turnable; empty: a page without a script.  tolerances: HTML from bstcad.report.tolerances.
-    sections: (heading, HTML) from a script of the user.
+    figures: PNG bytes by name; None or absent: the picture is omitted (a sentence replaces the 3-D picture).  scene:
+    TOML text of the scene with all defaults.  prescription: rows from bstcad.report.prescription.sections.  solid: JSON
+    from bstcad.report.rendering.turnable; "": a page without a script.  tolerances: HTML from
+    bstcad.report.tolerances.  sections: (heading, HTML) of each section that a script of the user adds.
     """
     from markupsafe import Markup
 
@@ -163,8 +164,8 @@ def base64_images(pictures: Mapping[str, bytes | None]) -> dict[str, str]:
 def junit(report: Contents) -> bytes:
     """Return the checks of a design as a JUnit suite, one test case per check.
 
-    A check without a limit is passed or, if the verdict is NO_LIMIT, skipped.  The time of the suite is that of the
-    verification, and its output contains the remarks.
+    A check without a limit counts as passed, or as skipped if the verdict is NO_LIMIT.  The time of the suite is that
+    of the verification, and its output contains the remarks.
     """
     unjudged = [check for check in report.checks if report.verdict == NO_LIMIT and check.limit is None]
     text = environment().get_template("junit.xml.j2").render(report=report, unjudged=unjudged)
@@ -177,7 +178,7 @@ def junit(report: Contents) -> bytes:
 def summary(report: Contents | Examined, verbose: bool = False) -> Group:
     """Return verdict, remarks, first figures, failed checks and the number of passed ones, for `rich.print`.
 
-    verbose: with every check.
+    verbose: list all checks, not only the failed ones.
     """
     from rich.console import Group
     from rich.text import Text
@@ -199,7 +200,7 @@ def summary(report: Contents | Examined, verbose: bool = False) -> Group:
 
 
 def check_lines(checks: Sequence[Check], verbose: bool, of: str = "") -> Iterator[Text]:
-    """Yield a line per failed check, with `verbose` also per passed check.  of: prefix of the check's name."""
+    """Yield a line per failed check, then with `verbose` one per passed check; of: text before each check's name."""
     from rich.text import Text
 
     for check in sorted(checks, key=lambda check: check.passed):
@@ -211,7 +212,7 @@ def check_lines(checks: Sequence[Check], verbose: bool, of: str = "") -> Iterato
 
 
 def topic_tag(line: Check | Remark) -> tuple[str, str]:
-    """Return the name for `bstcad docs` in brackets, and its style; empty if no page explains the line."""
+    """Return (text, style): " [NAME]" with which `bstcad docs NAME` explains the line, or "" without such a page."""
     return line.topic and f" [{line.topic}]", "dim"
 
 
@@ -219,9 +220,9 @@ def topic_tag(line: Check | Remark) -> tuple[str, str]:
 
 
 def plan_effects(plan: Mapping[str, Any], title: str, optic: str) -> Group:
-    """Return tables of effects that are simulated and not simulated, from the entries of `plan --json`.
+    """Return tables of the effects that are simulated and not simulated; plan: entries of `bstcad plan --json`.
 
-    title: heading.  If the entries contain a verdict, which then follows from the effects alone, it comes first.
+    title: heading.  optic: lens or mirror.  A verdict that already follows from the effects alone comes first.
     """
     from rich.console import Group
     from rich.table import Table
@@ -251,7 +252,7 @@ def _verdict(plan: Mapping[str, Any]) -> Iterator[Text]:
 
 
 def _of_target(plan: Mapping[str, Any], of: str, optic: str) -> Iterator[RenderableType]:
-    """Yield a plan's estimates and sentences on one target.  of: suffix such as ", target[1]" if there are several."""
+    """Yield estimates and sentences on one target; plan: its entry in `goals`.  of: suffix ", target[1]", or ""."""
     from rich.text import Text
 
     left_out = _table(f"not simulated{of}", "light on target", "RRMSD", "blur")
@@ -265,7 +266,7 @@ def _of_target(plan: Mapping[str, Any], of: str, optic: str) -> Iterator[Rendera
 
 
 def plan_predictions(plan: Mapping[str, Any]) -> Group:
-    """Return seconds, RRMSD and memory of each quality, and of the standard quality with more control points."""
+    """Return the predicted seconds, RRMSD and memory of each quality, and of quality standard with a finer net."""
     from rich.console import Group
     from rich.text import Text
 
@@ -284,7 +285,7 @@ def plan_predictions(plan: Mapping[str, Any]) -> Group:
 
 
 def _table(first: str, *others: str) -> Table:
-    """Return an empty table whose first column, and those whose heading begins with "<", are left-justified."""
+    """Return an empty table with these headings; left-justified: the first column, and those marked with a "<"."""
     from rich import box
     from rich.table import Table
 

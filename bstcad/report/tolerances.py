@@ -1,6 +1,7 @@
 """tolerance.json as a record, its section of report.html and its table for the terminal.
 
-bstcad.tolerance computes the study.  A superposed picture is the designed one plus separately traced changes.
+bstcad.tolerance computes the study.  A superposed picture is that of the design plus changes by the errors, which were
+traced separately; a full trace is a picture of the lens with all errors of a trial.
 """
 
 from __future__ import annotations
@@ -24,20 +25,20 @@ from bstcad.runs import files
 if TYPE_CHECKING:
     from rich.console import Group
 
-MAX_PAGE_BYTES = 30_000_000  # size limit of a page that is changed
-MAX_PICTURE_BYTES = 1_000_000  # size limit of a picture that is read
+MAX_PAGE_BYTES = 30_000_000  # largest report.html that is read (bytes)
+MAX_PICTURE_BYTES = 1_000_000  # largest picture of a study that is read (bytes)
 PNG = b"\x89PNG\r\n\x1a\n"
-FIGURES = ("tolerance_trials", "tolerance_worst")  # names of the pictures
-MAX_DISAGREEMENT = 0.1, 0.03  # relative error up to which superposed pictures are trusted: 95th percentile, median
-MIN_FRACTION = 1e-3  # fraction of the mean square change below which an error is listed in a second table
-WIDEST = 10.0  # largest factor on the width of an error in the search for the loosest tolerances
-MAX_NAMED_ERRORS = 3  # number of errors that are named per trial
+FIGURES = ("tolerance_trials", "tolerance_worst")  # names of the study's pictures: figures/NAME.png
+MAX_DISAGREEMENT = 0.1, 0.03  # largest relative errors of trusted superposed pictures: 95th percentile, median
+MIN_FRACTION = 1e-3  # errors that cause less than this fraction of the mean square change are in a second table
+WIDEST = 10.0  # largest factor by which the search for the loosest tolerances widens an error
+MAX_NAMED_ERRORS = 3  # largest number of errors that are named per trial
 
 Yield = tuple[Fraction, Fraction, Fraction]  # lower bound, estimate and upper bound of the yield (95 % Wilson interval)
 Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
 Width = Annotated[float, Field(gt=0, le=1e6)]
-Spread = TypedDict("Spread", {"5 %": Size, "50 %": Size, "95 %": Size})  # percentiles of RRMSD, or RMS in waves
-Disagreement = TypedDict("Disagreement", {"median": Size, "95 %": Size})  # relative errors of superposed pictures
+Spread = TypedDict("Spread", {"5 %": Size, "50 %": Size, "95 %": Size})  # percentiles of RRMSD, or of RMS (waves)
+Disagreement = TypedDict("Disagreement", {"median": Size, "95 %": Size})  # relative errors of superposed RRMSD or RMS
 
 
 @dataclass(frozen=True)
@@ -154,19 +155,19 @@ class Tolerances:
 
     @property
     def trusted(self) -> bool:
-        """True if superposed pictures agree with the full traces, and wavefronts too if they have a limit."""
+        """True if superposed pictures agree with full traces, and superposed wavefronts too if they have a limit."""
         limited = self.wavefront is not None and self.wavefront.limit is not None
         found = (self.model_off, self.wavefront.model_off) if limited else (self.model_off,)
         return all(each["95 %"] <= MAX_DISAGREEMENT[0] and each["median"] <= MAX_DISAGREEMENT[1] for each in found)
 
     @property
     def loosest(self) -> Mapping[str, float]:
-        """Loosest width ± by error; empty if no yield was requested."""
+        """Loosest width ± by name of the error, in its unit; empty if no yield was requested."""
         return {} if self.inverse is None else self.inverse.limits
 
 
 def _file_keys(value: Any) -> Any:
-    """Return a value with the keys of tolerance.json, without entries that are None."""
+    """Return a value of `plain` with "yield" in place of "passed" in its keys, without entries that are None."""
     if isinstance(value, dict):
         return {key.replace("passed", "yield"): _file_keys(part) for key, part in value.items() if part is not None}
     return list(map(_file_keys, value)) if isinstance(value, list) else value
@@ -186,7 +187,7 @@ def write(found: Tolerances, path: Path) -> None:
 
 
 def section(found: Tolerances, pictures: Mapping[str, bytes], optic: str) -> str:
-    """Return HTML of a study.  pictures: PNG bytes by the names in FIGURES."""
+    """Return the HTML section on a study; pictures: PNG bytes by the names in FIGURES; optic: lens or mirror."""
     return environment().get_template("tolerances.html.j2").render(
         study=found, errors=errors(found), worst_errors=worst_errors, little=MIN_FRACTION, widest=WIDEST, optic=optic,
         pictures=base64_images({key: picture for key, picture in pictures.items() if key in FIGURES}),
@@ -194,7 +195,7 @@ def section(found: Tolerances, pictures: Mapping[str, bytes], optic: str) -> str
 
 
 def of_folder(folder: Path, optic: str) -> str:
-    """Return the section for a design's folder; empty if it has no tolerance.json by bstcad."""
+    """Return the `section` on the study in a design's folder; "" if it contains no readable tolerance.json."""
     try:
         found = read(folder / "tolerance.json")
     except ValueError:
@@ -209,7 +210,7 @@ def of_folder(folder: Path, optic: str) -> str:
 
 
 def put_into(page: Path, section: str) -> bytes | None:
-    """Return the page with `section` in the place of its section on tolerances; None: no such place or page."""
+    """Return a report.html with `section` between BEGIN and END; None if it lacks them or cannot be read."""
     try:
         text = files.contents(page, MAX_PAGE_BYTES).decode("utf-8")
     except (OSError, ValueError):
@@ -220,9 +221,9 @@ def put_into(page: Path, section: str) -> bytes | None:
 
 
 def errors(found: Tolerances) -> list[dict[str, Any]]:
-    """Return the rows of the table of errors, the worst first, as dicts with the keys of `_error`.
+    """Return the rows of the table of errors as dicts with the keys of `_error`, the largest fraction first.
 
-    The fields of a form error are one row: their changes add, and the squares of their widths add.
+    The fields of a form error are one row, with the sum of their changes and the quadratic sum of their widths.
     """
     groups: dict[str, list[Sensitivity]] = {}
     for item in found.sensitivities:
@@ -254,7 +255,7 @@ def _signed(change: float) -> str:
 
 
 def worst_errors(found: Tolerances, trial: Trial) -> str:
-    """Return the errors that change the picture of a trial most, in words."""
+    """Return the errors that change the picture of a trial most, with their amounts, in words."""
     known = {item.name: item for item in found.sensitivities if item.name in trial.amounts}
 
     def added(item: Sensitivity) -> float:
@@ -268,7 +269,7 @@ def worst_errors(found: Tolerances, trial: Trial) -> str:
 
 
 def summary(found: Tolerances) -> Group:
-    """Return the table of errors and the sentences, for `rich.print`."""
+    """Return the table of errors and the sentences on the study, for `rich.print`."""
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 Rows = list[tuple[str, str]]  # name, value
-DIGITS = 12  # significant digits to which a number is first rounded
+DIGITS = 12  # significant digits to which `quantity` first rounds a number
 LADDERS = {  # unit: (smallest size in this unit, factor to the written unit, written unit), in descending order
     "mm": ((0.1, 1.0, "mm"), (1e-3, 1e3, "µm"), (1e-8, 1e6, "nm"), (0.0, 1e9, "pm")),
     "deg": ((0.01, 1.0, "°"), (0.0, 3600.0, "″")),
@@ -27,7 +27,10 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float | bool | None) -> str:
-    """Return three digits (0.0284), an integer in full (6 512), 3.2 × 10⁻⁷ below 1e-3 or from 1e6 on; yes, no, none."""
+    """Return a value as text: three digits (0.0284), an integer in full (6 512), or yes, no or none.
+
+    A number below 1e-3 or from 1e6 on that is not an integer has two digits and a power of ten (3.2 × 10⁻⁷).
+    """
     if value is None:
         return "none"
     if isinstance(value, bool | np.bool_):
@@ -45,7 +48,7 @@ def number(value: float | bool | None) -> str:
 
 
 def two_digits(value: float) -> float:
-    """Round an estimate to two digits."""
+    """Round an estimate to two significant digits."""
     return float(f"{value:.2g}")
 
 
@@ -86,7 +89,7 @@ def duration(seconds: float) -> str:
 
 
 def bound(check: Check) -> str:
-    """Return the limit of a check, with ≤ if a value below the limit passes, with ≥ if it fails."""
+    """Return the limit of a check, with ≤ if a value below the limit passes, with ≥ if such a value fails."""
     value, limit, unit = check.value, check.limit, check.unit
     if limit is None:
         return ""
@@ -97,7 +100,7 @@ def bound(check: Check) -> str:
 
 
 def amount(value: float, unit: str, signed: bool = False) -> str:
-    """Return an error with its unit, such as nm; "mm", "mm RMS" and "deg" change to a unit that suits `value`."""
+    """Return an amount with its unit; "mm", "mm RMS" and "deg" change to a unit that suits `value`; signed: with +."""
     length, _, kind = unit.partition(" ")
     text = quantity(value, length) if length in ("mm", "deg") else f"{number(value)} {unit}".strip()
     text = f"{text} {kind}".strip() if length == "mm" else text
@@ -110,7 +113,7 @@ def exact(value: float) -> str:
 
 
 def mm(value: float) -> str:
-    """Return a length in mm, rounded to 0.001 mm; only rounded values keep zeros at the end: 6.040, but −0.5, 0."""
+    """Return a length (mm) rounded to 0.001 mm: 6.040 for 6.0402, but without zeros at the end (0.5) if it is exact."""
     text = f"{value:.3f}" if abs(value) >= 5e-4 else "0"
     text = text.rstrip("0").rstrip(".") if "." in text and abs(value - float(text)) < 1e-6 else text
     return text.replace("-", "−")
@@ -138,7 +141,7 @@ def tilt_words(tilt: Sequence[float], number: Callable[[float], str] = number) -
 
 
 def scene_value(value: Any) -> str:
-    """Return a value of a scene in a line: yes or no, a number with all digits, a list, a table with its keys."""
+    """Return a value of a scene in one line: yes or no, a number with all digits, a list, a table with its keys."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
@@ -154,7 +157,7 @@ def scene_value(value: Any) -> str:
 
 @cache  # compiling the templates takes 0.6 s of CPU time
 def environment() -> Environment:
-    """Return the templates of this folder; all text is escaped, since titles, names and scenes come from users."""
+    """Return the templates of this folder; they escape all text for HTML, since titles and scenes come from users."""
     import jinja2
 
     folder = jinja2.FileSystemLoader(Path(__file__).parent)
@@ -168,7 +171,7 @@ def environment() -> Environment:
 
 @cache
 def _plain_text() -> Environment:
-    """Return the templates without escapes, for plain text."""
+    """Return the templates of this folder for plain text, without escapes."""
     return environment().overlay(autoescape=False)
 
 
@@ -213,5 +216,5 @@ class Remark(NamedTuple):
 
 
 def remarks(template: str, macro: str, **values: Any) -> list[Remark]:
-    """Return the remarks that a macro of a template writes, each as a paragraph with its id: "(dark) A part …"."""
+    """Return the remarks that a macro of a template writes as paragraphs that begin with an id: "(dark) A part …"."""
     return [Remark(*text.removeprefix("(").split(") ", 1)) for text in paragraphs(template, macro, **values)]

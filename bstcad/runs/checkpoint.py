@@ -25,12 +25,12 @@ import torch
 from bstcad.runs import files
 from bstcad.runs.files import SceneError
 
-MAGIC = b"bstcad checkpoint 9\n"  # first line; increase the number if fields of states or purposes change
+MAGIC = b"bstcad checkpoint 9\n"  # first line of the file; increase the number if fields of states or purposes change
 DIGEST_SIZE = 65  # length of the line with the SHA-256 (bytes)
 MAX_SIZE = 8 << 30  # largest size of a checkpoint (bytes); 2049 x 2049 control points need 1 GB
 MAX_WRITING_FRACTION = 0.02  # largest fraction of the run's time that checkpoints may take
 
-Purpose = dict[str, Any]  # description of the checkpoint's design: numbers, text, None, lists and dicts of them
+Purpose = dict[str, Any]  # description of the design of a checkpoint: numbers, text, None, and lists and dicts of them
 # A state is a record: a frozen dataclass of numbers, text, None, arrays, tensors, tuples, mappings and such records.
 
 
@@ -38,7 +38,7 @@ Purpose = dict[str, Any]  # description of the checkpoint's design: numbers, tex
 
 
 def write(path: Path, purpose: Purpose, state: Any) -> None:
-    """Write a checkpoint: description of the design (`purpose`) and state.  On an OSError the old file stays."""
+    """Write a checkpoint: description of the design (`purpose`) and state.  After an OSError the old file is intact."""
     arrays: dict[str, np.ndarray] = {}
     tree = json.dumps([purpose, state], default=partial(_packed, arrays))
     with files.atomic_file(path) as file:  # without a copy of the state in memory
@@ -51,7 +51,7 @@ def write(path: Path, purpose: Purpose, state: Any) -> None:
 
 
 def read(path: Path, kind: type, device: str = "cpu") -> tuple[Purpose, Any]:
-    """Return (purpose, state) of a checkpoint; kind: class of the state, device: device for its tensors.
+    """Return (purpose, state) of a checkpoint; kind: class of the state; device: torch device for its tensors.
 
     Mappings become dicts, and lists become tuples.  SceneError if the file is not a checkpoint of this version.
     """
@@ -80,7 +80,7 @@ def read(path: Path, kind: type, device: str = "cpu") -> tuple[Purpose, Any]:
 
 
 def _packed(arrays: dict[str, np.ndarray], value: Any) -> dict[str, Any]:
-    """Encode a value for JSON: {"@array" or "@tensor": name in `arrays`}, {"@module.Class": fields}, or a dict."""
+    """Encode a value for JSON: {"@module.Class": fields}, {"@array" or "@tensor": its name in `arrays`}, or a dict."""
     if isinstance(value, torch.Tensor):
         return {"@tensor": _packed(arrays, value.detach().cpu().numpy())["@array"]}
     if isinstance(value, np.ndarray):
@@ -92,7 +92,7 @@ def _packed(arrays: dict[str, np.ndarray], value: Any) -> dict[str, Any]:
 
 
 def _unpacked(arrays: Mapping[str, np.ndarray], records: Mapping[str, type], device: str, found: dict) -> Any:
-    """Decode `found`, a value of `_packed` with its inner values decoded.  records: classes by "module.Class"."""
+    """Decode a dict of `_packed` whose inner values are already decoded; records: classes by their "module.Class"."""
     (kind, content), *_ = [*found.items(), ("", None)]
     if kind == "@array":
         return arrays[content]
@@ -127,7 +127,7 @@ def _name(kind: Any) -> str:
 
 @dataclass
 class Keeper:
-    """Latest state of a design, which is written to disk at intervals."""
+    """Keeper of the latest state of a design, which it writes to the checkpoint `path` at intervals."""
 
     path: Path
     purpose: Purpose
@@ -148,7 +148,7 @@ class Keeper:
             self.flush()
 
     def flush(self) -> bool:
-        """Write the latest state; return True if any state of the design is on disk.  A full disk raises no error."""
+        """Write the latest state; return True if this or an earlier state is on disk.  A full disk raises no error."""
         if self.latest is not None and (self.latest is not self._written or not self.path.exists()):
             began = time.monotonic()
             try:
@@ -163,7 +163,7 @@ class Keeper:
         return self._written is not None and self.path.exists()
 
     def keep_at_exit(self) -> str:
-        """Write the latest state at the end of a run, beside the folder or else among temporary files.
+        """Write the latest state at the end of a run, to `path` or else among temporary files.
 
         Return a sentence for the user: how to resume, or that the state is lost; "" without a state.
         """
@@ -181,7 +181,7 @@ class Keeper:
         return f"the design so far is kept in {path}; move it to {self.path} and use --resume to continue it"
 
     def load(self) -> Any:
-        """Return the state to resume from; None without a file.  SceneError if it is damaged or of another design."""
+        """Return the state in the file; None if there is no file.  SceneError if it is damaged or of another design."""
         if not self.path.exists():
             return None
         purpose, state = read(self.path, self.kind, self.purpose.get("device", "cpu"))
@@ -199,7 +199,7 @@ class Keeper:
         self.path.unlink(missing_ok=True)
 
     def withdraw(self) -> None:
-        """Delete the checkpoint of this run, since the scene is refused; a checkpoint of an earlier run stays."""
+        """Delete the checkpoint if this run wrote it, since the scene is refused; else that of an earlier run stays."""
         self.latest = None
         if self._own:
             self.remove()

@@ -17,9 +17,9 @@ from typing import Any, Protocol
 from bstcad.runs import environment, signals
 from bstcad.runs.files import MachineError, SceneError, first_line
 
-CONNECTION_TIMEOUT = 30.0  # timeout (s) for the scheduler's answer, and for the first worker
+CONNECTION_TIMEOUT = 30.0  # longest time (s) to wait for the scheduler's answer, and then for a first worker
 JOB_INTERVAL = 0.5  # time (s) between two checks for finished jobs
-RETRIES = 2  # number of retries of a job that raises an error on a worker
+RETRIES = 2  # number of times that a job which raised an error on a worker is done again
 MAX_WORKERS = 1000  # largest value of --workers
 THIS_MACHINE = "here"  # value of `Answer.where` for a job on this machine; for others, the address of the worker
 
@@ -28,7 +28,7 @@ _one_at_a_time = threading.Lock()  # limits a worker process to one job, whateve
 
 @dataclass(frozen=True)
 class Answer:
-    """Result of a job."""
+    """Result of a job, or the reason why it failed."""
 
     key: Any  # key with which the job was started
     where: str  # THIS_MACHINE, or the address of the worker (of the scheduler, if no worker answered)
@@ -44,7 +44,7 @@ class Machines(Protocol):
         """Largest number of jobs that run at the same time."""
 
     def start(self, key: Any, work: Callable[..., Any], *arguments: Any) -> None:
-        """Start the job work(*arguments)."""
+        """Start the job work(*arguments); key: value by which its Answer is recognised."""
 
     def next(self, tick: Callable[[], None]) -> Answer:
         """Wait until a job ends, calling `tick` regularly, and return its answer."""
@@ -52,7 +52,7 @@ class Machines(Protocol):
 
 @contextlib.contextmanager
 def connect(scheduler: str | None, workers: int | None = None) -> Iterator[Cluster | None]:
-    """Yield a Cluster of the scheduler at an address or of `workers` temporary local processes; None for neither."""
+    """Yield a Cluster of the scheduler at this address, or of `workers` local processes; None if both are None."""
     check(scheduler, workers)
     with contextlib.ExitStack() as stack:
         address = scheduler
@@ -71,7 +71,7 @@ def check(scheduler: str | None, workers: int | None) -> None:
 
 @contextlib.contextmanager
 def _local(workers: int) -> Iterator[str]:
-    """Yield the address of a local scheduler with worker processes, which share the cores."""
+    """Yield the address of a local scheduler with this number of worker processes, which share the cores."""
     distributed = _library("--workers")
     local = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place, contextlib.ExitStack() as stack:
@@ -83,7 +83,7 @@ def _local(workers: int) -> Iterator[str]:
 
 
 class Cluster:
-    """Workers of a scheduler at an address such as tcp://10.0.0.1:8786."""
+    """Workers of a scheduler at an address such as tcp://10.0.0.1:8786; patience: see CONNECTION_TIMEOUT."""
 
     def __init__(self, address: str, patience: float = CONNECTION_TIMEOUT) -> None:
         self._distributed, self.address = _library("--scheduler"), address
@@ -115,18 +115,18 @@ class Cluster:
         return max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1)  # all of them, not the first five
 
     def start(self, key: Any, work: Callable[..., Any], *arguments: Any) -> None:
-        """Start the job work(*arguments) on a worker."""
+        """Start the job work(*arguments) on a worker; key: as in Machines."""
         self._check()
         version = environment.version()
         future = self._client.submit(answer, version, key, work, *arguments, pure=False, retries=RETRIES)
         self._keys[future] = key
 
     def next(self, tick: Callable[[], None] = lambda: None) -> Answer:
-        """Wait until a job ends, calling `tick`, and return its answer.  MachineError if the scheduler is lost."""
+        """Wait until a job ends, calling `tick` regularly; return its answer.  MachineError without a scheduler."""
         return self._ended(self._keys, tick)
 
     def _ended(self, futures: Collection[Any], tick: Callable[[], None] = lambda: None) -> Answer:
-        """Wait until one of these futures is done, calling `tick`, and return its answer."""
+        """Wait until one of these futures of jobs is done, calling `tick` regularly, and return its answer."""
         while True:
             for future in [future for future in futures if future.done()]:
                 return self._answer(self._keys.pop(future), future)
@@ -138,7 +138,7 @@ class Cluster:
     def spread(self, work: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]) -> Iterator[Any]:
         """Yield work(shared, item) for each item, in order.  MachineError if a worker fails.
 
-        `shared` is sent once.  The scheduler stores it, unlike scattered data, so that it outlives lost workers.
+        `shared` is sent once, as the result of a job, which the scheduler repeats if the worker that has it is lost.
         """
         import dask
 
@@ -166,7 +166,7 @@ class Cluster:
 
 
 def answer(wanted: str, key: Any, work: Callable[..., Any], *arguments: Any) -> Answer:
-    """Return the Answer of work(*arguments) on a worker; a failure if the worker's version is not `wanted`."""
+    """Do the job work(*arguments) on this worker and return its Answer: a failure if the version is not `wanted`."""
     from distributed import get_worker
 
     with _one_at_a_time:

@@ -1,4 +1,4 @@
-"""Machine of a design, and the versions of bstcad, Python and the libraries."""
+"""This machine, and the versions of bstcad, Python and the libraries."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LIBRARIES = ["torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "tr
 
 
 def circumstances(device: str) -> dict[str, Any]:
-    """Return the version of bstcad, the machine, and the versions of Python and the libraries, for report.json."""
+    """Return the entries version, machine and versions of report.json; device: "cpu" or "cuda", which tailors."""
     return {
         "version": bstcad.__version__,
         "machine": {
@@ -47,14 +47,14 @@ def cores() -> int:
 
 
 def threads(sharers: int) -> dict[str, str]:
-    """Return environment variables that divide the cores among `sharers` processes."""
+    """Return the environment variables by which each of `sharers` processes uses its part of the cores."""
     number = str(max(1, cores() // sharers))
     return {"OMP_NUM_THREADS": number, "NUMBA_NUM_THREADS": number}
 
 
 @cache
 def version() -> str:
-    """Return bstcad's version with a hash of its sources."""
+    """Return bstcad's version, such as 1.2.0, followed by + and a hash of its sources."""
     package, digest = Path(bstcad.__file__).parent, hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         digest.update(str(path.relative_to(package)).encode() + path.read_bytes())
@@ -62,7 +62,7 @@ def version() -> str:
 
 
 def _peak_memory() -> float | None:
-    """Return the sum of the separate peak memories (GB) of this and the second process; None if unknown."""
+    """Return the peak memory of this process plus that of the second process (GB); None if one is unknown."""
     try:
         first, second = processes.peak_memory(), processes.submit(processes.peak_memory).result()
     except BrokenExecutor:

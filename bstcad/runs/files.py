@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     import numpy as np
 
 MAX_SENTENCE = 600  # largest length of a text from `one_line` (characters)
-MADE_PART_FILES = ("deviation.npz",)  # files by which the folder of a made part is recognised
-DESIGN_FILES = ("report.json", "lens.step", "scene.toml")  # files by which a design's folder is recognised
+MADE_PART_FILES = ("deviation.npz",)  # file by which the folder of a made part is recognised
+DESIGN_FILES = ("report.json", "lens.step", "scene.toml")  # files, any of which marks a design's folder
 # Kinds of files for a shop, as in `bstcad export --as` and the scene's output.export.
 Export = Literal["sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet"]
 EXPORTS: tuple[str, ...] = get_args(Export)
-MAX_ARCHIVE_SIZE = 600_000_000  # largest archive (bytes), enough for a net of 2049 x 2049 and pictures of 4096 x 4096
-MAX_ARRAY_HEADER = 4096  # largest size of an array's header (bytes), with a margin
+MAX_ARCHIVE_SIZE = 600_000_000  # largest .npz (bytes), enough for a net of 2049 x 2049 and pictures of 4096 x 4096
+MAX_ARRAY_HEADER = 4096  # largest header of an array in an .npz archive (bytes), with a margin
 NO_MEMORY = re.compile(  # words of Python, torch, the system and the dynamic loader for a lack of memory
     "not enough memory|out of memory|bad_alloc|can(not|'t) allocate memory|failed to map segment|can't start new thread"
 )
@@ -52,7 +52,7 @@ class MachineError(SentenceError, RuntimeError):
 
 
 def one_line(text: object) -> str:
-    """Return a text with control characters escaped; the middle of a long text is left out."""
+    """Return a text with control characters escaped; of a text over MAX_SENTENCE characters the middle is left out."""
     text = _cut(str(text))
     return text if text.isprintable() else _cut("".join(c if c.isprintable() else repr(c)[1:-1] for c in text))
 
@@ -62,12 +62,12 @@ def _cut(text: str) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of an error's text, to be quoted within a sentence."""
+    """Return the first line of an error's text, without a full stop, to be quoted within a sentence."""
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
 
 
 def note(error: BaseException) -> str:
-    """Return the notes of an error, such as a sentence on how to resume."""
+    """Return the notes that were added to an error, such as a sentence on how to resume; "" without notes."""
     return "; ".join(getattr(error, "__notes__", ()))
 
 
@@ -123,7 +123,7 @@ def contents(path: Path, largest: int) -> bytes:
 
 
 def within(path: Path, *folders: Path) -> Path:
-    """Return the path with links resolved.  ValueError if they lead out of these folders, or back to themselves."""
+    """Return the path with links resolved.  ValueError if links lead out of all these folders, or to themselves."""
     try:
         found = path.resolve()
         endless = found.is_symlink()  # newer versions of pathlib return a link; older ones raise
@@ -137,10 +137,10 @@ def within(path: Path, *folders: Path) -> Path:
 
 
 def arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], largest: int) -> dict[str, np.ndarray]:
-    """Return arrays of float64 with the given shapes, by name, from an .npz archive of at most `largest` bytes.
+    """Return arrays as float64, by name, from an .npz archive of at most `largest` bytes; shapes: their shapes by name.
 
     An archive may unpack to a million times its size, and an array's header may claim any size: both are checked
-    against the shape before memory is allocated.  Raises the errors of zipfile and numpy for a damaged archive.
+    against the shape before memory is allocated.  Raises ValueError, or for a damaged archive errors of zipfile.
     """
     with zipfile.ZipFile(io.BytesIO(contents(path, largest))) as archive:
         return {name: _array(archive, name, shape) for name, shape in shapes.items()}
@@ -156,7 +156,7 @@ def names(path: Path) -> list[str]:
 
 
 def net(path: Path, most: int) -> np.ndarray:
-    """Return control_points (m, n, 3) of an .npz archive.  ValueError if m or n exceeds `most`; else see `arrays`."""
+    """Return control_points (m, n, 3) of an .npz archive; ValueError if m or n exceeds `most`, or as in `arrays`."""
     with zipfile.ZipFile(io.BytesIO(contents(path, MAX_ARCHIVE_SIZE))) as archive:
         with archive.open("control_points.npy") as file:
             (m, n, *_), _ = _header(file, "control_points")
@@ -193,7 +193,7 @@ def _header(file: IO[bytes], name: str) -> tuple[tuple[int, ...], str]:
 def check_free(folder: Path, ours: Sequence[str] = DESIGN_FILES, whose: str = "a design's") -> None:
     """Raise SceneError unless a design may use the folder: it must be new or empty, or contain an earlier design.
 
-    ours: files by which such a folder is recognised.  whose: owner of its files, for the message.
+    ours: names of files, of which an earlier design's folder has at least one.  whose: their owner, for the message.
     """
     try:
         folder.resolve()
@@ -209,14 +209,14 @@ def check_free(folder: Path, ours: Sequence[str] = DESIGN_FILES, whose: str = "a
 
 
 def put(path: Path, *parts: bytes | memoryview) -> None:
-    """Write a file completely, or leave the old file unchanged; a link is replaced, and its target stays as it is."""
+    """Write a file completely, or leave the old one unchanged; a link is replaced, and the linked file is unchanged."""
     with atomic_file(path) as file:
         file.writelines(parts)
 
 
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[io.BufferedRandom]:
-    """Yield a temporary file to write and read, which replaces the file at `path` when the block ends."""
+    """Yield a temporary file to write and read; it replaces the file at `path` if the block ends without an error."""
     new = path.with_name(f".{path.name.removeprefix('.')}.new")
     new.unlink(missing_ok=True)
     try:
@@ -249,7 +249,7 @@ def beside(folder: Path, kind: str) -> Path:
 def exclusive(folder: Path) -> Iterator[None]:
     """Lock an output folder against other runs within the block.  SceneError if another run uses it.
 
-    The system releases the lock when its process ends, so the lock file of a killed run locks nothing.
+    The system releases the lock when the run's process ends, so the lock file of a killed run locks nothing.
     """
     from filelock import FileLock, Timeout  # loaded late: it takes a quarter of a second
 

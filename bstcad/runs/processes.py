@@ -53,7 +53,7 @@ def command_of(process: int) -> tuple[str, ...]:
 
 
 def _end_with(parent: int, end: Callable[[], Any]) -> None:
-    """Call `end`, which ends this process, as soon as its parent has ended."""
+    """Call `end`, which ends this process, as soon as the process `parent` (its id) has ended."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -96,9 +96,9 @@ class Submit(Protocol):
 def submit(work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> Future[R]:
     """Call the function `work` in the second process; calls run one after the other.
 
-    The arguments are pickled before `submit` returns, so the caller may cache properties of them during the call.  The
-    Future raises BrokenExecutor if the process died during the call.  If the system allows no second process, a thread
-    does the work.
+    The arguments are pickled before `submit` returns, so the caller may change them during the call, for example by a
+    cached property.  The Future raises BrokenExecutor if the process died during the call.  If the system allows no
+    second process, a thread does the work.
     """
     global _process
     if _process is not None:
@@ -112,7 +112,7 @@ def submit(work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> Fut
 
 
 def _submit_to(process: Executor, work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> Future[R]:
-    """Submit a call, pickled in this thread if it is for a process: loky would pickle it later, in another thread."""
+    """Submit a call, which this thread pickles if `process` is one: loky would pickle it later, in another thread."""
     if isinstance(process, ThreadPoolExecutor):
         return process.submit(work, *arguments, **options)
     from loky.backend import reduction
@@ -129,11 +129,11 @@ def _call(pickled: bytes) -> Any:
 
 
 class Overdue(TimeoutError):
-    """Work of the second process exceeded its time limit; the process has been ended."""
+    """Work of the second process exceeded its time limit, and the second process has been ended."""
 
 
 def result(work: Future[R], limit: float) -> R:
-    """Return the result of a call in the second process; Overdue if it takes more than `limit` seconds."""
+    """Return the result of a call in the second process; after `limit` seconds end that process and raise Overdue."""
     try:
         return work.result(limit)
     except TimeoutError as error:
@@ -208,7 +208,7 @@ def _environment_variable(name: str, value: str) -> Iterator[None]:
 
 
 def _serve(parent: int) -> None:
-    """Ignore the signals that the parent handles, and end when it ends: a killed parent cannot end this process."""
+    """Ignore the signals that the parent handles, and end once it has ended: a killed parent cannot end a child."""
     global _is_second
     _is_second = True
     for number in (*TERMINAL_SIGNALS, signal.SIGTERM):
@@ -262,7 +262,7 @@ Tick = Callable[[], None]  # function called regularly while a child works
 
 @dataclass(frozen=True)
 class ExitStatus:
-    """Exit status of a child process."""
+    """End of a child process: its exit code, times, and text on stderr."""
 
     code: int  # exit code; -n if signal n ended the child
     seconds: float  # wall time
@@ -284,7 +284,7 @@ def run(
 ) -> ExitStatus:
     """Run `bstcad` with these arguments in a child process, which is killed after `limit` seconds.
 
-    tick: called regularly; an exception of tick ends the child.  environment: additional variables.
+    tick: called regularly; an exception of tick ends the child.  environment: additional environment variables.
     """
     source = str(Path(__file__).parents[2])  # the child runs these sources
     paths = os.pathsep.join(filter(None, (source, os.environ.get("PYTHONPATH"))))
@@ -323,7 +323,7 @@ def _end(child: subprocess.Popen) -> None:
 
 
 def end_with_parent() -> None:
-    """End this process and its group once the parent has ended, if it is a child of `run`; else do nothing."""
+    """If this process was started by `run`, end it and its group once its parent has ended; else do nothing."""
     parent = os.environ.pop(PARENT, None)
     if parent is not None and os.getpgrp() == os.getpid():
         _end_with(int(parent), lambda: os.killpg(0, signal.SIGKILL))

@@ -29,7 +29,7 @@ class Throttled:
         self._progress, self._pause, self._last = progress, pause, ("", -math.inf)
 
     def __call__(self, stage: str, done: int, total: int, text: str) -> None:
-        """Pass the progress on, unless its text is repeated within the pause."""
+        """Call the wrapped function, unless the text is the same as in its last call less than the pause ago."""
         now = time.perf_counter()
         if text != self._last[0] or now - self._last[1] >= self._pause:
             self._last = text, now
@@ -37,7 +37,7 @@ class Throttled:
 
 
 def watch(console: Console) -> AbstractContextManager[ProgressFunction]:
-    """Display bars if `console` is a terminal, else lines."""
+    """Display `bars` if the console is a terminal, else `lines`."""
     return bars(console) if console.is_terminal else lines(console)
 
 
@@ -80,7 +80,7 @@ def bars(console: Console) -> Iterator[ProgressFunction]:
 
 @contextmanager
 def cells(display: Callable[..., Any], clock: Callable[[], float] = time.monotonic) -> Iterator[ProgressFunction]:
-    """Display a table of the stages below a notebook's cell, updated every REDRAW_INTERVAL and when a stage ends."""
+    """Display a table of the stages below a notebook's cell; display: function of IPython; clock: returns seconds."""
     began: dict[str, float] = {}  # start time by stage
     rows: dict[str, str] = {}
     handle = display({"text/html": "", "text/plain": ""}, raw=True, display_id=True)
@@ -107,7 +107,7 @@ def cells(display: Callable[..., Any], clock: Callable[[], float] = time.monoton
 
 @contextmanager
 def lines(console: Console, clock: Callable[[], float] = time.monotonic) -> Iterator[ProgressFunction]:
-    """Print a line when a stage starts, every LINE_INTERVAL, and when it ends."""
+    """Print a line when a stage starts, every LINE_INTERVAL, and when the stage ends; clock: returns seconds."""
     began: dict[str, float] = {}  # start time by stage
     due: dict[str, float] = {}  # earliest time of a stage's next line
 

@@ -1,7 +1,7 @@
 """Signals that end a run.
 
-While a lens is tailored, the first Ctrl-C (SIGINT) requests the best lens so far; a second one ends the run at once, as
-do SIGTERM and SIGHUP, after which a SIGKILL may follow.  In each case a checkpoint is kept (commands.generate).
+While a lens is tailored, the first Ctrl-C (SIGINT) requests the best lens so far.  A second Ctrl-C, a SIGTERM or a
+SIGHUP ends the run at once; SIGKILL may follow SIGTERM.  In each case a checkpoint is kept (commands.generate).
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterator
 # Signals that terminate a run; Windows has no SIGHUP.
 TERMINATION_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 TERMINAL_SIGNALS = (signal.SIGINT, *TERMINATION_SIGNALS[1:])  # signals that a terminal sends to its whole process group
-_received: list[int] = []  # termination signals since `raise_terminated` began
+_received: list[int] = []  # numbers of the termination signals since `raise_terminated` began
 _starting: list[object] = []  # one item for each process that is being started
-_delayed: list[int] = []  # signals that `exit_on_signal` handles once the process has been started
+_delayed: list[int] = []  # numbers of signals that `_exit` handles once the processes have been started
 
 
 class Terminated(BaseException):
@@ -40,7 +40,7 @@ def termination() -> Terminated | None:
 
 @contextlib.contextmanager
 def raise_terminated() -> Iterator[None]:
-    """Raise Terminated on the first SIGTERM or SIGHUP in the block; later ones, and ignored ones, have no effect."""
+    """Raise Terminated on the first SIGTERM or SIGHUP in the block, unless ignored; later ones have no effect."""
 
     def handle(number: int, frame: object) -> None:
         _received.append(number)
@@ -77,7 +77,7 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
 def ignored_by_children() -> Iterator[None]:
     """Make processes that start in the block ignore a terminal's signals; this process receives them after the block.
 
-    Until its end the signals are masked, so that they are kept; a system that cannot mask signals loses them.
+    Until the end of the block the signals are masked, and so kept; a system that cannot mask signals loses them.
     """
     masks = hasattr(signal, "pthread_sigmask")
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL_SIGNALS) if masks else ()
@@ -95,7 +95,7 @@ def ignored_by_children() -> Iterator[None]:
 
 @contextlib.contextmanager
 def exit_on_signal() -> Iterator[None]:
-    """End this process at once, with a sentence, on a signal while the block loads libraries.
+    """End this process at once, with a sentence, on a signal in the block, which loads libraries.
 
     Some libraries swallow the exception of a signal while they load and stay half loaded.  Loading all of them can take
     ten seconds on a busy machine.  Nothing has been written yet.

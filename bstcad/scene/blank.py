@@ -39,19 +39,19 @@ MIN_RECESS_GAP = 1e-2  # mm; smallest distance between the outlines of the front
 CONIC_CONSTANTS = (-1e3, 1e3)  # range of conic constants
 CURVATURES = (-1e3, 1e3)  # range of curvatures, 1/mm
 INDICES = (1.01, 5.0)  # range of the refractive index
-BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # optional bounds on tailored faces
+BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # keys of lens, optional: bounds on faces
 
 NET_FILE = "front.npz"  # file in a design's folder with the net that was read from lens.front.file
 NET_REMEDY = "give the folder of a design, its design.npz or its lens.step"
-MAX_AXIS_SINE = 1e-9  # sine of the largest angle between the sides of a net and the axes that counts as no rotation
-UNIFORM_TOLERANCE = 1e-9  # mm; largest deviation of a net from uniform spacing in x and y
+MAX_AXIS_SINE = 1e-9  # sine of the largest angle between the axes of a net and x, y, z that counts as no rotation
+UNIFORM_TOLERANCE = 1e-9  # mm; largest deviation in x or y of a control point from a uniform grid
 VERTEX_TOLERANCE = 1e-12  # mm; a net whose vertex is this near to z = 0 is not shifted
-MAX_CONTROL_POINTS = 2049  # largest number of control points along a side
+MAX_CONTROL_POINTS = 2049  # largest number of control points along a side of a net
 NET_SIZES = (MIN_SIDE, MAX_CONTROL_POINTS)  # range of the control points per side of a net
-FIT_TOLERANCE = 1e-6  # mm; largest distance between a fitted net and its surface (a toroid, or a user's class)
+FIT_TOLERANCE = 1e-6  # mm; largest difference in z of a fitted net and its surface (a toroid, or a user's class)
 FIT_SIZES = (33, 65, 129, 257, 513, 1025)  # control points per side of a fitted net, tried in this order
-MAX_CELL_RATIO = 1.5  # ratio of length and width of a cell of the net above which a warning proposes another net
-MIN_ROUND_POINTS = 6  # fewest control points per side for a round lens, whose net ends two pitches past the rim
+MAX_CELL_RATIO = 1.5  # longer / shorter side of a cell of the net, above which a warning proposes another net
+MIN_ROUND_POINTS = 6  # fewest control points per side for a round lens, whose net ends two spacings past the rim
 
 Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 
@@ -61,7 +61,7 @@ Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 
 @dataclass(frozen=True)
 class FileNet(FileContent):
-    """A B-spline surface with its vertex at z = 0; a Scene contains its heights, so that a design can be repeated."""
+    """The net in a file: a B-spline surface, vertex at z = 0.  A Scene contains its heights, not the file's path."""
 
     name = NET_FILE
     shape: tuple[int, int]  # control points along x and along y
@@ -71,14 +71,14 @@ class FileNet(FileContent):
 
     @classmethod
     def of(cls, surface: BSplineSurface) -> FileNet:
-        """Return the net of a surface, moved so that its vertex is at z = 0."""
+        """Return the net of a surface, moved along z so that its vertex is at z = 0."""
         resting = surface.plain().moved(0.0)
         vertex = resting.from_vertex()
         heights = (vertex if abs(vertex.z) > VERTEX_TOLERANCE else resting).heights
         return cls(surface.shape, surface.x, surface.y, heights.numpy().astype("<f8").tobytes())
 
     def surface(self, z: float) -> BSplineSurface:
-        """Return the surface with its vertex at z (mm)."""
+        """Return the net as a surface with its vertex at z (mm)."""
         from bstcad.optics.bspline import BSplineSurface
 
         heights = np.frombuffer(self.data, "<f8").reshape(self.shape).astype(np.float64)
@@ -93,9 +93,9 @@ class FileNet(FileContent):
 
 
 def read_net(path: Path) -> FileNet:
-    """Read the back face of a design from its folder, design.npz or lens.step; SceneError if missing or damaged.
+    """Read the back of a design from its folder, design.npz or lens.step; SceneError if it is missing or damaged.
 
-    A face of a STEP file keeps its position in x and y; its shift along z is dropped.
+    A net from a STEP file keeps its position in x and y, and its vertex is moved to z = 0.
     """
     from bstcad.optics.bspline import BSplineSurface
 
@@ -125,12 +125,12 @@ def _net_of_step(path: Path) -> np.ndarray:
     surface, shape = text.surface, text.surface.control_points.shape[:2]
     uniform = (np.array_equal(full, knots(m)) for full, m in zip(surface.full_knots, shape, strict=True))
     if surface.degrees != (2, 2) or not all(uniform):
-        raise ValueError("its freeform face has other knots than bstcad's")
+        raise ValueError("its freeform face does not have the degree and the knots of a net by bstcad")
     return _along_axes(surface.control_points)
 
 
 def _along_axes(net: np.ndarray) -> np.ndarray:
-    """Return a net (m, n, 3) with x increasing along its first axis and y along its second.
+    """Exchange or reverse the array axes of a net (m, n, 3) so that x grows along the first and y along the second.
 
     ValueError if the axis of its lens is not along z, or the sides of the net are not along x and y.
     """
@@ -170,18 +170,18 @@ class _Front:
 
     @property
     def surface(self) -> Surface:
-        """Surface of bstcad.optics with the parameters of the front."""
+        """The front as a surface of bstcad.optics."""
         of, _ = FRONTS[self.kind]
         surface = of(**{each.name: getattr(self, each.name) for each in fields(of)})
         return surface if self.outline is None else Recess(surface, self.outline)
 
     @property
     def is_tailored(self) -> bool:
-        """True for a net that tailoring shapes."""
+        """True if the front is a net that tailoring shapes."""
         return self.kind == "bspline" and self.optimise is True
 
     def traced(self, outline: Outline) -> Surface:
-        """Return the surface that a lens of this outline has: the front's surface, or a net fitted to it."""
+        """Return the front of a lens of this outline as it is traced: `surface`, or a net fitted to it."""
         return self.surface
 
     @property
@@ -197,7 +197,7 @@ class _Front:
         return tuple(name for name in names if not isinstance(chosen, tuple) or name in chosen)
 
     def with_parameters(self, surface: Surface) -> Self:
-        """Return the front with the parameters of this surface, all of them fixed."""
+        """Return the front with all parameters of `surface`, fixed; a front without free parameters is unchanged."""
         return replace(self, **surface.plain().parameters(), optimise=False) if self.free else self
 
     def complaints(self, outline: Outline) -> Iterator[str]:
@@ -223,7 +223,7 @@ class _Front:
 
 
 def _farthest(outline: Outline) -> tuple[torch.Tensor, ...]:
-    """Return x and y (mm) of the point of a rim that is farthest from the axis."""
+    """Return x and y (mm) of the point of an outline that is farthest from the axis, as tensors."""
     return torch.tensor(outline.farthest, dtype=torch.float64).unbind()
 
 
@@ -250,7 +250,7 @@ class SphereFront(_Front):
     __pydantic_config__ = STRICT
 
     def complaints(self, outline: Outline) -> Iterator[str]:
-        """Yield the faults; a sphere must reach the rim of the lens."""
+        """Yield the faults: those of every front, and a sphere that does not reach the rim of the lens."""
         yield from super().complaints(outline)
         if self.outline is not None:
             return
@@ -290,10 +290,10 @@ class ConicFront(_Front):
 
 
 class _FittedFront(_Front):
-    """A front that is approximated by a fitted net; its record has the keys curvature_x and curvature_y."""
+    """A front that is traced as a fitted net; a subclass has the keys curvature_x and curvature_y."""
 
     def traced(self, outline: Outline) -> Surface:
-        """Return the net within FIT_TOLERANCE of the surface, its vertex at z."""
+        """Return the net fitted to the surface within FIT_TOLERANCE, with its vertex at self.z."""
         return _net_of(self.surface, outline)
 
     def complaints(self, outline: Outline) -> Iterator[str]:
@@ -348,7 +348,7 @@ class NetFront(_Front):
 
     @property
     def surface(self) -> Surface:
-        """Surface of bstcad.optics; a plane before tailoring if there is no file."""
+        """The front before tailoring as a surface of bstcad.optics: the net of the file, or a plane without a file."""
         return Plane(self.z) if self.file is None else self.file.surface(self.z)
 
     @property
@@ -357,7 +357,7 @@ class NetFront(_Front):
         return ()
 
     def complaints(self, outline: Outline) -> Iterator[str]:
-        """Yield the faults: no file and not tailored, or a net of a lens with another outline.
+        """Yield the faults: keys that need or exclude each other, or the net of a lens with another outline.
 
         A net may end two control-point spacings outside the outline (net_extent), or at the sides of a rectangle.
         """
@@ -395,7 +395,7 @@ FRONTS: dict[str, tuple[type[Any], Callable[..., Any]]] = {
 def as_front(value: Any, outline: Outline | None = None) -> Any:
     """Return the front of a scene for a surface of optics; return any other value as it is.
 
-    outline: outline of the lens, inside which a net is fitted to a surface not in FRONTS; None: it raises ValueError.
+    outline: that of the lens, inside which a net is fitted to a surface not in FRONTS; None: ValueError instead.
     """
     if not hasattr(value, "relative_sag_and_slope"):
         return value
@@ -406,7 +406,7 @@ def as_front(value: Any, outline: Outline | None = None) -> Any:
         own = {} if value.outline is None else {"outline": value.outline}
         return front(value.z, **value.parameters(), **own)
     if outline is None:
-        raise ValueError(f"a scene cannot contain a {value.kind}; use scene.changed, which fits a net to it")
+        raise ValueError(f"a scene cannot contain a surface {value.kind!r}; use scene.changed, which fits a net to it")
     return as_front(fit_net(value, outline))
 
 
@@ -443,7 +443,7 @@ def net_extent(outline: Outline, net: Sides) -> tuple[float, float]:
 
 
 def net_complaints(outline: Outline, points: Sides | None) -> Iterator[str]:
-    """Yield complaints about the number of control points of a net for a lens of this outline; None: chosen later."""
+    """Yield complaints about the control points per side of a net for a lens of this outline; None: chosen later."""
     m, n = as_pair(points or MIN_ROUND_POINTS)
     if outline.is_round and m != n:
         yield f"a round lens (lens.outline) needs a square net, not {m} x {n} control points; give one number"
@@ -462,7 +462,7 @@ Front = Annotated[
 
 
 def stated_index(material: str | None, index: float | None, wavelength: float) -> float:
-    """Return the refractive index that a table states as a number or by a material, at a wavelength (nm)."""
+    """Return `index` if a table of the scene states it, else the index of its material, at a wavelength (nm)."""
     if index is not None:
         return index
     assert material is not None  # `complaints` refuse a table with neither
@@ -536,7 +536,7 @@ class LensBlank(Record):
         return self.passes.optic
 
     def index_at(self, wavelength: float) -> float:
-        """Return the refractive index at a wavelength (nm); 1 if light does not enter the solid."""
+        """Return the lens's refractive index at a wavelength (nm); 1 if light does not enter the solid."""
         return stated_index(self.material, self.index, wavelength) if self.passes.enters else 1.0
 
     @property
@@ -546,7 +546,7 @@ class LensBlank(Record):
 
     @property
     def bounds(self) -> Bounds | None:
-        """Bounds on the tailored faces; None if the scene has none."""
+        """Bounds on the tailored faces; None if the scene states no key of BOUNDS."""
         if not self.bounded_by:
             return None
         curvature = None if self.tool_radius is None else 1 / self.tool_radius
@@ -566,7 +566,7 @@ class LensBlank(Record):
 
     @property
     def front_surface(self) -> Surface:
-        """The front before tailoring, as kernels trace it."""
+        """The front before tailoring, as it is traced: a fitted net in the place of a toroid."""
         return self.front.traced(self.outline)
 
     @property
@@ -576,14 +576,14 @@ class LensBlank(Record):
         return tuple(face for face in self.passes.faces if tailored[face])
 
     def front_net(self, net: Sides) -> Sides | None:
-        """Return the control points per side of the front's net if the back has `net`; None if the front has no net."""
+        """Return the control points per side of the front's net for a back with `net`; None if the front has no net."""
         if self.front.is_tailored:
             return self._tailored_front_net(net)
         fixed = _net_of(self.front.surface, self.outline) if isinstance(self.front, _FittedFront) else self.front.file
         return None if fixed is None else simplified(fixed.shape)
 
     def _tailored_front_net(self, net: Sides) -> Sides:
-        """Return the control points per side of a tailored front: `net` of the back times the ratio in the scene."""
+        """Return the control points per side of a tailored front: `net` (the back) times their ratio in the scene."""
         own = self.front.file.shape if self.front.file else self.front.control_points
         if own is None:
             return net
@@ -592,13 +592,13 @@ class LensBlank(Record):
         return in_proportion(net, of=self.back.net, to=simplified(own))
 
     def nets(self, net: Sides | None = None) -> tuple[Sides, ...]:
-        """Return the control points per side of the back (default: the scene's), then of a freeform front."""
+        """Return the control points per side of the back (`net`, or the scene's), then of the front if it has a net."""
         back = net or self.back.net
         front = self.front_net(back)
         return (back,) if front is None else (back, front)
 
     def flat_front(self, net: Sides, as_wide_as: Sides | None = None) -> Surface:
-        """Return the front before tailoring if the back has `net`; as_wide_as: see Scene.flat_lens."""
+        """Return the front before tailoring for a back with `net`; as_wide_as: as in Scene.flat_lens."""
         if not self.front.is_tailored:
             return self.front_surface
         if self.front.file is not None:
@@ -611,13 +611,13 @@ class LensBlank(Record):
 
     @property
     def cells(self) -> tuple[float, float]:
-        """Width and height of a cell of the back's net (mm)."""
+        """Width and height (mm) of a cell of the back's net in the scene."""
         half_x, half_y = net_extent(self.outline, self.back.net)
         m, n = as_pair(self.back.net)
         return 2 * half_x / (m - 1), 2 * half_y / (n - 1)
 
     def doubts(self) -> Iterator[str]:
-        """Yield a warning about oblong cells: square cells give finer detail with the same number of control points."""
+        """Yield a warning about oblong cells: square cells give finer detail with as many control points."""
         if self.back.control_points is None:
             return
         (width, height), (m, n) = self.cells, as_pair(self.back.net)
@@ -632,7 +632,7 @@ class LensBlank(Record):
             )
 
     def complaints(self) -> Iterator[str]:
-        """Yield the faults of the table."""
+        """Yield the faults of the table [lens], each as "key: sentence"."""
         given = [name for name in ("material", "index") if getattr(self, name) is not None]
         if self.front.reflect and self.back.reflect:
             yield "lens.front.reflect: no light reaches the front, as lens.back.reflect is true; remove one of them"

@@ -19,13 +19,13 @@ ONE_OF: dict[str, tuple[str, ...]] = {  # alternative keys of a table; setting o
     **dict.fromkeys(("lens", "before", "behind"), ("material", "index")),
     **dict.fromkeys(OUTLINES, ("radius", "diameter")),
 }
-STEP = re.compile(r"([^\[\]]+)(?:\[(\d{1,6})\])?")  # name, and number of a table in its list
+STEP = re.compile(r"([^\[\]]+)(?:\[(\d{1,6})\])?")  # part of a key: name, and number of a table in a list
 
 Step = tuple[str, int | None]
 
 
 def override(data: dict[str, Any], key: str, value: Any, shown: str) -> None:
-    """Set a dotted key of `data` and remove its alternatives (ONE_OF); None removes the key; shown: key in messages."""
+    """Set a dotted key of `data` and remove its alternatives (ONE_OF); None: remove the key; shown: key in messages."""
     steps = []
     for part in key.split("."):
         if (match := STEP.fullmatch(part)) is None:
@@ -47,7 +47,7 @@ def override(data: dict[str, Any], key: str, value: Any, shown: str) -> None:
 
 
 def tables_at(node: Any, key: str, shown: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield (full key, value) of `key` in `node`, once per table of a list; shown: full key of `node`."""
+    """Yield (full key, value) of `key` in `node`, once for each table of a list; shown: full key of `node` itself."""
     name, _, rest = key.partition(".")
     if isinstance(node, list):
         for k, part in enumerate(node):
@@ -59,7 +59,7 @@ def tables_at(node: Any, key: str, shown: str = "") -> Iterator[tuple[str, Any]]
 
 
 def _inner(table: dict[str, Any], steps: Sequence[Step], shown: str) -> dict[str, Any]:
-    """Return the table at the first of the remaining steps of a key; an absent table is created."""
+    """Return the table in `table` at the first of the remaining steps of a key; an absent table is created."""
     name, number = steps[0]
     inner = table.setdefault(name, {})
     listed = isinstance(inner, list) and all(isinstance(part, dict) for part in inner)
@@ -79,7 +79,7 @@ def _inner(table: dict[str, Any], steps: Sequence[Step], shown: str) -> dict[str
 
 
 def _set_table(table: dict[str, Any], name: str, number: int, value: Any, shown: str) -> None:
-    """Replace or append the table of this number in a list; None removes the table."""
+    """Replace or append the table of this number in the list `name`; value None removes the table."""
     inner = [*_tables(table.get(name, []), name, shown)]
     if number >= len(inner) + (value is not None):
         raise _no_such_table(inner, name, number, shown)
@@ -88,7 +88,7 @@ def _set_table(table: dict[str, Any], name: str, number: int, value: Any, shown:
 
 
 def _tables(found: Any, name: str, shown: str) -> list[Any]:
-    """Return the value of a key as a list of tables."""
+    """Return the value `found` of a key as a list of tables; SceneError if it is neither a table nor a list."""
     if not isinstance(found, dict | list):
         raise SceneError(f"{shown}: {name} is not a table; set the key {name} itself")
     return [found] if isinstance(found, dict) else found
@@ -101,6 +101,6 @@ def _no_such_table(tables: list[Any], name: str, number: int, shown: str) -> Sce
 
 
 def _step_text(step: Step) -> str:
-    """Return a step as it is written in a key."""
+    """Return a step as it is written in a key, such as target[1]."""
     name, number = step
     return name if number is None else f"{name}[{number}]"

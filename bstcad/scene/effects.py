@@ -51,7 +51,7 @@ class Absorption(Record):
 class Ghost(Record):
     """Light reflected twice inside the lens, in verification.
 
-    The faces then reflect light: as `fresnel` states, or else as bare faces reflect unpolarised light.
+    The faces then reflect light as the effect `fresnel` states, or without it as bare faces reflect unpolarised light.
     """
 
     kind: Annotated[Literal["ghost"], Key("Light reflected twice inside the lens, in verification.")]
@@ -65,7 +65,7 @@ class Own(Record):
     _makes: LossFactory | None = PrivateAttr(None)  # pickled with the record for other processes
 
     def model_post_init(self, context: Any) -> None:
-        """Find the function with the effect's name."""
+        """Find the function that a script or an installed package registered under the effect's name."""
         self._makes = _REGISTERED.get(self.name) or _installed(self.name)
 
     def of(self, wavelength: float) -> Any:
@@ -90,7 +90,7 @@ def effect(name: str, makes: LossFactory) -> Own:
 
 
 def _installed(name: str) -> LossFactory | None:
-    """Return the function that an installed package declares under a name; None if there is none."""
+    """Return the function that an installed package declares under a name as an entry point; None if there is none."""
     return next((found.load() for found in entry_points(group=PACKAGES, name=name)), None)
 
 
@@ -100,7 +100,7 @@ OneEffect = TypeVar("OneEffect", bound=Record)
 
 
 def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
-    """Yield complaints about effects that are named twice, impossible for this optic, or without data."""
+    """Yield complaints about effects that are stated twice, impossible for this lens or mirror, or without data."""
     for k, effect in enumerate(effects):
         key, glass = f"effects[{k}]", lens.passes.enters
         if any(_name(effect) == _name(other) for other in effects[:k]):
@@ -129,12 +129,12 @@ def _name(effect: Effect) -> str:
 
 
 def find_effect(effects: Effects, kind: type[OneEffect]) -> OneEffect | None:
-    """Return the effect of a class; None if the scene does not have it."""
+    """Return the scene's effect of the class `kind`; None if the scene does not have it."""
     return next((effect for effect in effects if isinstance(effect, kind)), None)
 
 
 def reflection_of(effects: Effects) -> Fresnel | None:
-    """Return the reflection of a scene: of bare faces if only a ghost is stated; None without either effect."""
+    """Return the scene's effect `fresnel`; with only a ghost, one of bare faces; None if the scene has neither."""
     bare = Fresnel(kind="fresnel") if find_effect(effects, Ghost) else None
     return find_effect(effects, Fresnel) or bare
 

@@ -55,7 +55,7 @@ class Window(Record):
 
     @property
     def curvatures(self) -> tuple[float, float]:
-        """Curvatures of both faces (1/mm)."""
+        """Curvatures (1/mm) of both faces, the lower one first."""
         return self.curvature
 
     def complaints(self, key: str) -> Iterator[str]:
@@ -105,11 +105,11 @@ class Mirror(Record):
         yield from ()
 
     def faces(self) -> tuple[Plane | Sphere | TiltedSurface, ...]:
-        """Return the face."""
+        """Return the only face, as a tuple."""
         return _tilted_faces(self, self.z)
 
     def interfaces(self, sense: int, wavelength: float) -> tuple[Interface, ...]:
-        """Return the face as an interface."""
+        """Return the face as an interface, which depends neither on the sense nor on the wavelength."""
         return tuple(Interface(face, self.outline, Reflect(), Status.BLOCKED) for face in self.faces())
 
 
@@ -119,7 +119,7 @@ Around: TypeAlias = tuple[tuple[Interface, ...], tuple[Interface, ...]]  # inter
 
 
 def _tilted_faces(element: Window | Mirror, middle: float) -> tuple[Plane | Sphere | TiltedSurface, ...]:
-    """Return the faces of an element tilted about the point of the axis at z = middle (mm)."""
+    """Return the faces of an element, tilted about the point of the axis at z = middle (mm)."""
     faces: list[Plane | Sphere | TiltedSurface] = []
     for z, c in zip(element.vertices, element.curvatures, strict=True):
         if element.tilt and any(element.tilt):
@@ -132,14 +132,15 @@ def _tilted_faces(element: Window | Mirror, middle: float) -> tuple[Plane | Sphe
 
 
 def reversal(elements: Sequence[Window | Mirror]) -> int:
-    """Return -1 for an odd number of mirrors, which reverse the light along z, or else 1."""
+    """Return -1 if the elements contain an odd number of mirrors, which reverse the light along z, or else 1."""
     return -1 if sum(element.kind == "mirror" for element in elements) % 2 else 1
 
 
 def interfaces(elements: Sequence[Window | Mirror], sense: int, wavelength: float) -> tuple[Interface, ...]:
     """Return the interfaces of the elements for light that starts along sense · z (sense 1 or -1); wavelength in nm.
 
-    The status of light outside their outlines is BLOCKED; `Scene.around` changes it to MISSED_FRONT before the lens.
+    The status of light outside their outlines is BLOCKED, which `Scene.around` changes to MISSED_FRONT for elements
+    before the lens.
     """
     found: list[Interface] = []
     for element in elements:
@@ -159,7 +160,7 @@ class Station:
 
     @classmethod
     def of(cls, key: str, element: Window | Mirror) -> Station:
-        """Return the station of a window or a mirror."""
+        """Return the station of a window or a mirror; key: dotted key of its table."""
         ends = [face.z + sag for face in element.faces() for sag in face.sags(element.outline)]
         return cls(f"{key}.z", f"the {element.kind}", min(ends), max(ends))
 
@@ -233,7 +234,7 @@ class LightPath:
                 yield from (with_target_key(sentence, key) for sentence in sentences)
 
     def _unfaced(self) -> Iterator[str]:
-        """Yield complaints about targets that the lens sees, in the mirrors, edge-on or from the rear."""
+        """Yield complaints about targets whose image in the mirrors faces the lens edge-on or with its rear."""
         behind = interfaces(self.behind, 1, self.source.main_wavelength)
         vertex: Vector = (0.0, 0.0, self.lens.back.z)
         for key, target in self.targets.items():
@@ -244,5 +245,5 @@ class LightPath:
 
 
 def lowest(elements: Sequence[Window | Mirror]) -> float:
-    """Return the lowest z (mm) of the first of the elements."""
+    """Return the lowest z (mm) of the first element."""
     return Station.of("", elements[0]).low

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
     from pydantic_core import ErrorDetails
 
-KEY_NAME = r"""[\w-]+|"[^"\n]*"|'[^'\n]*'"""  # name between the dots of a TOML key
+KEY_NAME = r"""[\w-]+|"[^"\n]*"|'[^'\n]*'"""  # pattern of a name between the dots of a TOML key
 DOTTED = rf"(?:{KEY_NAME})(?:\s*\.\s*(?:{KEY_NAME}))*"
 HEADER, KEY = re.compile(rf"\s*(\[\[?)\s*({DOTTED})\s*\]"), re.compile(rf"\s*({DOTTED})\s*=")
 
@@ -48,7 +48,7 @@ SENTENCES = {  # sentence by type of pydantic's error; {shown}: the value; {list
 
 
 def with_target_key(sentence: str, key: str) -> str:
-    """Return a sentence on a single target, "target.z: …", with the key of one of several targets, "target[1].z: …"."""
+    """Replace the key of a single target in a sentence, "target.z: …", by that of one of several, "target[1].z: …"."""
     return THE_TARGET.sub(key, sentence)
 
 
@@ -66,13 +66,13 @@ def nearest(word: str, known: list[str], otherwise: str) -> str:
 
 
 def explain(error: ValidationError, data: Any) -> str:
-    """Return the first fault of `data` as a sentence; an unknown key comes before all other faults."""
+    """Return the first fault that pydantic found in the tables `data` as a sentence; unknown keys come first."""
     problems = [problem for problem in error.errors(include_url=False) if _applies(problem["loc"], data)]
     return _sentence(min(problems, key=lambda problem: problem["type"] not in UNKNOWN_KEY))
 
 
 def _applies(location: tuple[int | str, ...], data: Any) -> bool:
-    """Return True unless the error belongs to an outline whose shape differs from the shape in the data."""
+    """Return True unless an error at this location is about another shape of outline than `data` states."""
     for step in location:
         if step in ("Circle", "Rectangle") and isinstance(data, dict):
             return data.get("shape") == step.lower()
@@ -162,7 +162,7 @@ def _type_sentence(kind: str, location: _Location, value: Any, context: Mapping[
 
 
 def _value_text(value: Any) -> str:
-    """Return a value as it is written in a file, at most 40 characters."""
+    """Return a value nearly as it is written in a file, shortened to 40 characters."""
     text = repr(value) if not isinstance(value, bool) else str(value).lower()
     return text if len(text) <= 40 else text[:39] + "…"
 
@@ -191,7 +191,7 @@ def toml_positions(text: str) -> dict[str, int]:
 
 
 def line_of(key: str, lines: Mapping[str, int]) -> int | None:
-    """Return the line of a key, or of the innermost table or value that contains it; None if there is no such line."""
+    """Return the line of a key, or of the innermost table or value around it; None: no line; lines: toml_positions."""
     while key and key not in lines:
         key = key.rpartition("[" if key.endswith("]") else ".")[0]
     return lines.get(key)

@@ -14,7 +14,7 @@ IRRADIANCE_SAMPLES = 200  # points per side of the lens at which the irradiance 
 
 
 def complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
-    """Yield complaints about the profile, the spectrum and the size of a source before this lens."""
+    """Yield complaints about the keys of the source: its profile, its spectrum, and those that its kind checks."""
     width = source.widths.get(source.profile)
     if width and source.profile != source.unbounded and getattr(source, width) is None:
         unit = "mm" if width == "radius_1e2" else "degrees"
@@ -50,7 +50,7 @@ def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:
 
 
 def order_complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
-    """Yield complaints about a source not before a lens or not above a mirror, and keys for a mirror's unlit front."""
+    """Yield complaints: the source is not before the lens or above the mirror; keys for a mirror's unlit front."""
     front, back = lens.front.z + lens.front_sags[0], lens.back.z
     key, start = f"source.{source.start_key}", source.nearest_z(upwards=lens.passes.sense > 0)
     if lens.passes.sense > 0:
@@ -67,7 +67,7 @@ def order_complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
 
 
 def unlit_complaints(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator[str]:
-    """Yield complaints about a tilted or decentred source that sends no light to the lens inside its rim."""
+    """Yield complaints about a tilted or decentred source that sends no light to the lens inside this rim."""
     if not (source.tilted or getattr(source, "centre", None)):
         return
     upwards = lens.passes.sense > 0
@@ -79,7 +79,7 @@ def unlit_complaints(source: Emitter, lens: LensBlank, rim: Outline) -> Iterator
 
 
 def doubts(source: Emitter, rim: Outline, key: str) -> Iterator[str]:
-    """Yield warnings about a parallel beam that is wider or over 10 % narrower than the lens; key: key of the rim."""
+    """Yield warnings about a parallel beam wider than the rim or over 10 % narrower; key: dotted key of the rim."""
     beam, _ = source.spot(0.0)
     if beam is None:  # without an edge
         return

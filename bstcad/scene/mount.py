@@ -1,4 +1,4 @@
-"""The lens as a part: the title block [part], and the mount [mount], with which bstcad writes part.step."""
+"""The lens as a part: the tables [part] (title block of a drawing) and [mount], with which bstcad writes part.step."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from bstcad.scene.blank import LensBlank
 from bstcad.scene.schema import COORDINATES, LENGTHS, Record
 
 MAX_DRAFT = 30.0  # degrees; largest draft angle of the walls of a lens
-MIN_WEB = 0.1  # mm; smallest width of material between a hole and any other edge
+MIN_WEB = 0.1  # mm; smallest width of a flange between the lens and its edge, and between a hole and any other edge
 LAND = 0.1  # height of the upright wall below the back's rim: 0.1 mm, or a tenth of a wall lower than 1 mm
-ITERATIONS = 60  # iterations for the end of a bevel or wall; on a front of slope 0.5 each at least halves the error
+ITERATIONS = 60  # iterations to find the end of a bevel or wall; each halves the error on a front of slope 0.5
 MIN_CLOSING = 0.25  # smallest rate at which a bevel or a wall with draft nears the front (mm per mm of depth)
-MIN_CLEAR_APERTURE = 1e-3  # smallest clear aperture of the front after draft and bevel, as a fraction of the rim
+MIN_CLEAR_APERTURE = 1e-3  # smallest width of the front's clear aperture after draft and bevel / width of the rim
 LENS_COLOUR, MIRROR_COLOUR = "#9ed3f580", "#c8ccd0"  # default colours of a part
 MAX_TEXT = 200  # largest number of characters of a text of the title block
 COLOUR = re.compile(r"#(?:[0-9a-fA-F]{6}|[0-9a-fA-F]{8})")
@@ -96,7 +96,7 @@ class Round(Record):
 
     @property
     def outline(self) -> Circle:
-        """The circle as an outline of optics."""
+        """The circle as an outline of bstcad.optics."""
         return Circle(self.diameter / 2)
 
 
@@ -110,7 +110,7 @@ class Box(Record):
 
     @property
     def outline(self) -> Rectangle:
-        """The rectangle as an outline of optics."""
+        """The rectangle as an outline of bstcad.optics."""
         size, r = (self.width, self.height), self.corner_radius
         return Rounded(*size, corner_radius=r) if r else Rectangle(*size)
 
@@ -174,7 +174,7 @@ class Mount(Record):
         return self.flange.z
 
     def rim_of(self, outline: Outline) -> Round | Box:
-        """Return the rim, in the part, of a lens with this outline."""
+        """Return the rim that a lens with this outline has in the part."""
         if self.rim is not None:
             return self.rim
         if isinstance(outline, Circle):
@@ -185,7 +185,7 @@ class Mount(Record):
         """Return the clear apertures of front and back in the part; None: the whole outline of the lens.
 
         The back ends on the rim.  Draft and bevel move the edge of the front inwards, by a distance that differs along
-        the rim of a curved front.  The front's clear aperture is the rim less the largest of these distances.
+        the rim of a curved front.  The front's clear aperture is the rim, moved inwards by the largest distance.
         """
         if self.rim is None and not (self.draft or self.bevel):
             return None
@@ -198,7 +198,7 @@ class Mount(Record):
         return rim.inset(self._inset(rim, lens.front, self.top(lens))), rim
 
     def top(self, lens: Lens) -> float:
-        """Return z (mm) in the scene at which draft begins: at the flange's lower face, or below the back's rim."""
+        """Return z (mm) in the scene where draft begins: the flange's lower face, or without a flange `parting`."""
         if self.flange is not None:
             return self.flange.z
         return parting(lens.back, lens.front, *self.rim_of(lens.outline).outline.rim_points())
@@ -226,12 +226,12 @@ class Mount(Record):
 
 
 def as_cut(lens: Lens, mount: Mount | None) -> Lens:
-    """Return the lens cut to the rim of its mount."""
+    """Return the lens cut to the rim that its mount states, or else the lens as it is."""
     return lens if mount is None or mount.rim is None else replace(lens, outline=mount.rim.outline)
 
 
 def parting(back: Surface, front: Surface, x: np.ndarray, y: np.ndarray) -> float:
-    """Return z (mm) of the plane at which draft begins on a lens without a flange; x, y: points along its rim (mm)."""
+    """Return z (mm) of the plane, just below the back's rim, where draft begins without a flange; x, y: rim (mm)."""
     low, high = sag(back, x, y).min(), sag(front, x, y).max()
     return float(low - min(LAND, LAND * (low - high)))
 
@@ -287,12 +287,12 @@ def _wall_complaints(mount: Mount, lens: LensBlank, rim: Round | Box) -> Iterato
 
 
 def _depth(shape: Round | Box, x: float, y: float) -> float:
-    """Return the distance (mm) of a point from the shape's rim, negative outside."""
+    """Return the distance (mm) of a point (x, y) inside the shape from the shape's edge; negative outside."""
     return float(shape.outline.depth(np.array(x), np.array(y)))
 
 
 def _steepest_descent(front: Surface, rim: Outline) -> float:
-    """Return the steepest descent of a front at the rim, in the direction inwards (mm per mm)."""
+    """Return the steepest descent (mm per mm) of a front at the rim in the direction inwards; < 0 if all rises."""
     x, y = rim.rim_points()
     m_x, m_y = rim.inset_direction(x, y)
     _, z_x, z_y = sampled(front, x, y)
@@ -300,14 +300,14 @@ def _steepest_descent(front: Surface, rim: Outline) -> float:
 
 
 def _corner_complaints(key: str, shape: Round | Box, taken: float) -> Iterator[str]:
-    """Yield complaints about a corner radius not above `taken`, the depth (mm) that draft and bevel remove."""
+    """Yield complaints about a corner radius not above `taken`, the width (mm) that draft and bevel remove."""
     if 0 < shape.corner_radius <= taken:
         size = f"{shape.corner_radius:g} mm is too small, as draft and bevel remove {taken:.3g} mm"
         yield f"{key}.corner_radius: {size}; make it larger, or 0"
 
 
 def _flange_complaints(flange: Flange, lens: LensBlank, rim: Round | Box) -> Iterator[str]:
-    """Yield complaints about a flange without walls, away from the lens, or with holes that do not fit."""
+    """Yield complaints about a flange without walls, not around the lens's wall, or with holes that do not fit."""
     key, upper = "mount.flange", flange.z + flange.thickness
     taken = flange.bevel + flange.thickness * math.tan(math.radians(flange.draft))
     if not 2 * flange.bevel < flange.thickness:

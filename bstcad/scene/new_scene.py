@@ -1,4 +1,4 @@
-"""New scenes: a plate that projects a picture or letters with one of four lights, and copies of the templates."""
+"""New scenes: a plate lens that projects a picture or letters with one of four lights, or a copy of a template."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SIZE = 80.0  # default size of a plate, mm
 WIDTH_TO_THICKNESS = 10.0  # ratio of the width of a plate to its thickness
 MIN_THICKNESS = 3.0  # mm; smallest thickness of a plate
-RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # ranges of the options, mm
+RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # ranges of the options --size and --distance, mm
 BLUR_MARGIN = 1.1  # accept.rrmsd divided by the RRMSD of the blurred picture; standard designs stay below this limit
 MIN_RRMSD, MAX_RRMSD = 0.05, 0.25  # smallest and largest accept.rrmsd of a new scene
 
@@ -35,7 +35,7 @@ COMMENT_WIDTH = 118  # characters in a line of comment
 
 @dataclass(frozen=True)
 class Light:
-    """A light for which a plate is made; plate.toml.j2 has its table [source]."""
+    """A light for which a plate is made; plate.toml.j2 contains its table [source]."""
 
     name: str  # value of the option --light
     of: str  # name of the light in sentences, such as "an LED"
@@ -67,7 +67,7 @@ class Plate:
     ) -> Plate:
         """Return the plate for --light, --size and --distance; None: the default.  SceneError for a wrong value."""
         if light is not None and light not in LIGHTS:
-            raise SceneError(f"--light {light}: is unknown; {nearest(light, list(LIGHTS), 'give one of')}")
+            raise SceneError(f"--light {light}: no such light; {nearest(light, list(LIGHTS), 'give one of')}")
         chosen = LIGHTS[light or next(iter(LIGHTS))]
         sides = _lengths("size", SIZE if size is None else size, "80, or width x height, such as 80x60", 2)
         [length] = _lengths("distance", chosen.throw * max(sides) if distance is None else distance, "2000", 1)
@@ -90,7 +90,7 @@ class Plate:
 
     @property
     def magnification(self) -> float:
-        """Ratio of the widths of picture and plate; the picture is as wide as the shadow of the plate."""
+        """Width of the picture / width of the plate; the picture is as wide as the shadow of the plate."""
         return 1 + self.distance / self.before if self.before else 1.0
 
     @property
@@ -99,7 +99,10 @@ class Plate:
         return self.magnification * self.side / self.light.pixels
 
     def source_image(self, distance: float) -> float:
-        """Return the width (mm) of the source's image at distance L: s L / before, or 2 L tan(s/2); s: source size."""
+        """Return the width (mm) of the source's image at distance L (mm) behind the plate; s: size of the source.
+
+        It is s L / before for a lamp, 2 L tan(s / 2) for parallel light.
+        """
         if self.before:
             return self.light.size * distance / self.before
         return 2 * distance * math.tan(math.radians(self.light.size / 2))
@@ -161,7 +164,7 @@ class Plate:
 
 @dataclass(frozen=True)
 class Written:
-    """A new scene file."""
+    """A new scene file, and the sentences that the command prints."""
 
     path: Path
     sentences: str = ""  # sentences on the light and the finest detail; "" for a template
@@ -174,8 +177,9 @@ def new_scene(
     """Write NAME.toml to `folder`, a commented scene that loads; SceneError for an existing file.
 
     The scene is a plate with a picture as large as the plate's shadow on the wall, or a copy of a template.  light: a
-    name of LIGHTS.  size: plate size, mm: one number, width x height "80x60", or, with the picture's proportions,
-    "photo" or "120xphoto".  distance: from plate to wall, mm.  picture: path, relative to `folder`; None: letters.
+    name of LIGHTS.  size: size of the plate (mm), a number or width x height such as "80x60"; in the proportions of
+    the picture "photo" or "120xphoto".  distance: from plate to wall (mm).  picture: path, relative to `folder`; None:
+    letters.  template: name of a template, without the other options.
     """
     from bstcad.scene.picture import photo_size, read_picture, safe_name  # slow to load
 
@@ -211,13 +215,13 @@ def new_scene(
 
 
 def in_proportions(side: float, shown: tuple[int, int]) -> str:
-    """Return the size of a plate, such as "80x53.3": longer side (mm), proportions of a picture (width, height)."""
+    """Return the size of a plate, such as "80x53.3", with this longer side (mm) and the proportions of `shown`."""
     width, height = (max(side * each / max(shown), RANGES["size"][0]) for each in shown)
     return f"{width:.4g}x{height:.4g}"
 
 
 def _lengths(name: str, given: str | float, example: str, count: int) -> list[float]:
-    """Return the lengths (mm) in the value of an option, at most `count`, separated by x, such as 80 or "80x60"."""
+    """Return the lengths (mm) in the value `given` of the option --name: up to `count` lengths, such as "80x60"."""
     try:
         found = [float(length) for length in re.split("[xX×]", str(given))]
     except ValueError:
@@ -253,7 +257,7 @@ def _template(template: str, name: str) -> str:
     """Return the text of a template in which the scene has this name."""
     known = list(templates())
     if template not in known:
-        raise SceneError(f"--template {template}: is unknown; {nearest(template, known, 'the templates are')}")
+        raise SceneError(f"--template {template}: no such template; {nearest(template, known, 'the templates are')}")
     text = (_folder() / f"{template}.toml").read_text(encoding="utf-8")
     for before in (f"bstcad generate templates/{template}.toml", f'name = "{template}"', f"outputs/{template}"):
         text = text.replace(before, before.replace("templates/", "").replace(template, name))

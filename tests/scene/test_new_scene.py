@@ -171,9 +171,9 @@ def test_nothing_is_written_over(place):
     (["mine", "--picture", "none.jpg"], "--picture none.jpg: not found; give the path of a picture file"),
     (["mine", "--picture", __file__], "is not a "),
     (["mine", "--size", "80by60"], "--size 80by60: is not a size; give a length in mm, such as 80, or width x height"),
-    (["mine", "--light", "moon"], "--light moon: is unknown; give one of laser, sun, lamp, led"),
+    (["mine", "--light", "moon"], "--light moon: no such light; give one of laser, sun, lamp, led"),
     (["mine", "--distance", "-3"], "--distance -3: is not between"),
-    (["mine", "--template", "thou"], "--template thou: is unknown; did you mean 'thu'?"),
+    (["mine", "--template", "thou"], "--template thou: no such template; did you mean 'thu'?"),
     (["mine", "--template", "thu", "--size", "9"], "--template thu: a template has its own light, picture and sizes"),
 ])  # fmt: skip
 def test_what_is_wrong_is_one_sentence_and_writes_nothing(place, capsys, arguments, sentence):
