@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 # In a run with a time limit: time reserved for the report, and smallest time for the rays of the verification (s).
 REPORT_TIME, MIN_RAY_TIME = 2.0, 0.5
 
-Drawing = Callable[..., Pictures]  # class of drawings, called with (scene, submit); NoPictures draws no figures
+Drawing = Callable[..., Pictures]  # class that draws figures, from (scene, processes.submit)
 # Functions of a script that add to a report: checks, from (proof, folder of the files), or a section (heading, HTML).
 OwnCheck = Callable[[Proof, Path], Iterable[Check]]
 OwnSection = Callable[[Contents], tuple[str, str]]
@@ -92,9 +92,10 @@ def generate(
 ) -> Report:  # fmt: skip
     """Design a lens, write it to `folder` and verify the written files.
 
-    hooks: functions that are called during the design; this command uses its own `save` and `interrupted`.
-    began: start of the times in the report and of tailoring.max_time (time.perf_counter(); default: now).
-    During the design a checkpoint is written beside the folder at intervals; with `resume` the design continues from
+    hooks: functions that are called during the design; this command replaces `save` and `interrupted`.
+    device: "auto", "cpu" or "cuda".  began: value of time.perf_counter() from which the times in the report and
+    tailoring.max_time count (None: now).
+    During the design a checkpoint is written beside `folder` at intervals; with `resume` the design continues from
     this checkpoint.  After a Ctrl-C the best lens so far is written to `output_folder`.
     """
     scene = with_default_net(scene, lambda line: hooks.progress("control points", 1, 1, line))
@@ -131,7 +132,10 @@ def with_default_net(scene: Scene, say: Callable[[str], None] = lambda line: Non
 
 
 def output_folder(folder: Path, stopped: str) -> Path:
-    """Return `folder`, or FOLDER-unfinished for a design stopped by Ctrl-C that would replace a finished one."""
+    """Return `folder`, or FOLDER-unfinished if a design stopped by Ctrl-C would replace one that was not.
+
+    stopped: why the design ended early ("interrupt": by Ctrl-C), or "".
+    """
     if stopped != "interrupt" or not (folder / "report.json").exists():
         return folder
     if record.making(folder / "report.json").stopped == "interrupt":
@@ -185,7 +189,7 @@ def prove(made: Made, options: ProofOptions = ProofOptions(), progress: Progress
 def _write_and_prove(
     made: Made, folder: Path, drawn: Pictures, options: ProofOptions, progress: Progress
 ) -> tuple[Made, Proof]:
-    """Write the geometry and verify it; return the design with the times of these two stages, and its proof."""
+    """Write the geometry to `folder` and verify it; return the design with the times of both stages, and its proof."""
     made = replace(made.with_report_data(), stored=None)  # design.npz is written again
     processes.return_freed()  # the second process needs the memory for the solid
     began = time.perf_counter()
@@ -272,12 +276,13 @@ def verify(
     path: Path, options: ProofOptions = ProofOptions(), *, against: Sequence[Any] = (), measured: Path | None = None,
     place: Path | None = None, progress: Progress = no_progress,
 ) -> Report | Examined:  # fmt: skip
-    """Verify a design again from the files of its folder and rewrite its report; or examine a single STEP file.
+    """Verify a design again from the files of its folder `path` and rewrite its report; or examine a STEP file `path`.
 
     against: programs that also trace the lens, by name (judges.comparison.JUDGES) or as your own judge (OwnJudge).
-    measured: file of measured points of a made part, which is also verified.  With `place` its report is written there
-    and the design's folder does not change.  Without `place` it is written to the design's folder and to its subfolder
-    measured/CLOUD, which only a verification of the same points rewrites.
+    measured: file of measured points of a made part; the part is then verified, too.
+    place: folder for the report of the made part; the design's folder then does not change.  None: this report is
+    written to the design's folder and to its subfolder measured/NAME (name of the file of points), which only a
+    verification of the same points rewrites.
     """
     against = comparison.choose_judges(against)
     if path.is_file():
@@ -285,7 +290,7 @@ def verify(
             raise SceneError(f"{path}: a STEP file states no light, so it has no picture; give the design's folder")
         return examine(path)
     if place is not None and measured is None:
-        raise SceneError(f"{place}: this folder is only for the report of a made part; give its points with --measured")
+        raise SceneError(f"{place}: only a made part's report can go there; give the part's points with --measured")
     with folders.amending(path, place) as amended:
         made = read(path)
         with scene_errors():  # reads the cloud first, since the next steps are slow
@@ -391,7 +396,7 @@ def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
 def _sheet(
     made: Made, proof: Proof | Contents, figures: Sequence[GoalFigures], irradiance: np.ndarray, *, order: Order
 ) -> DataSheet:
-    """Return the data sheet of a design from its proof or report, with the light on the first target."""
+    """Return the data sheet of a design from its proof or report; irradiance: light on the first target."""
     light: dict[str, Any] = {"target": made.goals[0].picture, "irradiance": irradiance, "figures": figures}
     found: dict[str, Any] = {"shape": proof.shape, "passed": proof.passed, "version": bstcad.__version__}
     return DataSheet(scene=made.scene, designed=made.lens, order=order, **light, **found)
@@ -437,9 +442,10 @@ def _write_sheet(drawn: Pictures, folder: Path) -> None:
 def tolerance(
     folder: Path, settings: StudySettings, workers: int | None = None, scheduler: str | None = None
 ) -> Tolerances:
-    """Study how accurately a lens must be made, mounted and lit; write tolerance.json and return its record.
+    """Study how accurately a lens must be made, mounted and lit; write tolerance.json and return its contents.
 
-    workers: number of processes for the traces.  scheduler: address of a dask scheduler whose workers trace instead.
+    workers: number of processes for the traces (None: only this one).  scheduler: address of a dask scheduler, whose
+    workers trace instead.
     """
     from bstcad.tolerance import tolerancing  # loaded late, since the other commands do not need it
 
@@ -450,7 +456,7 @@ def tolerance(
 
 
 def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> Exported:
-    """Write files for a shop to a design's folder, see bstcad.report.exports."""
+    """Write files for a shop to the design's folder `folder`; kinds and points as in bstcad.report.exports.export."""
     with folders.amending(folder) as amended:
         made = read(folder)
         with scene_errors("export: "):
@@ -473,13 +479,13 @@ def _sheet_again(made: Made, folder: Path) -> DataSheet:
     with scene_errors():
         known = record.read(folder / "report.json")
     if known.shape is None or not (folder / "lens.step").is_file():
-        raise SceneError(f"{folder}: report.json or lens.step is missing or damaged; run bstcad verify or generate")
+        raise SceneError(f"{folder}: lens.step, or the shape in report.json, is missing; run bstcad verify or generate")
     irradiances, order = folders.read_irradiances(folder, made.scene), _order(made, known.shape, folder)
     return _sheet(made, known, known.goals, irradiances[0], order=order)
 
 
 def show(folder: Path, png: Path | None) -> None:
-    """Draw a lens with rays and picture to the file `png`, or in a window, and wait until the window is closed."""
+    """Draw a lens with rays and picture to the file `png`; None: in a window, and wait until the window is closed."""
     on_linux = sys.platform.startswith("linux")  # only on Linux the environment states whether there is a display
     if png is None and on_linux and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
         raise MachineError("this machine has no display for a window; give --png FILE to write a picture")
@@ -491,12 +497,12 @@ def show(folder: Path, png: Path | None) -> None:
     with tempfile.TemporaryDirectory(prefix="bstcad-") as temporary:
         drawn = Path(temporary, "light.png")
         if not rendering.draw(path, drawn):
-            raise MachineError("this machine cannot draw in three dimensions; install a display, EGL or OSMesa")
+            raise MachineError("this machine cannot draw in three dimensions; it needs a display, EGL or OSMesa")
         files.put(png, drawn.read_bytes())
 
 
 def light_path_in(folder: Path) -> LightPath:
-    """Return the lens in a folder, rays through it, and the pictures of the targets.  SceneError without light."""
+    """Return the lens in a folder, rays through it, and its pictures; SceneError if no light reaches the target."""
     scene, nominal = folders.read_nominal(folder)
     wanted, irradiances = (goal.picture for goal in nominal.goals), folders.read_irradiances(folder, scene)
     path = light_path_of(scene, nominal.lens, [*zip(wanted, irradiances, strict=True)])

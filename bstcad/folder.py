@@ -61,7 +61,7 @@ class Made(Nominal):
     precision_comparison: Callable[[], DesignCourse] | None = None
 
     def with_report_data(self) -> Made:
-        """Return this design with the comparison of precisions that the report prints."""
+        """Return this design with the comparison of float32 and float64 that the report prints."""
         compare = self.precision_comparison
         return self if compare is None else replace(self, making=compare(), precision_comparison=None)
 
@@ -86,9 +86,9 @@ def same_front(one: Surface, other: Surface) -> bool:
 
 # --- estimates of file sizes ------------------------------------------------------------------------------------------
 
-LARGE_STEP = 100e6  # smallest size of lens.step that is printed before a design (bytes)
+LARGE_STEP = 100e6  # smallest estimated size of lens.step (bytes) that is printed before a design
 BYTES_PER_POINT = 83  # bytes of a point's STEP statement and of one reference to it (#N), without the digits of N
-OTHER_BYTES = 103_000, 1600  # bytes of all other statements: constant part, and part per control point of a side
+OTHER_BYTES = 103_000, 1600  # bytes of other statements: per file, and for each net per control point of a side
 
 
 def step_size(scene: scenes.Scene, net: Sides | None = None) -> float:
@@ -178,10 +178,10 @@ def _flush(path: Path) -> None:
 
 @contextlib.contextmanager
 def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
-    """Yield a temporary folder whose files are moved to a design's folder when the block ends without an error.
+    """Yield a temporary folder; its files are moved to the design's folder `folder` if the block ends without an error.
 
     place: folder for the report of a made part; the temporary folder then replaces `place`, and `folder` is unchanged.
-    SceneError if `place` has other files, or if the design in `folder` has changed meanwhile; nothing is then written.
+    SceneError if `place` has files of another kind, or if the design has changed meanwhile; nothing is then written.
     """
     if place is not None:
         files.check_free(place, files.MADE_PART_FILES, "a made part's")
@@ -217,7 +217,7 @@ def _stamps(folder: Path) -> list[tuple[object, ...]]:
 
 
 def scene_files(scene: scenes.Scene) -> dict[str, bytes]:
-    """Return scene.toml and the files that it names, by file name; a folder with these files loads an equal scene."""
+    """Return scene.toml and the files that it names, by file name; the scene loaded from these files is equal."""
     return {SCENE: scene.toml().encode()} | {name: content.copy for name, content in scene.files.items()}
 
 
@@ -230,10 +230,10 @@ def hash_of(contents: Mapping[str, bytes]) -> str:
 
 
 def write_geometry(design: Made, folder: Path, submit: Submit = run_here) -> Callable[[], None]:
-    """Write lens.step, lens.stl, part.step of a mount, and the scene with the files that it names.
+    """Write lens.step, lens.stl, part.step if there is a mount, and the scene with the files that it names.
 
     Return the function that writes lens.3mf.  The verification does not read lens.3mf, so a thread can write it later.
-    submit: with bstcad.runs.processes.submit the second process writes STEP, while this process writes the meshes.
+    submit: runs the writing of STEP; with bstcad.runs.processes.submit in a second process, beside that of the meshes.
     """
     scene, lens = design.scene, design.lens
     stated = scene.name, scene.part.of(scene.lens)
@@ -250,7 +250,7 @@ def write_geometry(design: Made, folder: Path, submit: Submit = run_here) -> Cal
             step.result()
     except BrokenExecutor as error:
         crash = "OpenCASCADE crashed on this solid or ran out of memory"
-        raise MachineError(f"{crash}; close other programs and try again") from error
+        raise MachineError(f"{crash}; close other programs and try again; if it fails again, report it") from error
     return partial(meshes.write_3mf, mesh, folder / "lens.3mf", label(scene))
 
 

@@ -1,7 +1,8 @@
 """batoid as a judge: a sequential ray tracer for telescopes, in C++ and double precision.
 
-A freeform face is batoid's `Bicubic` on grid lines through all knots.  Heights, slopes and mixed derivatives there make
-it equal to the spline, except in the outermost one and a half pitches, where x is not linear in the parameter.
+A freeform face becomes batoid's `Bicubic`, from heights, slopes and mixed derivatives on a grid with lines through all
+knots.  It equals the spline, except up to one and a half control-point spacings from the edge of the net, where x is
+not linear in the spline's parameter.
 bstcad's source gives the start, direction and flux of each ray; batoid traces the ray, without losses.
 """
 
@@ -27,7 +28,7 @@ from bstcad.optics.rays import Rays, axes
 from bstcad.optics.tilted import TiltedSurface
 from bstcad.optics.trace import launch_strips
 
-GRID_MARGIN = 0.125  # margin of a grid outside the net, relative to the net's width; ray searches may begin there
+GRID_MARGIN = 0.125  # margin of a Bicubic beyond each edge of the net / width of the net; searches for hits use it
 POLYGON_CORNERS = 4096  # number of corners of the polygon that represents an outline with round corners
 COMPARISON_POINTS = 100_000  # largest number of points at which batoid's faces are compared with the lens's
 
@@ -41,7 +42,7 @@ class PlacedSurface:
     frame: Any  # coordinate system of batoid
 
     def error(self, outline: Outline) -> FaceError:
-        """Return the error of the surface against the lens's face."""
+        """Return the error of the surface against the lens's face, inside the outline."""
         assert self.face is not None
         exact = self.face.at(*faces.random_points(outline, COMPARISON_POINTS, seed=0))
         heights = self.surface.sag(exact.x, exact.y) + self.frame.origin[2]
@@ -62,7 +63,7 @@ def placed(face: Face) -> PlacedSurface:
 
 
 def surfaces(lens: Lens) -> tuple[PlacedSurface, ...]:
-    """Return the faces in the order in which light meets them, including windows and mirrors around the lens."""
+    """Return the surfaces in the order in which light meets them, with windows and mirrors around the lens."""
     return tuple(
         _place_tilted(surface) if isinstance(surface, TiltedSurface) else placed(faces.face(surface, lens.outline))
         for surface in (interface.surface for interface in lens.interfaces)
@@ -85,7 +86,7 @@ def vector(rays: Rays) -> Any:
 
 
 def land(rays: Any, screen: Screen, sense: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Move rays of batoid to a screen; return x, y (mm), and True for a hit.  sense: 1 for light along +z, or -1."""
+    """Move rays of batoid to a screen; return x, y (mm), and a mask of hits.  sense: 1 for light along +z, or -1."""
     x, y, _ = screen.middle
     batoid.intersect(batoid.Plane(), rays, _frame(screen.middle, np.column_stack(axes(screen.tilt or (0.0, 0.0)))))
     arrived = ~rays.failed & ~rays.vignetted & np.isfinite(rays.x) & np.isfinite(rays.y) & (sense * rays.vz > 0)

@@ -32,13 +32,13 @@ from bstcad.scene.target import overlap
 from bstcad.verify.verdict import Check
 
 JUDGES = {"batoid": "bstcad.judges.batoid", "mitsuba": "bstcad.judges.mitsuba"}
-JUDGE_RAYS = 1 << 24  # total number of rays of a judge on one target
+JUDGE_RAYS = 1 << 24  # total number of rays that a judge traces for one target
 MAX_COMPARED_PIXELS = 128  # largest number of pixels along the longer side of the compared pictures
 OWN_EFFORT = Effort(accuracy=0.0, witness=False)  # effort of bstcad's picture: all rays, no picture by flux tubes
 OWN_SEED_OFFSET = 500_009  # difference between the seeds of bstcad's and the judge's rays
-AGREEMENT_FACTOR = 1.5  # largest ratio of the difference of pictures to its noise, for many pixels
+AGREEMENT_FACTOR = 1.5  # largest ratio of the pictures' difference to its noise; for N pixels 1 + 3 / sqrt(N) times it
 MIN_NOISE = 1e-9  # lower bound of the noise, relative to the target's RMS
-FLUX_TOLERANCE = 0.005  # largest difference of the light on the target, as a fraction of the source's light
+FLUX_TOLERANCE = 0.005  # largest difference of the two programs' fluxes on the target, as a fraction of the source's
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Judge:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A judge's outcome with checks and pictures (rows, columns) of equal sum, or only the reason for declining."""
+    """A judge's outcome with checks and pictures (rows, columns) of equal sum, or only its reason for declining."""
 
     judge: Judge
     checks: tuple[Check, ...] = ()
@@ -211,9 +211,10 @@ def _scale_to(picture: np.ndarray, total: float) -> np.ndarray:
 
 
 def coarse_screen(screen: Screen) -> Screen:
-    """Return the screen with nearly square pixels, at most MAX_COMPARED_PIXELS and no more than now on its longer side.
+    """Return the screen with other, nearly square pixels.
 
-    Of the numbers above half this limit, the one with the most nearly square pixels is chosen; of equals, the largest.
+    The longer side has at most N pixels, N = MAX_COMPARED_PIXELS or its present number if that is smaller, and more
+    than N / 2.  Of these numbers the one with the most nearly square pixels is chosen; of equals, the largest.
     """
     width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
     ratio = min(width, height) / max(width, height)

@@ -22,9 +22,9 @@ from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Surface
 from bstcad.optics.unfolding import per_radian
 
-PARAMETER_STEPS = 6  # steps of Newton's method for a parameter; the first guess has an error of at most half a span
+PARAMETER_STEPS = 6  # steps of Newton's method for t at a given x; the first guess has an error of at most half a span
 GRID_CELLS = 512  # number of cells per side of the coarsest grid over a curved face without knots
-PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # ring radii / rim radius; many, as slim triangles leak
+PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # ring radii / rim radius; many: slim triangles leak light
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class FaceError:
     slope: float  # RMS angle between normals (rad)
 
     def shift(self, lens: Lens, screen: Screen) -> float:
-        """Return the shift of light on the screen due to the error of the slope, in the screen's unit."""
+        """Return the RMS shift of light on the screen due to the error of the slope, in the screen's unit."""
         return self.slope * lens.deflection * abs(per_radian(lens, screen))
 
     @classmethod
@@ -267,7 +267,7 @@ def wall(front: Face, back: Face, apertures: tuple[Outline, Outline]) -> Trimesh
 
 
 def plate(front: Face, outline: Outline) -> Trimesh:
-    """Return the mesh of a plate around the front, at the height of the front's rim."""
+    """Return the mesh of a plate around the front, from its rim outwards at the height of the rim."""
     hole = front.at(*rim(outline).T).points
     return _strips([hole * (ring, ring, 1.0) for ring in PLATE_RINGS], np.tile([0.0, 0.0, 1.0], (len(hole), 1)))
 

@@ -4,9 +4,9 @@ Mitsuba's particle tracer sends photons from the source, reflects or transmits e
 images a matt screen through a pinhole.  Therefore the light has photon noise, and the losses of uncoated faces even if
 the scene requests none.  Mirrors are lossless.  With a library of LLVM 16 or later, Mitsuba is several times faster.
 
-The wall of the lens and a plate around its front stop the light that bstcad counts as lost: through the sides, and past
-the lens.  A parallel beam starts from a plate of the aperture's shape with normals along the beam; a cone of uniform
-radiant intensity is a spot; any other point source is a projector, whose slide is its irradiance on a plane.
+The wall of the lens and a plate around its front stop the light that bstcad counts as lost: light through the sides of
+the lens, and light beside it.  A parallel beam starts from a plate of the aperture's shape with normals along the beam.
+A cone of uniform radiant intensity is a spot; any other point source is a projector, with a slide of its irradiance.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ from bstcad.optics.trace import window
 
 MIN_LLVM = 16  # first version of LLVM that compiles Mitsuba's kernels; with 15 the process crashes
 SCREEN_REFLECTANCE = 1e-3  # reflectance of the screen, so low that light reflected to the lens is negligible
-PHOTONS_PER_PASS = 1 << 22  # largest number of photons in a pass, limited by memory
+PHOTONS_PER_PASS = 1 << 22  # largest number of photons in one rendering, limited by memory
 MESH_PARTS = (1, 2, 4)  # numbers of mesh cells per half span of the net, tried in turn
 MAX_CORNERS = 5_000_000  # largest number of corners of a mesh that refines the coarsest one
-MAX_FACET_SHIFT = 0.007  # largest shift of light by facets (RMS, pixels); 0.02 changes a picture by 0.8 %
-TEXELS = 1024  # number of texels of a slide along each side
+MAX_FACET_SHIFT = 0.007  # largest RMS shift of light by facets (pixels); a shift of 0.02 changes a picture by 0.8 %
+TEXELS = 1024  # number of texels (pixels) along each side of a slide, or of the picture of a Gaussian beam
 TEXEL_CENTRES = (2 * np.arange(TEXELS) + 1) / TEXELS - 1  # centres of texels, from -1 to 1
-FIELD_MARGIN = 1.01  # ratio of a projector's field to the field that the lens covers
-SPOT_EDGE = 1e-5  # width of a spot's edge, relative to its cone
+FIELD_MARGIN = 1.01  # ratio of the slopes at the edge of a projector's field to the largest slope of a ray to the lens
+SPOT_EDGE = 1e-5  # width of a spot's soft edge, relative to its half angle
 PROJECTOR_FLUX = math.pi  # ratio of the flux of Mitsuba's projector to the irradiance of its slide
 
-Entry = dict[str, Any]  # entry of a scene of Mitsuba
+Entry = dict[str, Any]  # entry of a scene in Mitsuba's notation
 S = TypeVar("S", Collimated, Point)
 
 
@@ -76,7 +76,7 @@ def light(lens: Lens, channels: Sequence[Channel]) -> tuple[Channel, ...]:
 def trace(
     lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, seed: int, reflections: int = 0
 ) -> Traced:
-    """Return the picture on a screen by about `rays` photons; reflections: largest number in the lens (2: ghosts)."""
+    """Trace about `rays` photons; reflections: largest number of reflections of a photon in the lens (2: ghosts)."""
     _mitsuba().set_variant(variant := _variant())
     _mitsuba().logger().clear_appenders()  # no progress bar per render
     halves, photons = np.zeros((2, *screen.shape)), 0
@@ -156,7 +156,7 @@ def _fine_mesh(face: Face, aperture: Outline, lens: Lens, screen: Screen, up: bo
 
 
 def _scene(bench: dict[str, Entry], channels: Sequence[Channel], lens: Lens, *, edges: int, folder: Path) -> Any:
-    """Load the scene `bench` with the lamps of channels of one index; edges: largest number of edges of a path."""
+    """Load the scene `bench` with the lamps of channels of one index; edges: most segments of a path."""
     material = {"type": "dielectric", "int_ior": channels[0].index, "ext_ior": 1.0}
     if not lens.passes.enters:
         material = {"type": "conductor", "material": "none"}
@@ -247,7 +247,7 @@ def _plate(source: Collimated, weight: float, lens: Lens, path: Path) -> Entry:
 
 
 def _spot(source: Point, weight: float, lens: Lens) -> Entry:
-    """Return a spot with the radiant intensity weight / (2π (1 - cos θ_max)) up to θ_max."""
+    """Return a spot with the radiant intensity weight / (2π (1 - cos θ_max)) up to the half angle θ_max."""
     edge = source.half_angle
     assert edge is not None  # a cone has a half angle
     intensity = weight / (2 * math.pi * (1 - math.cos(math.radians(edge))))
@@ -276,7 +276,7 @@ def _slide(source: Point, lens: Lens, half: float) -> Entry:
 
 
 def _irradiance(source: Emitter, x: np.ndarray, y: np.ndarray, z: float) -> np.ndarray:
-    """Return the irradiance of a source on a plane z (mm), (rows, columns)."""
+    """Return the irradiance (rows, columns) of a source at the columns x and rows y (mm) of a plane z (mm)."""
     at_x, at_y = map(torch.from_numpy, np.meshgrid(x, y))
     return source.irradiance(at_x, at_y, z).numpy()
 

@@ -2,12 +2,12 @@
 
 The residuals are the signed distances d of all points except outliers, along the face's normals n.  A small motion,
 with translation τ and rotation ω about the pivot c, changes the distance of a point q by n · τ + ((q - c) × n) · ω.
-The factors of τ and ω are six columns; rotations are in mm at the rim of the lens, to compare with translations.
+The factors of τ and ω are the six columns of the fit; rotations are in mm at the rim, to compare with translations.
 Motions that hardly change any distance (rotating a round face about its axis, shifting a plane along itself) are not
 determined and stay zero.
 
 The search starts from several poses, with a few thousand points and robust weights, so that points of the sides and of
-the front have little influence.  The cloud as given is preferred unless another start is clearly better.  A cloud that
+the front have little influence.  The pose as given is preferred unless another start is clearly better.  A cloud that
 fits only after its axes are exchanged or reversed is reported as a fault.
 
 Outliers are isolated points, caused by dust, glints and instrument errors; form errors cover an area.  Each point is
@@ -37,8 +37,8 @@ STEP_TOLERANCE = 1e-10  # largest component (mm at the rim) of a step that ends 
 FOOT_ITERATIONS = 3  # iterations for the foot of a perpendicular; each multiplies the error by distance x curvature
 INDEPENDENT_PATCHES = 100  # assumed number of patches of a face with independent form errors
 SCALE_PATCHES = 16  # assumed number of independent patches of form errors that resemble a scale error, such as power
-MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty from form errors / BackFace.reach, above which a motion is not determined
-MIN_SENSITIVITY = 1e-7  # smallest change of distance per motion (mm per mm); smaller values are rounding errors
+MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty of a motion due to form errors / BackFace.reach, above which it stays zero
+MIN_SENSITIVITY = 1e-7  # smallest RMS change of the distances per motion (mm/mm); smaller ones are rounding errors
 RIM_MARGIN = 2e-3  # width, in half widths, of the rim that is ignored: points there may lie on the edge
 FACE_DISTANCE_FRACTION = 0.25  # largest distance along z of a point from the face, per smallest thickness of the lens
 MOTION_NAMES = ("shift in x", "shift in y", "shift in z", "rotation about x", "rotation about y", "rotation about z")
@@ -105,7 +105,7 @@ class Pose:
         return (points - self.pivot - self.shift) @ self.rotation + self.pivot
 
     def compose(self, motion: np.ndarray, reach: float) -> Pose:
-        """Return the pose whose `to_design` is this pose's, followed by `motion` (6,); see BackFace.columns."""
+        """Return the pose whose `to_design` is this pose's, followed by `motion` (6,), mm as in BackFace.columns."""
         turn = Rotation.from_rotvec(motion[3:] / reach).as_matrix()
         rotation = self.rotation @ turn.T
         return Pose(rotation, self.shift - rotation @ motion[:3], self.pivot)
@@ -174,7 +174,7 @@ def align(face: BackFace, cloud: np.ndarray, start: Pose) -> Alignment:
 
 
 def _least_squares(face: BackFace, cloud: np.ndarray, pose: Pose) -> Pose:
-    """Return the pose by least squares of all points of the face, starting from a pose near the solution."""
+    """Return the pose by least squares of all points that lie on the face, starting from a pose near the solution."""
     for _ in range(MAX_GAUSS_NEWTON_STEPS):
         points, *_ = _face_points(face, cloud, pose)
         motion, _ = gauss_newton_step(face, points, *face.distance(points))
@@ -294,11 +294,11 @@ def _neighbour_planes(
 
 # --- starting poses ---------------------------------------------------------------------------------------------------
 
-START_TOLERANCE = 1e-4  # distance / BackFace.reach, below which a start is accepted at once
+START_TOLERANCE = 1e-4  # distance of `first_pose` / BackFace.reach, up to which the best start is accepted at once
 START_SAMPLE, AXES_SAMPLE = 3000, 1000  # number of points for the starts, and for exchanges of axes
 START_STEPS, AXES_STEPS = 40, 15  # Gauss-Newton steps from each start, and for exchanges of axes
-START_FRACTION = 0.25  # minimum fraction of the points that a start brings onto the face
-IMPROVEMENT_RATIO = 0.5  # ratio of distances below which a later start replaces the best earlier one
+START_FRACTION = 0.25  # fraction of the points, the nearest ones inside the outline, by which a start is judged
+IMPROVEMENT_RATIO = 0.5  # ratio of a later start's distance to the best so far, below which the later one replaces it
 DECENTRE_RING = 0.15  # ratio of the decentre of further starts to BackFace.reach, used if the first ones do not fit
 
 
@@ -316,7 +316,7 @@ def first_pose(face: BackFace, cloud: np.ndarray) -> tuple[Pose, float]:
 
 
 def find_axis_exchange(face: BackFace, cloud: np.ndarray, original: float) -> tuple[np.ndarray, str] | None:
-    """Return (matrix (3, 3), words) of an axis exchange that at least halves the distance `original` (mm), or None."""
+    """Return (matrix (3, 3), words) of an axis exchange that more than halves `first_pose`'s distance `original`."""
     sample, fitting = _sample(cloud)[:: START_SAMPLE // AXES_SAMPLE], []
     for matrix, words in sorted(_axis_exchanges(), key=lambda exchange: _rarity(exchange[0])):
         turned = sample @ matrix.T
@@ -345,7 +345,7 @@ def _rarity(matrix: np.ndarray) -> int:
 
 
 def _sample(cloud: np.ndarray) -> np.ndarray:
-    """Return START_SAMPLE random points of a cloud, chosen with a fixed seed."""
+    """Return at most START_SAMPLE random points of a cloud, chosen with a fixed seed."""
     return cloud[np.random.default_rng(0).permutation(len(cloud))[:START_SAMPLE]]
 
 
@@ -355,7 +355,7 @@ def _middle(points: np.ndarray) -> np.ndarray:
 
 
 def _best_start(face: BackFace, sample: np.ndarray, decentres: list[np.ndarray], steps: int) -> tuple[Pose, float]:
-    """Return pose and distance (mm) of the best start; later ones replace it only if they are clearly better."""
+    """Return pose and distance (mm) of the best start from `decentres` (mm); a later one must be clearly better."""
     shifts = (np.array([*decentre, height]) for decentre in decentres for height in _heights(face, sample, decentre))
     first, *later = (_refine_start(face, sample, identity_pose(face, shift), steps) for shift in shifts)
     best = first

@@ -17,7 +17,7 @@ MAX_CLOUD_SIZE = 1_000_000_000  # largest size of a file (bytes)
 MIN_CLOUD_POINTS = 100  # minimum number of points, to which six degrees of freedom and a form are fitted
 MESH_SUFFIXES = (".ply", ".stl")
 UNIT_SIZES = {"inches": 1 / INCH, "metres": 1e-3, "micrometres": 1e3}  # number of units in 1 mm
-PLAUSIBLE_RATIOS = (0.3, 1.7)  # limits of the ratio of extents, cloud to lens; for mm, the upper limit is 5 times this
+PLAUSIBLE_RATIOS = (0.3, 1.7)  # limits of cloud's extent / lens's width; for mm, the upper limit is 5 times as large
 
 
 @dataclass(frozen=True)
@@ -74,5 +74,5 @@ def in_millimetres(points: np.ndarray, outline: Outline) -> tuple[np.ndarray, st
         return points * INCH, unit
     lens_width = f"and the lens is {width:.3g} mm wide"
     if unit:
-        raise ValueError(f"its points cover {extent:.3g} {lens_width}, as if they were in {unit}; give them in mm")
+        raise ValueError(f"its points seem to be in {unit}: they cover {extent:.3g} {lens_width}; give them in mm")
     raise ValueError(f"its points cover {extent:.3g} mm {lens_width}; give a cloud of the lens's back face, in mm")

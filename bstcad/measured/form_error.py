@@ -1,9 +1,9 @@
 """Fit the form error of a made face as a spline, separate it from measurement noise, and state its figures.
 
-The deviation is modelled as a polynomial plus a random field, a spline on a net over the lens.  The cosine amplitudes
-c_k of the net are Gaussian with a variance S that depends only on the frequency; the points have white noise of
-variance σ².  S (in bands of a quarter octave) and σ are estimated from the points.  The form error is the posterior
-mean, the minimum-error linear estimate of heights, slopes and curvatures.  The posterior can be sampled.
+The deviation is modelled as a polynomial plus a random field, a spline on a net over the lens.  The amplitudes c_k of
+the net's cosine transform are Gaussian with a variance S that depends only on the frequency; the points have white
+noise of variance σ².  S (in bands of a quarter octave) and σ are estimated from the points.  The form error is the
+posterior mean, the minimum-error linear estimate of heights, slopes and curvatures.  The posterior can be sampled.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from bstcad.optics.surfaces import sag, sampled
 
 POLYNOMIAL_DEGREE = 2  # degree of the polynomial in x and y
 NET_MARGIN = 0.2  # margin of the field's net beyond the lens's, relative to its side, since cosines end with zero slope
-POINTS_PER_NET_CELL = 6.0  # mean number of points in a cell of the net
-FIELD_NET_LIMITS = (9, 513)  # limits of the number of control points per side, before the FFT rounds it up
-MAX_REFINEMENT = 4  # factor by which each side of a lens's net is refined to add a finer field; the nets are not nested
+POINTS_PER_NET_CELL = 6.0  # mean number of measured points in a cell of the field's net
+FIELD_NET_LIMITS = (9, 513)  # limits of the field's control points per side, before they are rounded up for the FFT
+MAX_REFINEMENT = 4  # refinement factor per side of a lens's net to which a finer field is added; nets are not nested
 BANDS_PER_OCTAVE = 4  # number of bands of the spectrum per octave of frequency
 SPECTRUM_ROUNDS = 8  # number of alternating estimates of field and spectrum
 FIRST_MOTION_ROUND = 3  # round, from 0, in which the motion is fitted; the spectrum is then good enough to weight it
 MAX_FIELD_STEPS, FIELD_TOLERANCE = 30, 1e-4  # maximum steps of conjugate gradients, and their relative tolerance
 DETECTION_SIGMAS = 3.0  # excess over noise, in standard deviations, at which a band of frequencies contains form
 UNDETECTED_VARIANCE = 1e-4  # variance of the form in a band without detected form, relative to the noise
-MAX_RELIEF_UNCERTAINTY = 0.001  # uncertainty from fine relief / BackFace.reach, above which a motion stays zero
+MAX_RELIEF_UNCERTAINTY = 0.001  # uncertainty of a motion fitted to fine relief / BackFace.reach, above which it is zero
 EXTRAPOLATION_BANDS = 6  # number of bands from which the spectrum is extrapolated below the noise
 MIN_NOISE_RATIO = 1e-3  # lower bound of the noise relative to the RMS deviation
 SAMPLING_STRIPS = 32  # number of strips in which a net is sampled, which bounds the memory
@@ -125,7 +125,7 @@ def _field(
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
     """Return the field's heights (m, m), standard deviations (m, m) of its amplitudes, the noise (mm) and motion (k,).
 
-    rows: basis functions (n, m²).  off: deviations (n,), mm; motions: their changes (n, k); both without polynomials.
+    rows: basis functions (n, m²).  off: deviations (n,), mm; motions: their changes (n, k), mm/mm; polynomials removed.
     Generalised least squares give the motion: a fit of the field has the residual σ² V⁻¹ off, V: covariance of `off`.
     """
     (m, _), n = net.shape, len(off)  # the net is square
@@ -332,7 +332,7 @@ def robust_pv(points: np.ndarray, distances: np.ndarray) -> float:
 
 
 def zernike(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the fringe set (n, 36) on the unit circle: all Zernike terms with n + |m| <= 10.
+    """Return the fringe set (points, 36) on the unit circle: all Zernike terms with n + |m| <= 10.
 
     R(r) = (-1)^k r^m P_k^(m, 0)(1 - 2 r²), k = (n - m) / 2, with Jacobi polynomials P.
     """

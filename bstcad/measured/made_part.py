@@ -23,7 +23,7 @@ from bstcad.verify.verdict import Check
 
 MAX_RMS_DISTANCE = 3e-3  # RMS distance after alignment / BackFace.reach, above which a part is of another design
 MIN_RELIEF = 0.5  # fine relief, as a fraction of the design's, below which a part is of another design
-COARSE_DEGREE = 4  # degree of the polynomial removed from relief: it is similar in all lenses of equal optical power
+COARSE_DEGREE = 4  # degree of the polynomial removed from relief, which is similar in lenses of equal power
 MIN_DESIGN_RELIEF = 3e-5  # RMS fine relief of a design / BackFace.reach, below which a part is not judged by relief
 SCALE_TOLERANCE = 2e-4  # relative tolerance of the scale, about the size of a thermal expansion
 SCALE_SIGMAS = 3.0  # tolerance of the scale, in standard uncertainties, if larger than SCALE_TOLERANCE

@@ -1,7 +1,7 @@
 """Read the vertices of PLY and STL files.
 
 The amount of data that a header declares is compared with the size of the file before memory is allocated.  If the two
-differ, the message states both.
+differ, the error states both.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def read_mesh(data: bytes, ending: str) -> MeasuredPoints:
     try:
         positions = (_ply if ending == ".ply" else _stl)(data)
     except _Damaged as error:
-        raise ValueError(f"is not a readable {ending[1:].upper()} file ({error}); write it again") from None
+        raise ValueError(f"is not a readable {ending[1:].upper()} file ({error}); {EXPORT_HINT}") from None
     points = make_points(positions)
     if not len(points.positions):
         raise ValueError("contains no points; export the vertices of the measured face")

@@ -155,7 +155,7 @@ class _Layout:
 
     @classmethod
     def of(cls, line: str, forced: str = "") -> _Layout:
-        """Infer the layout of a line; forced: its separator, if the file states it."""
+        """Infer the layout of a line; forced: separator that the file states, or ""."""
         mark = forced or next((mark for mark in (";", "\t") if mark in line), None)
         if mark is not None:
             return cls(mark, mark != ",")

@@ -33,7 +33,7 @@ from bstcad.optics.sides import Sides, as_pair, side
 from bstcad.optics.surfaces import Surface
 
 DEGREE = 2  # degree of the basis functions (order 3)
-SPANS_AT_A_TIME = 1 << 14  # spans evaluated at a time, so that their values stay in the cache
+SPANS_AT_A_TIME = 1 << 14  # number of spans evaluated at a time, so that their values stay in the cache
 # Positions in a span, including both end knots, at which slope and curvature of a net are limited and reported.
 QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
@@ -46,14 +46,14 @@ def knots(m: int) -> np.ndarray:
 def parameter(u: Tensor, m: int) -> Tensor:
     """Return t(u) for u in [0, m-1]; Wang et al. 2023, Eq. 13.
 
-    t = 2 - sqrt(4 - 2u), u - 1/2, m - 4 + sqrt(4 - 2(m - 1 - u)) in the first, inner and last span.
+    t = 2 - sqrt(4 - 2u) in the first span, u - 1/2 in inner spans, and m - 4 + sqrt(4 - 2(m - 1 - u)) in the last.
     """
     k, s = span(u, m)
     return k + s
 
 
 def span(u: Tensor, m: int) -> tuple[Tensor, Tensor]:
-    """Return (k, s), t(u) = k + s: number of the span and position in it, which has more digits than the sum t."""
+    """Return (k, s) with t(u) = k + s: number k of the span, and position s in it, which has more digits than t."""
     first, last = u < 1.5, u > m - 2.5
     end = torch.where(first, u, m - 1 - u)  # distance from the nearer end
     root = torch.sqrt(4.0 - 2.0 * torch.where(first | last, end, torch.ones_like(u)))  # guarded before the root
@@ -127,7 +127,7 @@ def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Ten
 
 
 def basis_matrix(u: np.ndarray, m: int, derivative: int = 0) -> scipy.sparse.csr_matrix:
-    """Return the banded matrix (len(u), m): row r contains the basis functions, or their first derivatives, at u[r]."""
+    """Return the banded matrix (len(u), m): row r has the basis functions at u[r]; derivative 1: their derivatives."""
     points = torch.as_tensor(np.asarray(u, dtype=np.float64))
     k, *weights = basis(points, m)
     columns = (k[:, None] + torch.arange(3)).numpy()
@@ -403,7 +403,7 @@ class Spans:
         )
 
     def _weights(self, index: Tensor, count: int, s: Sequence[float]) -> list[list[Tensor]]:
-        """Return `weights` by [derivative][basis function], each (len(s), spans); index: spans, count: m or n."""
+        """Return `weights` by [derivative][basis function], each (len(s), spans); index: of spans; count: m or n."""
         each = [weights(index, count, at) for at in s]
         return [[torch.stack([w[order][k] for w in each]).to(self.heights) for k in range(3)] for order in range(3)]
 

@@ -19,7 +19,7 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, tilt_of
 
-WIDTHS_BEFORE_LENS = 4.0  # distance from lens to aperture of a rotated beam without z, in diagonals of the aperture
+WIDTHS_BEFORE_LENS = 4.0  # distance of aperture and lens for a rotated beam without z, in diagonals of the aperture
 MAX_INCLINATION = 89.0  # limit of the angle between light and the axis of the lens, degrees
 
 
@@ -169,7 +169,7 @@ class Collimated(Emitter):
         return x + (z - self.z) * a, y + (z - self.z) * b
 
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
-        """Return the rectangle of the plane z that contains all the light: the bounding box of the aperture.
+        """Return the rectangle of the plane z, centred on the axis, that contains all the light.
 
         For light that is tilted or off the axis the rectangle contains only the part that can meet the first surface
         inside its outline, between the sags (mm).

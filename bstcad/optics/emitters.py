@@ -142,7 +142,7 @@ class Emitter(ABC):
 
     @property
     def is_rotation_invariant(self) -> bool:
-        """True if a rotation about the source's axis leaves the light unchanged; else `moved` does not apply it."""
+        """True if a rotation about the source's axis leaves the light unchanged; else `moved` neglects the rotation."""
         return False
 
     @property

@@ -209,7 +209,7 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
 
 
 def _plane_and_root(surface: Surface, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
-    """Return (points on the base plane (3, …), path s from there to the surface, meets); s has no gradient."""
+    """Return (points on z = surface.z (3, …), path s (mm) from there to the surface, mask of rays that meet it)."""
     dz = rays.direction[2]
     path = -rays.above(surface.z) / torch.where(dz.abs() > 1e-12, dz, torch.full_like(dz, 1e-12))
     start = torch.stack([*(rays.position[:2] + path * rays.direction[:2]), torch.zeros_like(dz)])
@@ -244,7 +244,7 @@ def net_bounds(surface: BSplineSurface, dtype: torch.dtype, sense: int = 1) -> N
 def first_root(
     net: BSplineSurface, start: Tensor, path: Tensor, rays: Rays, bounds: NetBounds
 ) -> tuple[Tensor, Tensor]:
-    """Return (s, meets): path s (mm) of live rays from their points `start` (3, …) on the base plane to the surface.
+    """Return (path s (mm) of rays from points `start` (3, …) on z = net.z to the net, mask of rays that meet it).
 
     path: signed length (mm) from the position of each ray to `start`; roots behind the position do not count.  Rays
     that are steep to the surface must begin in the glass.
@@ -274,7 +274,7 @@ def _select(vectors: Tensor, index: tuple[Tensor, ...]) -> Tensor:
 def _newton(
     net: BSplineSurface, start: Tensor, direction: Tensor, s: Tensor, searched: Tensor, tolerance: float, first: int = 0
 ) -> tuple[Tensor, Tensor]:
-    """Return (path s* with |F| <= tolerance (mm), meets) by Newton steps from s; first: number of steps made before."""
+    """Return (s* with |F| <= tolerance (mm), mask of success) by Newton steps from s, numbered from `first` on."""
     dx, dy, dz = direction
     meets = torch.zeros_like(searched)
     for step in range(first, NEWTON_STEPS):

@@ -45,7 +45,7 @@ class Screen:
 
     @property
     def plane(self) -> Receiver:
-        """Receiver on which light lands: a plane, or the receiver of another form."""
+        """Receiver on which light lands: a plane, or a receiver of another form."""
         if self.surface is not None:
             return self.surface
         if self.tilt is None and self.clocking == 0:
@@ -131,7 +131,7 @@ def collect(rays: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
 
 
 def collect_plain(position: Tensor, flux: Tensor, screen: Screen) -> tuple[Tensor, Tensor]:
-    """Run `collect` in plain torch: four pixels per ray, without pixels outside the screen."""
+    """Compute the values of `collect` in plain torch: four pixels per ray, without pixels outside the screen."""
     column, row = (p.reshape(-1) for p in screen.pixel(position[0].double(), position[1].double()))
     flux, (rows, columns) = flux.reshape(-1).double(), screen.shape
     outside = (column - column.clamp(0, columns)) ** 2 + (row - row.clamp(0, rows)) ** 2
@@ -195,7 +195,7 @@ LEDGER = {  # status of lost rays, by line of the ledger
 
 
 def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
-    """Return the flux of rays by fate; the lines sum to the flux of all rays that are not Status.BLOCKED."""
+    """Return the flux on and off the target and by cause of loss; the sum is that of all rays but Status.BLOCKED."""
     flux = rays.flux.double()
     on_screen = screen.contains(rays.position[0], rays.position[1])
     lines = {

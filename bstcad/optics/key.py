@@ -13,7 +13,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Key:
-    """Meaning, unit and range of a field; the range applies to all numbers of a list (in inner lists, to the first)."""
+    """Meaning, unit and range of a field; the range applies to each number of [a, b, …], but in [[a, b], …] to a."""
 
     meaning: str  # meaning, one sentence
     unit: str = ""  # unit; "": a pure number or a word

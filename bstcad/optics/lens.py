@@ -68,7 +68,7 @@ class Lens:
 
     @property
     def _lossless(self) -> tuple[Interface, ...]:
-        """Interfaces of the solid without losses, one for each pass."""
+        """Interfaces of the solid without losses, one for each step of `passes`."""
         surfaces = {"front": self.front.optical, "back": self.back}
         apertures = dict(zip(("front", "back"), self.apertures, strict=True))
         lost = (Status.MISSED_FRONT, *(Status.VIGNETTED for _ in self.passes.steps[1:]))
@@ -79,7 +79,7 @@ class Lens:
 
     @property
     def front_net(self) -> BSplineSurface:
-        """Front of a lens with a tailored front; TypeError if it is not a net."""
+        """Tailored front; TypeError if the front is not a net."""
         return require_net(self.front)
 
     @property
@@ -122,7 +122,7 @@ class Lens:
         return self.shapes("front") and self.shapes("back") and not self.passes.reflects
 
     def shaping(self, *faces: Face) -> Lens:
-        """Return the lens in which tailoring shapes these faces of the solid, in the order of the light."""
+        """Return the lens in which tailoring shapes these faces of the solid, given in the order of the light."""
         return replace(self, shaped=tuple(self.number_of(face) for face in faces))
 
     @property

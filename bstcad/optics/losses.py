@@ -63,7 +63,7 @@ def coated_reflectance(face: Transmission, coating: CoatingLayer, cos_in: Tensor
 
 
 def metal_reflectance(index: complex, cos_in: Tensor, polarisation: Polarisation = "none") -> Tensor:
-    """Return the reflectance R of a metal of complex index n + ik, relative to the medium before it.
+    """Return the reflectance R of a metal; index: its complex index n + ik, divided by that of the medium before it.
 
     With a + ib = sqrt((n + ik)² - sin² θ):  R_s = ((a - cos θ)² + b²) / ((a + cos θ)² + b²),
     R_p = R_s ((a cos θ - sin² θ)² + b² cos² θ) / ((a cos θ + sin² θ)² + b² cos² θ).
@@ -191,7 +191,7 @@ class Losses:
 
 
 def _amplitudes(n_in: float, n_out: float, cos_in: Tensor, cos_out: Tensor) -> tuple[Tensor, Tensor]:
-    """Return (r_s, r_p) of a boundary between two media."""
+    """Return the reflected amplitudes (r_s, r_p) at a boundary between two media (see `reflectance`)."""
     a, b, c, d = n_in * cos_in, n_out * cos_out, n_out * cos_in, n_in * cos_out
     return (a - b) / (a + b), (c - d) / (c + d)
 

@@ -14,7 +14,7 @@ The picture for display is the mean of all sets, smoothed as long as this remove
 linearly between their corners: with two tubes per side of a cell of the net the error is about the RRMSD that remains
 after tailoring with tubes, with four a third of this error, with eight a tenth (measured).  The tubes are therefore
 halved in width until the pictures agree, or the error of the tubes cannot explain the difference.  `rrmsd_by_tubes` is
-a few per cent too low for a lens tailored with tubes.  A ghost (light reflected twice in a lens) is traced once.
+a few per cent too low for a lens tailored with tubes.  A ghost (light reflected twice in a lens) is traced only once.
 
 An extended source forms an image of itself through each point of the lens (`ImageSamples`).  All rays through one point
 of the back meet the same slope, whichever source point they come from: no lens can unite them in one point.
@@ -44,7 +44,7 @@ from bstcad.optics.trace import UNDERSIDE, GhostImage, Simulation, simulate, thr
 
 SETS = 8  # number of independent sets of rays: the relative uncertainty of a standard error is a quarter
 PILOT_DIVISOR = 5  # maximum rays per side divided by those of the first sets, which predict the number needed
-PICTURE_NOISE = 0.45  # largest noise of the mean picture divided by RRMSD, at the default accuracy; adds 10 % to RRMSD
+PICTURE_NOISE = 0.45  # largest noise of the mean picture / RRMSD, at the default accuracy; it adds 10 % to the RRMSD
 RESOLVED = 5.0  # smallest ratio of an RRMSD to its standard error at which it counts as resolved
 # Tolerances of the difference between the pictures by rays and by tubes: relative to the smaller RRMSD, and absolute.
 WITNESS_RELATIVE_TOLERANCE, WITNESS_TOLERANCE = 0.5, 0.002
@@ -52,17 +52,17 @@ MAX_WITNESS_TUBES = 4200  # maximum tubes per side to which the witness is refin
 SMOOTHING_WIDTHS = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # standard deviations of Gaussians (pixels)
 # Exponent: k points of an extended source divide tubes and rays per side by k^SIDE_EXPONENT; the total is constant.
 SIDE_EXPONENT = 0.5
-RAYS_PER_POINT = 1 << 13  # rays of each set per point of an extended source
+RAYS_PER_POINT = 1 << 13  # number of rays of each set per point of an extended source
 MIN_SOURCE_POINTS, MAX_SOURCE_POINTS = 8, 1024  # limits of the number of source points of each set
 MIN_TUBES = 513  # minimum tubes per side (`tubes_of`): fewer do not resolve pixels
-COARSE_SHEET = 64  # tubes per side of the coarse sheet over the back; interpolation from it misplaces 1e-6 of the light
+COARSE_SHEET = 64  # tubes per side of the grid from which finer ones are interpolated, with 1e-6 of the light misplaced
 PASS_SEEDS = 1 << 20  # difference between the seeds of successive passes of rays from an extended source
 GHOST_DIVISOR = 4  # rays per side divided by those of the ghost, which is about a thousandth of the light
-IMAGE_POINTS_PER_SIDE = 48  # points per side of the back face through which the image of the source is computed
+IMAGE_POINTS_PER_SIDE = 48  # number of points per side of the back face through which the source is imaged
 # Largest distance of landing light from the screen's centre, divided by (longer side of the screen + median distance).
 # Light farther out grazes a tilted plane and does not belong to the image.
 MAX_IMAGE_DISTANCE = 16
-EVEN_POINT_PAIRS = 2048  # pairs of points that represent a uniformly bright source
+EVEN_POINT_PAIRS = 2048  # number of pairs of points that represent a uniformly bright source
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Light:
     rrmsd: float  # RRMSD without bias (Wang et al. 2023, Eq. 15); NaN: no light falls on the screen
     standard_error: float  # standard error of the RRMSD
     rays: int  # total number of rays
-    flux: dict[str, float]  # ledger: fractions of the source's flux by fate; they sum to 1
+    flux: dict[str, float]  # ledger: fractions of the source's flux, by where the light goes; they sum to 1
     tent: float = math.nan  # RRMSD by linear binning
     picture_error: float = math.nan  # RRMSD between `picture` and the lens's noiseless picture
     witness: Witness | None = None  # None: an extended source, losses, no kernel for this lens, or not requested
@@ -111,12 +111,12 @@ class Light:
 
     @property
     def efficiency(self) -> float:
-        """Return the ratio of the flux inside the target to the flux that leaves the last surface."""
+        """Return the flux on the target as a fraction of the flux that leaves the last surface."""
         return efficiency(self.flux)
 
     @property
     def used(self) -> float:
-        """Return the fraction of the light entering the lens that falls on the target."""
+        """Return the flux on the target as a fraction of the flux that meets the lens, but not its underside."""
         enters = 1 - self.flux["missed the lens"] - self.flux.get(UNDERSIDE, 0.0)
         return self.flux["on target"] / enters if enters > 0 else 0.0
 
@@ -190,7 +190,7 @@ class _Rays:
 
     boxes: tuple[Tensor, ...]  # picture of each set, (rows, columns) with the target's sum; (): no light on the screen
     tents: tuple[Tensor, ...]  # pictures by linear binning, as `boxes`
-    flux: dict[str, float]  # ledger of the flux by fate
+    flux: dict[str, float]  # ledger of the flux, as in `Light`
     count: int  # number of rays
     on_screen: float  # flux on the screen, as a fraction of the source's
     weight: float = 1.0  # weight of the pictures in a mean: inverse variance of their noise, on any scale
@@ -244,7 +244,7 @@ class _Setup:
 
 
 def _value(rays: _Rays, target: Tensor) -> tuple[float, float]:
-    """Return (RRMSD, its standard error); an RRMSD² below its standard error is replaced by the standard error."""
+    """Return (RRMSD, its standard error); an RRMSD² below its own standard error is replaced by that."""
     squared, error = squared_distance(rays.boxes, target)
     value = math.sqrt(max(squared, error))
     return value, math.sqrt(value**2 + error) - value
@@ -460,7 +460,7 @@ class RayTubes:
 def tubes_picture(
     lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, over_the_back: bool = False
 ) -> Tensor:
-    """Return the flux in each pixel as a fraction of the source's, by n x n tubes per channel; see `tubes.picture`."""
+    """Return the flux in each pixel as a fraction of the source's, by n x n tubes per channel (`tubes.picture`)."""
     few = COARSE_SHEET if over_the_back else tubes.SHEET_TUBES
     lights = ((c.source, c.through(lens)) for c in channels)
     pictures = (tubes.picture(*light, screen, n, few=few, over_the_back=over_the_back) for light in lights)

@@ -26,10 +26,10 @@ from typing import Any
 
 MAKERS_SHELF = "specs"  # shelf of the data sheets of glass makers, in which a glass name alone identifies a page
 MAX_NAMES_LISTED = 8  # largest number of page names listed in a message
-MAX_NAME_LENGTH = 60  # characters of a material name that a message quotes; names of up to twice as many are found
+MAX_NAME_LENGTH = 60  # characters up to which a name is quoted in full; names twice as long are still looked up
 RANGE_TOLERANCE = 1e-9  # relative tolerance of the wavelength range, for rounding by a change of unit
 
-_NAMES = re.compile(r"^ *(?:- )?(SHELF|BOOK|PAGE|data): (.*)$", re.MULTILINE)  # names and files of pages
+_NAMES = re.compile(r"^ *(?:- )?(SHELF|BOOK|PAGE|data): (.*)$", re.MULTILINE)  # lines of a catalogue
 _DENSITY = re.compile(r"^ +density:\n +- (?:temperature: .*\n +)?value: ([\d.eE+]+) *$", re.MULTILINE)  # density, kg/m³
 
 
@@ -171,7 +171,7 @@ class Medium:
 
     @property
     def data(self) -> Data:
-        """Data of the page."""
+        """Data of the page `page`."""
         return read(self.page)
 
     @property
@@ -185,7 +185,7 @@ class Medium:
         return self.nominal or self.data.density
 
 
-_ACRYLIC = "organic/poly_methyl_methacrylate"  # book of PMMA
+_ACRYLIC = "organic/poly_methyl_methacrylate"  # book with the pages of PMMA
 # k of the polymers is that of sheets by Zhang et al., Appl. Opt. 59, 2337 (2020): an upper bound.  For acrylic it
 # gives a = 3e-3/mm at 650 nm, whereas optical fibres of acrylic lose 0.15 dB/m, which is 3.5e-5/mm.
 MEDIA = (

@@ -44,7 +44,7 @@ WRONG = {
     "more columns": (lines(np.hstack([GOOD, GOOD]), ","), "has 6 columns, but no heading names x, y and z"),
     "x twice": ("x,y,z,x\n" + lines(GOOD[:, [0, 1, 2, 0]], ","), "names x, y or z twice"),
     "another unit": ("x [ft],y [ft],z [ft]\n" + lines(GOOD, ","), "'x[ft]', has an unknown unit; give mm"),
-    "metres": (lines(GOOD / 1000, ","), "as if they were in metres; give them in mm"),
+    "metres": (lines(GOOD / 1000, ","), "seem to be in metres"),
     "no text": (bytes(range(256)), "is not a text file"),
 }
 

@@ -15,8 +15,8 @@ With L the merit function, G = ∂L/∂I and H(x, y) = ∫_y^∞ G dy, the adjoi
 and ∫ (1 - s) G ds, ∫ s G ds, s = 0 … 1 along the edge (an edge that moves by δ sweeps the area δ · n ds, n its normal).
 They are computed once for the two triangles beside the edge.
 
-All lengths are in pixels, x across the columns, y down the rows.  Columns come first in the sums, as x does in a sheet
-of tubes: the rows of tubes of one part reach few columns.
+All lengths are in pixels, x across the columns, y down the rows.  Columns are the first index of the sums, as x is
+that of the tubes: so the rows of tubes of one part, which one thread computes, reach few columns.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from bstcad.optics.kernels.compiling import compiled
 
 MAX_DISTANCE = 1e15  # largest |x| + |y| of a corner (pixels); farther away, rounding approaches a pixel
 NO_BORDER = 1e300  # s of the next border of an edge that crosses no more borders along an axis
-MAX_WIDTH = 1e6  # extent in x of a part's corners (pixels) above which rounding may reach any column
+MAX_WIDTH = 1e6  # extent in x of the corners of one part (pixels), above which rounding may reach any column
 ROWS_PER_STRIP = 16  # rows of tubes whose gradient one thread computes at a time
 
 ON, OUT_OF_RANGE = 0, 16  # state of a corner: on the screen; outside MAX_DISTANCE or not a number
@@ -59,7 +59,7 @@ def pixel_at(x, y, columns, rows):
 
 @inlined
 def corner_at(corner, k, r, columns, rows):
-    """Return (x, y, column, row, state) of one corner."""
+    """Return (x, y, column, row, state) of the corner (k, r)."""
     x, y = corner[0, k, r], corner[1, k, r]
     i, j, state = pixel_at(x, y, columns, rows)
     return x, y, i, j, state
@@ -110,7 +110,7 @@ def half_square_outside(a, b, c, d, columns, rows):
 
 @inlined
 def _first_border(start, cell, d, size):
-    """Return (step, s of the next border, s between borders) along one axis; the outside is one cell on either side."""
+    """Return (step, s of the next border, s between borders) on an axis; edge from `start` in `cell` to start + d."""
     if d > 0.0 and cell < size:
         return 1, (cell + 1 - start) / d, 1.0 / d
     if d < 0.0 and cell >= 0:
@@ -162,7 +162,7 @@ def add_edge(sums, a, b, density):
 
 @njit(error_model="numpy")
 def _add_long_edge(sums, a, b, density):
-    """Run `add_edge` across any number of borders."""
+    """Do what `add_edge` does, for an edge that crosses any number of borders."""
     columns, rows = sums.shape[0], sums.shape[1] - 1
     ax, ay, i, j, _ = a
     dx, dy = b[0] - ax, b[1] - ay
@@ -215,7 +215,7 @@ def along_edge(g, below_g, a, b):
 
 @njit(error_model="numpy")
 def _along_long_edge(g, below_g, a, b):
-    """Run `along_edge` across any number of borders."""
+    """Do what `along_edge` does, for an edge that crosses any number of borders."""
     columns, rows = g.shape
     ax, ay, i, j, _ = a
     dx, dy = b[0] - ax, b[1] - ay
@@ -309,7 +309,7 @@ def _add_end(sums, corner, k, upper):
 
 @njit
 def _clear_columns(own, touched, x):
-    """Clear the columns that triangles between corners at x can reach, with a margin for rounding."""
+    """Clear the columns of `own` that triangles between corners at x can reach, with a margin for rounding."""
     low, high = math.inf, -math.inf
     for k in range(x.shape[0]):
         for r in range(x.shape[1]):
@@ -496,7 +496,7 @@ def _add_rest_of_row(g, corner, flux, k, flags, g_far, d_corner, d_flux):
 def clip_adjoint(corner, flux, thinnest, g, below_g, g_far, d_corner, d_flux):
     """Add the gradient in the corners to d_corner; store the gradient in the flux in d_flux, (n, m) or empty.
 
-    g (columns, rows), g_far: gradients in image and far.  below_g (columns, rows + 1): see `along_edge`.  The even
+    g (columns, rows), g_far: gradients in the picture and in `far` of `_clip`.  below_g: see `along_edge`.  The even
     strips of rows of tubes are computed first, then the odd ones, so that no two threads write one corner.
     """
     n, m = flux.shape
@@ -515,7 +515,7 @@ def clip_adjoint(corner, flux, thinnest, g, below_g, g_far, d_corner, d_flux):
 
 
 class Clip(torch.autograd.Function):
-    """Map (corner (2, n + 1, m + 1), flux (n, m), (rows, columns), thinnest) to (image, Σ far), as `tubes.collect`.
+    """Map (corner (2, n + 1, m + 1), flux (n, m), (rows, columns), thinnest) to (picture, Σ far): see `_clip`.
 
     Lengths are in pixels.  The gradient is taken in the corners and in the flux.
     """

@@ -3,7 +3,7 @@
 Rays are processed in blocks (forward.py).  The forward pass stores each ray's path to the face; the adjoint computes
 hit and slopes from this path again.
 
-With the ray x + t d, the face's slopes p and q and normal n = (-p, -q, 1), the hit X (where z = sag) moves by
+With the ray x + t d, the face's slopes p and q and normal n = (-p, -q, 1), the hit X (where z = sag) changes by
 
     dX = dx + t dd + d dt,   dt = (δsag - n · (dx + t dd)) / (n · d),   dp = δp + S_xx dX_x + S_xy dX_y, dq likewise,
 
@@ -152,7 +152,7 @@ def _at_tilted(faces, tilted, at, e, h, gx, gy):
 
 @njit(inline="always")
 def _behind_face(at, work, r):
-    """Return the gradients of `_at_level` for rays that go on: `work` contains ∂L/∂hit and ∂L/∂direction."""
+    """Return the gradients of `_at_level` for rays that do not land: `work` contains ∂L/∂hit and ∂L/∂direction."""
     g_x, g_y, g_z = work[G_X + r], work[G_Y + r], work[G_Z + r]
     g_e = (work[G_DX + r], work[G_DY + r], work[G_DZ + r])
     return g_e, (g_x, g_y, g_z), g_x * at[3] + g_y * at[4] + g_z * at[5]
@@ -331,7 +331,7 @@ def behind(rays: Rays, interface: Interface) -> Rays:
 
 
 def _across(rays: Rays, interface: Interface, plane: Receiver | None) -> tuple[Tensor, Rays]:
-    """Return (out of `Cross`, rays with flux and status behind the face but their old position and direction)."""
+    """Return (`out` of `Cross`, rays with flux and status behind the face but their old position and direction)."""
     shape, heights, lossy = rays.status.shape, interface.net.heights, bool(interface.losses)
     if rays.axial and interface.status_if_missed == Status.MISSED_FRONT:
         rays = _start_below_net(rays, interface)
@@ -348,10 +348,10 @@ def _across(rays: Rays, interface: Interface, plane: Receiver | None) -> tuple[T
 
 
 def _start_below_net(rays: Rays, interface: Interface) -> Rays:
-    """Move the start of light along the axis to a plane in front of all of a net.
+    """Move the start of light along the axis to a plane before the whole net.
 
     The start of such a beam is arbitrary, and interfaces.intersect does not use it.  The kernels only find roots ahead
-    of the start, and would lose light where a deep net extends in front of this start.
+    of the start, and would lose light where a deep net reaches back beyond this start.
     """
     surface, sense = interface.net, rays.sense
     lowest = net_bounds(surface, torch.float64, sense).lowest

@@ -38,7 +38,7 @@ WORK = 19 * BLOCK  # length of `work`
 
 @njit(error_model="numpy")
 def cosines(offset, count, work):
-    """Store the cosine of the angle of incidence at the slopes in `work`, from `offset` on."""
+    """Store in `work`, from `offset` on, the cosine of the angle of incidence for the slopes there."""
     for r in range(count):
         p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
         along = work[DZ + r] - p * work[DX + r] - q * work[DY + r]
@@ -297,7 +297,7 @@ def _look_up(peak, table, count, work):
 
 @njit(error_model="numpy")
 def _meet_front(faces, axial, count, work):
-    """Move rays to the front as `interfaces.intersect`: by `Conic.crossing`, or by the sag for rays along the axis."""
+    """Move rays to the front as `interfaces.intersect` does: by `Conic.crossing`, or along the axis by the sag."""
     c, conic, min_cos2 = faces.curvature, 1.0 + faces.conic_constant, faces.rules.min_cos2
     for r in range(count):
         x, y, dx, dy, dz = work[X + r], work[Y + r], work[DX + r], work[DY + r], work[DZ + r]

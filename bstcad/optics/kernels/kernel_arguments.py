@@ -1,7 +1,7 @@
 """Conversion of lens, light, cells and screen to the arguments of a fused kernel (records.py).
 
-The constants of the plain form are passed as numbers too: a cached kernel would not notice that a constant imported
-from a file outside this folder has changed.
+The constants of the plain torch form are passed as numbers, too: a cached kernel would not notice that a constant
+imported from a file outside this folder has changed.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import Receiver
 
-TRANSMISSION_NODES = 4097  # nodes of a table of a face's transmission
+TRANSMISSION_NODES = 4097  # number of nodes of a table of a face's transmission
 TABLE_SIDES = 65, 129, 257, 513  # control points per side of a table of light, tried in this order
 IRRADIANCE_TOLERANCE = 1e-5  # largest RMS of a table's relative error in the irradiance, far below errors of pictures
 MIN_IRRADIANCE = 1e-4  # fraction of the maximum irradiance that is added to the divisor of the relative error
 SLOPE_TOLERANCE = 1e-8  # largest RMS of a table's error in the slopes of rays
-PEAK_TO_RMS = 100.0  # largest allowed error at a point of a table divided by the RMS tolerance: end spans are worst
+PEAK_TO_RMS = 100.0  # largest allowed error of a table at a point / RMS tolerance; end spans have the largest errors
 MAX_LIGHT_TABLES = 16  # maximum number of tables of light in the cache
 MAX_TABLE_ERROR_RATIO = 0.5  # largest ratio of a table's error to the coarser table's; larger: the light has an edge
 
 
 def rules() -> Rules:
-    """Return the current constants of the plain form."""
+    """Return the current constants of the plain torch form."""
     steps = (interfaces.NEWTON_STEPS, interfaces.APPROACH_STEPS)
     search = (interfaces.SIDE_EXIT_COSINE, interfaces.MIN_NEWTON_DERIVATIVE, interfaces.TANGENCY_TOLERANCE)
     return Rules(*floats([*steps, *search, interfaces.MIN_COS_REFRACTION, surfaces.MIN_COS2, rays.MIN_AXIAL_COSINE]))
@@ -129,7 +129,7 @@ def _table_of_light(source: Emitter, window: Rectangle, z: float) -> Beam | None
 
 
 def _tilted(plane: Receiver | None, before: int, behind: int) -> records.TiltedScreen | None:
-    """Return a tilted plane as numbers, None for a level one; before, behind: senses of light at the net."""
+    """Return a tilted plane as numbers, None for a level one; before, behind: sense of light on the net's two sides."""
     if plane is None or plane.is_level:
         return None
     assert plane.axes is not None  # no kernel traces to other receivers

@@ -37,7 +37,7 @@ NO_TABLE = LightTable(0, 0, 0.0, 0.0, 0.0, 0.0, *3 * (np.zeros(0),))
 
 
 class Beam(NamedTuple):
-    """E = peak exp(-fall r²) / d^power on the plane of the first vertex; r: distance from (x, y), d: from the source.
+    """Irradiance E = peak exp(-fall r²) / d^power on the first vertex's plane; r: distance from (x, y), d: from source.
 
     The irradiance of a tilted point source is `Point._tilted_irradiance`: peak times c / d^4, 1 / d³ or exp(-fall (d² -
     c²) / c²) / c³, c = d cos θ, for the powers 4, 3 and 0.  With a table E is peak times the table's irradiance.
@@ -62,7 +62,7 @@ class Beam(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """Constants of the plain form; all are floats, so that a parallel kernel accepts them as one tuple."""
+    """Constants of the plain torch form; all are floats, so that a parallel kernel accepts them as one tuple."""
 
     newton_steps: float  # interfaces.NEWTON_STEPS
     approach_steps: float  # interfaces.APPROACH_STEPS

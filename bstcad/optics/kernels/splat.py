@@ -13,7 +13,7 @@ from torch import Tensor
 from bstcad.optics.kernels import reductions
 from bstcad.optics.kernels.compiling import compiled
 
-RAYS_PER_TASK = 4096  # rays per task, whose coordinates and results stay in the second-level cache
+RAYS_PER_TASK = 4096  # number of rays per task, whose coordinates and results stay in the second-level cache
 
 
 @compiled(parallel=True)
@@ -55,7 +55,7 @@ def _splat(position, flux, frame, image, touched, outside):
 
 @compiled(parallel=True)
 def _splat_adjoint(position, flux, frame, g, g_outside, d_position):
-    """Compute the gradient in the positions from the gradients g (rows, columns) in image and g_outside in outside."""
+    """Compute d_position from the gradients g (rows, columns) in the picture and g_outside in the sum of `outside`."""
     rows, columns = g.shape
     n = flux.size
     for c in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):

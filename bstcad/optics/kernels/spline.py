@@ -20,7 +20,7 @@ from bstcad.optics.kernels import reductions
 from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.reductions import on_threads
 
-POINTS_PER_TASK = 4096  # points per task, whose coordinates and results stay in the second-level cache
+POINTS_PER_TASK = 4096  # number of points per task, whose coordinates and results stay in the second-level cache
 
 
 def _flat(t: Tensor) -> np.ndarray:
