@@ -21,22 +21,22 @@ from bstcad.optics.irradiance import Screen
 
 # --- the end of the convergence curve ---------------------------------------------------------------------------------
 
-LAST_TENTH_RATIO = 1.1  # RRMSD divided by its final value, below which time counts for the last tenth of the error
-FITTED_FRACTION = 0.5  # fraction of the time, at the end of the curve, to which the power law is fitted
-MIN_FIT_POINTS = 5  # smallest number of points for a fit
-MIN_R_SQUARED = 0.9  # smallest R² of the fit in logarithms that counts as a power law
+LAST_TENTH_RATIO = 1.1  # RRMSD / final RRMSD: a report states how long before the end the curve was last above this
+FITTED_FRACTION = 0.5  # the power law is fitted to this last fraction of the time
+MIN_FIT_POINTS = 5  # smallest number of points of the curve for a fit
+MIN_R_SQUARED = 0.9  # smallest R² of the fit (in logarithms) at which the curve counts as a power law
 MAX_HALVING = 10.0  # largest reported factor by which the time grows if the error is halved
 
 History = Sequence[tuple[float, float]]  # (seconds since the start, RRMSD)
-StageResults = Sequence[tuple[float, float | None]]  # stages in order: (seconds, RRMSD at the end or None)
+StageResults = Sequence[tuple[float, float | None]]  # stages in order: (duration (s), RRMSD by rays at its end or None)
 
 
 @dataclass(frozen=True)
 class ConvergenceEnd:
-    """End of a convergence curve: RRMSD of the best lens so far, by flux tubes, after each evaluation.
+    """End of a convergence curve, which is the RRMSD of the best lens so far (by flux tubes) after each evaluation.
 
-    Near its end the curve is fitted by RRMSD ∝ t^-p, t the total time of the evaluations: to halve the error, t must
-    grow by the factor 2^(1/p).
+    Near its end the curve is fitted by RRMSD ∝ t^-p, where t is the total time of the evaluations.  To halve the error,
+    t must grow by the factor 2^(1/p).
     """
 
     rrmsd: float  # final RRMSD: median of the last twentieth of the evaluations
@@ -74,7 +74,8 @@ def _last_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (time, values) of the points in the last FITTED_FRACTION of the time after `since`, within the last stage.
 
-    Each evaluation counts with the median time of its stage, so that other work of the machine has no effect.
+    ends: end of each stage (s).  The time of each evaluation is replaced by the median of its stage, so that other work
+    of the machine has no effect.
     """
     stage = np.searchsorted(ends, seconds)
     steps = np.zeros(len(seconds))
@@ -126,7 +127,7 @@ def masks(target: np.ndarray) -> dict[str, np.ndarray]:
     """Return the pixels (rows, columns) of each part; a pixel belongs to the first part whose condition it meets.
 
     rim: a strip of at least one pixel along each side, as wide as 1/64 of the target.  edges: the tenth of all pixels
-    where the gradient (central differences) is largest, if it is at least 2 % of the brightest pixel per pixel.
+    with the largest gradient (central differences), if it is at least 0.02 per pixel, relative to the brightest pixel.
     darkest, brightest: a tenth of all pixels each, more if pixels are equal.  rest: all others.
     """
     steep = np.hypot(*np.gradient(target))
@@ -152,9 +153,9 @@ def _octaves(error: np.ndarray, per_unit: float) -> list[dict[str, Any]]:
     """Return the energy of an error's cosine transform (orthonormal: Parseval) by octaves of frequency, coarse first.
 
     frequency: lower and upper limit in cycles per pixel (the finest octave extends to 0.71, along the diagonals).
-    period: limits on the target, in its unit, the longer first.  error: fraction of the squared error.  The mean is in
-    no octave, as the two pictures have the same sum.  The cosine transform is not periodic, so a difference between
-    opposite sides adds no high frequencies.
+    period: both limits as lengths on the target, the longer first, in the unit of `per_unit` (pixels per unit).
+    error: fraction of the squared error.  The mean is in no octave, as the two pictures have the same sum.  The cosine
+    transform is not periodic, so a difference between opposite sides adds no high frequencies.
     """
     energy = dctn(error, norm="ortho") ** 2
     along = (np.arange(side) / (2 * side) for side in error.shape)
@@ -180,9 +181,9 @@ MIN_UNLIT_FRACTION = 5e-3  # smallest reported unlit fraction, both of the lit a
 
 
 def unlit(target: np.ndarray, irradiance: np.ndarray, screen: Screen) -> dict[str, Any]:
-    """Return the fraction of the lit area that stays dark, and the position of the largest dark patch; {} if small.
+    """Return the fraction of the lit area that stays dark; {} if it, or that of the light, is below MIN_UNLIT_FRACTION.
 
-    share: the fraction.  place: the ranges of x and y, as text.
+    share: the fraction.  place: the ranges of x and y of the largest dark patch, as text.
     """
     lit = target > DARK_LEVEL * target.mean()
     dark = lit & (irradiance < UNLIT_LEVEL * target)
@@ -203,7 +204,7 @@ def unlit(target: np.ndarray, irradiance: np.ndarray, screen: Screen) -> dict[st
 def lifted(target: np.ndarray, irradiance: np.ndarray) -> dict[str, float]:
     """Return how much light the dark parts of the target get: a smooth face cannot leave all of them dark.
 
-    light: excess over the target, as a fraction of all light.  level: mean irradiance there / mean of the target.
+    light: excess over the target, as a fraction of all light.  level: their mean irradiance / mean of the whole target.
     """
     dark = target < DARK_LEVEL * target.mean()
     light = float((irradiance - target)[dark].sum() / target.sum())
@@ -212,7 +213,7 @@ def lifted(target: np.ndarray, irradiance: np.ndarray) -> dict[str, float]:
 
 # --- cells of the control net -----------------------------------------------------------------------------------------
 
-TILE_PIXELS = 16  # side of a tile (pixels)
+TILE_PIXELS = 16  # side of the tiles into which a target is cut (pixels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +230,7 @@ class ControlCells:
     def floor(self, finer: float = 1.0) -> float:
         """Return the RRMSD if each tile shows as many of its coarsest cosines as cells light it.
 
-        finer: factor of the number of control points per side.
+        finer: factor by which the number of control points per side is multiplied.
         """
         tiles, cells = (_tiles(picture) for picture in (self.target, self.cells_per_pixel))
         energy = dctn(tiles, axes=(1, 2), norm="ortho").reshape(len(tiles), -1)[:, COARSE_TO_FINE] ** 2

@@ -42,14 +42,14 @@ GRID_LINES = 33  # number of grid lines in each direction in `ray_map`
 
 
 def fan(source: Emitter, lens: Lens, plane: Receiver) -> np.ndarray:
-    """Return polylines (rays, points, 3) in mm, from the source via each surface to the plane, of rays in y = 0."""
+    """Return polylines (rays, points, 3) in mm, from the source via each surface to the plane; rays start in y = 0."""
     half = clear_window(source, lens).width / 2
     x = torch.linspace(-0.98 * half, 0.98 * half, FAN_RAYS, dtype=torch.float64)
     return _polylines(source.rays(x, torch.zeros_like(x), lens.entrance.z, 1.0), lens, plane)[0]
 
 
 def bundle(source: Emitter, lens: Lens, plane: Receiver, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return polylines (rays, points, 3) in mm of rays through n x n cells of the beam, and flux (rays,) on arrival.
+    """Return polylines (rays, points, 3) in mm of rays, one per cell of n x n cells of the beam, and flux on arrival.
 
     Each ray starts with the flux of its cell; the total flux of the source is 1.  Rays that do not arrive are omitted.
     """
@@ -85,9 +85,9 @@ def ray_map(source: Emitter, lens: Lens, plane: Receiver) -> tuple[np.ndarray, n
 # --- clear apertures needed -------------------------------------------------------------------------------------------
 
 NEEDED_RAYS = 513  # rays per side for `needed_apertures`
-ROUND_RATIO = 1.01  # largest radius / smaller half side of a patch of light that counts as round
+ROUND_RATIO = 1.01  # largest ratio of radius to smaller half side at which a patch of light counts as round
 EXTENT_POINTS = tuple((u, v) for u in (-1, 0, 1) for v in (-1, 0, 1))  # points of an extended source, in half extents
-FULL_APERTURE = 0.99  # smallest extent of the light / clear aperture at which light fills the face
+FULL_APERTURE = 0.99  # smallest ratio of the extent of the light to the clear aperture at which light fills the face
 
 
 def needed_apertures(source: Emitter, lens: Lens) -> dict[str, Outline | None]:
@@ -117,7 +117,7 @@ def _hits(source: Emitter, lens: Lens) -> Tensor:
 
 
 def _aperture(hits: Tensor, aperture: Outline) -> Outline | None:
-    """Return the smallest outline that contains points (2, n) of a face; None if they fill its clear aperture."""
+    """Return the smallest outline that contains points (2, n) of a face; None if they fill its clear `aperture`."""
     if not hits.numel():
         return Circle(0.0)
     half_x, half_y = (float(part.abs().max()) for part in hits)
@@ -135,8 +135,8 @@ def _aperture(hits: Tensor, aperture: Outline) -> Outline | None:
 def rrmsd_of_ripple(channel: Channel, lens: Lens, screen: Screen, face: Literal["front", "back"]) -> float:
     """Return the RRMSD between the pictures of a lens with and without the ripple of a face; 0 without a ripple.
 
-    channel: light of one point of the source.  `Ripple.heights` fade towards the rim; the RRMSD, which is proportional
-    to small heights, is divided by `Ripple.fading`.
+    channel: light of one point of the source.  The ripple that is removed (`Ripple.heights`) fades towards the rim; so
+    the RRMSD, which is proportional to small heights, is divided by `Ripple.fading`.
     """
     net = getattr(lens, face)
     waves = ripple(net)
@@ -150,7 +150,7 @@ def rrmsd_of_ripple(channel: Channel, lens: Lens, screen: Screen, face: Literal[
 
 # --- light blocked by a mount -----------------------------------------------------------------------------------------
 
-MOUNT_RAYS = 512  # rays per side, divided among the channels
+MOUNT_RAYS = 512  # rays per side for `mount_losses`; each of c channels gets MOUNT_RAYS / √c
 MIN_MOUNT_RAYS = 48  # smallest number of rays per side for one channel
 
 
@@ -184,7 +184,10 @@ def mount_losses(lens: Lens, channels: Sequence[Channel], flange: tuple[float, f
 
 
 def _misses_opening(rays: Sequence[Rays], rim: Outline, planes: Iterable[float]) -> Tensor:
-    """Return True for rays that cross one of the planes outside the rim, before the first face or behind the last."""
+    """Return True for rays that cross a plane z = const outside the rim, before the first face or behind the last.
+
+    rays: those before the solid, then those behind each of its faces.  planes: their z (mm).
+    """
     first, (coming, *_, leaving) = rays[1], rays
     outside = torch.zeros_like(leaving.alive)
     for z in planes:
@@ -203,7 +206,7 @@ MARGIN_RAYS = 512  # rays per side for `margins`
 
 @dataclass(frozen=True)
 class Margins:
-    """Worst cases of a trace over all rays that carry light to the faces from the first net on."""
+    """Worst cases of a trace through the faces from the first control net on, among all rays that carry light."""
 
     tir_margin_deg: float | None  # critical angle minus angle of incidence (degrees), < 0: reflected; None: no ray
     newton_slope_min: float | None  # smallest |F'(t)| from the first net on, Newton's divisor; 0: grazing; None: no ray
@@ -214,8 +217,9 @@ class Margins:
 def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, n: int = MARGIN_RAYS) -> Margins:
     """Return the margins over n x n stratified rays per spectral line, shared among the points of an extended source.
 
-    cos θ = (d_z - d_x z_x - d_y z_y) / sqrt(1 + z_x² + z_y²) where light leaves the glass; total internal reflection at
-    sin θ = 1 / index.  At faces from the first net on F(t) = z - sag(x, y) at path t, F' = d_z - d_x z_x - d_y z_y.
+    Where light of direction d leaves the glass, cos θ = (d_z - d_x z_x - d_y z_y) / sqrt(1 + z_x² + z_y²) for its angle
+    of incidence θ; it is totally reflected if sin θ > 1 / index.  The path t to a face solves F(t) = z - sag(x, y) = 0,
+    by Newton's method with F' = d_z - d_x z_x - d_y z_y.
     """
     margin, slope, n = math.inf, math.inf, math.ceil(n / math.sqrt(points_per_line(channels)))
     wrong = sum(int((~torch.isfinite(net.heights)).sum()) for net in lens.nets)
@@ -243,8 +247,8 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
 
 # --- blur by an extended source ---------------------------------------------------------------------------------------
 
-MIN_DISTANCE_RATIO = 2.5  # smallest suggested distance / longest side of lens and picture (plate: side / 10 thick)
-MAX_NEARER_RATIO = 0.9  # largest reported ratio of the finest detail on a nearer target to the one on the target
+MIN_DISTANCE_RATIO = 2.5  # smallest suggested ratio of a target's distance to the longest side of lens and picture
+MAX_NEARER_RATIO = 0.9  # largest ratio of finest details, on a nearer target / on the target, that is reported
 
 
 @dataclass(frozen=True)
@@ -266,7 +270,7 @@ def blur(
 ) -> Blur | None:
     """Return the blur of the picture by the extent of the source, at the first spectral line of the channels.
 
-    None for a point source, and if none of the light passes the lens.
+    n: points per side of the back for which images are computed.  None for a point source, and if no light passes.
     """
     if points_per_line(channels) == 1:
         return None
@@ -299,7 +303,7 @@ class FinestDetail:
 
 
 def finest_detail(source_image: float, lens: Lens, screen: Screen, of: str, assumed: bool = False) -> FinestDetail:
-    """Return the finest detail on a target where the image of the source (size: `of`) is `source_image` pixels wide."""
+    """Return the finest detail on a target; source_image: diameter (pixels); of, assumed: as in FinestDetail."""
     distance, pixel = abs(image_from_lens(lens, screen).throw(lens.back.z)), _pixel(screen)
     grows = distance == abs(per_radian(lens, screen))  # False for an image over angles, which keeps its width
     sizes = (*(2 * half for half in lens.outline.half_extent), *(high - low for low, high in (screen.x, screen.y)))

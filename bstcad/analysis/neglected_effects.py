@@ -47,7 +47,7 @@ HALF_SHARP_WIDTH = 1.3  # width of a control cell's light (pixels) at which edge
 MAX_SHARPNESS = 0.75  # fraction of the jump at an edge that the finest cells reproduce, measured
 MAX_SAMPLED_PIXELS = 1 << 19  # largest number of sampled pixels: of a larger picture only some rows are used
 PADDING = 4  # dark pixels around a picture, within which the ringing of its spline ends
-AIRY_SIGMA = 0.376  # standard deviation of the Gaussian with the FWHM of a diffraction image, in λ L / D
+AIRY_SIGMA = 0.376  # standard deviation of the Gaussian with the FWHM of a point's image, in units of λ L / D
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Light of one channel through a lens onto a picture, without the effect."""
+    """Light of one channel through a lens, and the picture on the target, without the effect."""
 
     lens: Lens  # lens that the light passes
     channel: Channel  # light without the effect
@@ -143,7 +143,7 @@ class Reference:
         return np.where(known, field, field[known].mean() if known.any() else values.mean())
 
     def _landing(self, amount: np.ndarray, pixel: np.ndarray | None = None) -> np.ndarray:
-        """Sum an amount (n, n) over the light that lands (at `pixel`) in each cell of the target, (rows, columns)."""
+        """Sum `amount` (n, n) of the light that lands at `pixel` (None: `self.pixel`), by cells (rows, columns)."""
         shape, cells = self.screen.shape, tuple(min(FIELD_CELLS, side) for side in self.screen.shape)
         pixel = self.pixel if pixel is None else pixel
         row, column = (np.floor(p / side * count) for p, side, count in zip(pixel[::-1], shape, cells, strict=True))
@@ -164,7 +164,7 @@ class Reference:
 
     @torch.no_grad()
     def ghost(self, channel: Channel) -> Change | None:
-        """Return the change by light reflected twice inside the lens; channel: one with losses at the faces."""
+        """Return the change by light reflected twice inside the lens; channel: light with losses at the faces."""
         if not self.lit:
             return None
         lens, source = channel.through(self.lens), channel.source
@@ -221,9 +221,9 @@ class Spline:
         return picture[self.chosen]
 
     def moved(self, shift: np.ndarray) -> np.ndarray:
-        """Return the sampled rows of the picture after its light is moved by `shift` (2, …) pixels, per cell.
+        """Return the sampled rows of the picture after its light is moved.  Light that leaves the picture is lost.
 
-        Light that leaves the picture is lost.
+        shift: (2, rows, columns), pixels to the right and downwards, for each cell of the target.
         """
         picture = self.padded[PADDING:-PADDING, PADDING:-PADDING]
         if not np.abs(shift).max() > MIN_LIGHT_SHIFT:
@@ -266,7 +266,7 @@ def difference(changed: np.ndarray, before: np.ndarray) -> float:
 def _trace_through(
     lens: Lens, channel: Channel, screen: Screen, points: tuple[Tensor, Tensor]
 ) -> tuple[Landed, Tensor]:
-    """Trace light through points of the last face; return (landed rays of flux 1 before losses, flux density)."""
+    """Trace light through a grid of points of the last face; return (rays of flux 1 before losses, flux per cell)."""
     lens, source = channel.through(lens), channel.source
     p, q, _ = rays_to(source, lens, *points)
     rays = source.rays(p, q, lens.entrance.z, 1.0)

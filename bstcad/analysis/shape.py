@@ -23,17 +23,17 @@ from bstcad.optics.sampling import sample_rim
 
 GRID_POINTS = 1025  # points per side of the grid for thickness, and along a quarter of the rim
 HEIGHT_ROUNDING = 1e-13  # rounding of the heights, relative to the largest height
-SMOOTH_RATIO = 2.0  # largest slope energy of the highest octave / octave below it, for a net without ripple
-AT_BOUND = 0.97  # fraction of a bound above which a point counts as at the bound (the penalty begins at 0.99)
+SMOOTH_RATIO = 2.0  # largest ratio of slope energies, highest octave / octave below it, of a net without ripple
+AT_BOUND = 0.97  # fraction of a bound on curvature or slope above which a point counts as at the bound
 MIN_CURVATURE, MAX_RADIUS = 1e-9, 1e9  # curvature (1/mm) below which a face is flat; its radius then (mm)
-OUTLINE_ROUNDING = 1e-9  # relative rounding of the outline, so that the last points of a net that ends there are inside
+OUTLINE_ROUNDING = 1e-9  # fraction by which the outline is widened, so that points on it are inside despite rounding
 
 
 def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
-    """Return thickness, sag range, slope, radii, departure from the best sphere, slope energy and ripple of the back.
+    """Return the thickness of a lens, and sag range, slope, radii, departure from a sphere and ripple of the back.
 
-    A radius is None if the back has no such curvature.  Keys front_… describe a tailored front, seen from outside as
-    the back is: valleys are concave.
+    grid: points per side.  A radius is None if the back has no such curvature.  Keys front_… describe a tailored front,
+    which is seen from outside, as the back is: valleys are concave.
     """
     x, y = _points(lens.outline, grid)
     front, back = _sags(lens, x, y)
@@ -129,8 +129,8 @@ def ripple(face: BSplineSurface) -> Ripple:
 
     The octaves are computed from the net minus its best cubic polynomial, times a Hann window (sin² from rim to rim).
     (Without the window the kink of a smooth net along its rim may give the highest octave some hundred µrad.)  With E
-    the slope energy of the highest octave and E' that of the octave below, the fraction 1 - SMOOTH_RATIO E' / E is the
-    ripple.  Mean squares over the face follow from overlaps of the basis functions of degree 2 and of their slopes.
+    the slope energy of the highest octave and E' that of the octave below, that of the ripple is E - SMOOTH_RATIO E'.
+    Mean squares over the face follow from overlaps of the basis functions of degree 2 and of their slopes.
     """
     fading = np.outer(*(np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2 for count in face.shape))
     rest = _without_cubic(face)

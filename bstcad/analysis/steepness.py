@@ -24,7 +24,7 @@ from bstcad.optics.tubes import rays_to
 from bstcad.optics.unfolding import image_screen
 
 MAX_SLOPE_DEG = 70.0  # largest slope angle that tailoring makes (degrees); its tangent is optics.reach.MAX_SLOPE
-MAX_POINTS_PER_SIDE = 65  # largest number of points of the target per side
+MAX_POINTS_PER_SIDE = 65  # largest number of points of the target, per side, for which the slope is computed
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,10 @@ class Steepness:
 def needed_steepness(
     source: Emitter, lens: Lens, goal: Goal, x: np.ndarray, y: np.ndarray, origins: np.ndarray, at_back: bool = True
 ) -> Steepness:
-    """Return the steepness for light through the points `origins` of the face to the points x, y of the goal.
+    """Return the steepness for light through the points `origins` to the points x, y of the goal.
 
-    x (c,), y (r,): coordinates on the receiver, in its unit.  origins: (c, r, 2), x and y (mm) of points of the face;
-    at_back False: of the plane through the first vertex.
+    x (c,), y (r,): coordinates on the receiver, in its unit.  origins: (c, r, 2), x and y (mm) of points of the last
+    tailored face or, if not at_back, of the plane through the first vertex.
     """
     screen, number, lens = image_screen(lens, goal.receiver), lens.freeform[-1], lens.plain()
     i, j = (np.unique(np.linspace(0, n - 1, min(n, MAX_POINTS_PER_SIDE)).round().astype(int)) for n in (len(x), len(y)))
@@ -71,7 +71,7 @@ def needed_steepness(
 
 
 def _at_corners(picture: np.ndarray, screen: Screen, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the minimum of the pixels around each corner at x, y, (c, r): zero on the rim of the light."""
+    """Return the least of the four pixels around each pixel corner at x, y, as (c, r): zero on the rim of the light."""
     around = np.pad(picture[::-1].T, 1)  # x first, y upwards
     least = np.minimum.reduce([around[1:, 1:], around[1:, :-1], around[:-1, 1:], around[:-1, :-1]])
     per_x, per_y = screen.per_unit

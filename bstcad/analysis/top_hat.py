@@ -21,8 +21,8 @@ U_P = ΔE / E_max                                 plateau uniformity, ΔE the fu
 s_ηε = (A_ε - A_η) / A_ε, ε < η                  edge steepness: 0 if vertical
 efficiency                                       fraction of all light inside the outline; not in the standard
 
-At η = 0.9 the flatness is at least 0.9 and, except for pixels brighter than E_max, the uniformity at most 0.06.  Read
-them with the fractional power, or at a lower η.  Hot pixels count in powers, averages and uniformity.
+At η = 0.9 any beam has a flatness of at least 0.9 and, except for pixels brighter than E_max, a uniformity of at most
+0.06, so read them with the fractional power, or at a lower η.  Hot pixels count in powers, averages and uniformity.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ def top_hat(
     """Return the figures of a picture (rows, columns): irradiance, or flux per pixel, on any scale.
 
     pixel: width and height of a pixel (mm).  wanted: fraction of each pixel inside the outline, (rows, columns), for
-    the efficiency Σ wanted E / Σ E times on_picture, the fraction of all light in the picture.  Noise of mean zero may
-    make pixels negative.  Raises ValueError if a value is not finite, without light, or unless 0 < epsilon < eta < 1.
+    the efficiency on_picture Σ wanted E / Σ E; on_picture: fraction of all light that is in the picture.  Noise of mean
+    zero may make pixels negative.  ValueError if a value is not finite, without light, or unless 0 < epsilon < eta < 1.
     """
     if not 0 < epsilon < eta < 1:
         raise ValueError(f"epsilon = {epsilon:g} and eta = {eta:g} are not possible levels; give 0 < epsilon < eta < 1")

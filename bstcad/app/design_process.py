@@ -3,7 +3,7 @@
 python -m bstcad.app.design_process FOLDER DESIGN [--resume] does the job of FOLDER/job.json for the design in the
 folder DESIGN.  The process writes into FOLDER what the page shows: progress, light of the best lens, and state.
 SIGINT ends a design with the best lens so far; SIGTERM ends it at once with a checkpoint.  After SIGTERM or SIGKILL,
-`--resume` continues to the same lens, to the last bit.
+`--resume` ends with the lens of an uninterrupted design, to the last bit.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PROGRESS, LIGHT, STATE = "progress.jsonl", "light.png", "state.json"  # output f
 MAX_JOB_SIZE = 1_000_000  # largest size of job.json (bytes)
 MAX_PICTURE_SIDE = 512  # largest length of the longer side of the picture of the light (pixels)
 TUBES_PER_SIDE = 521  # flux tubes per side for the picture of the light; fewer for an extended source
-MIN_INTERVAL = 2.0  # shortest time (s) between two pictures, or, in a trade-off, lines of progress with equal text
+MIN_INTERVAL = 2.0  # shortest time (s) between two pictures; in a trade-off, also between equal lines of progress
 MAX_TIME_FRACTION = 0.03  # largest fraction of the run's time that the pictures may take
 SOURCE_POINTS = 16  # points that represent an extended source in the picture
 

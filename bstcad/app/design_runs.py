@@ -29,7 +29,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 
 DESIGN = "design"  # kind of a run that designs a lens; the other kinds work on a finished design
-MAX_PROGRESS_SIZE = 50_000_000  # largest size (bytes) of a run's file that is read
+MAX_PROGRESS_SIZE = 50_000_000  # largest size (bytes) of any file of a run that is read; the progress is the longest
 SCENE_TEXT = "written.toml"  # file of a run: the text of the scene on the page, with its comments
 ENDING_TIMEOUT = 1.0  # time (s) that an ending server waits for its runs; a slow run still writes its checkpoint later
 START_TIMEOUT = 30.0  # time (s) in which the process of a run has to start

@@ -20,7 +20,7 @@ from bstcad.app.scene_text import changed, is_same, tables
 from bstcad.app.words import typed
 from bstcad.runs.files import SentenceError
 
-SHAPES = {"lens.outline": "source.aperture"}  # outline: the outline that follows it while the two are equal
+SHAPES = {"lens.outline": "source.aperture"}  # table of an outline: table that follows it while the two are equal
 BACK_PLANE = "lens.back.z"  # key of the plane from which targets keep their distance
 WIDTHS = {  # key of the beam's width, by (kind of the source, profile)
     ("collimated", "gaussian"): "radius_1e2",
@@ -107,7 +107,7 @@ def _profile_widths(data: Mapping[str, Any], profile: Any) -> dict[str, Any]:
 
 
 def _width(data: Mapping[str, Any], source: Mapping[str, Any], name: str) -> float | None:
-    """Return the width of a beam that fills the lens: a radius (mm), or the half angle to the corners (degrees)."""
+    """Return the beam width that fills the lens: radius (mm) or half angle to the corners (degrees); None: unknown."""
     sizes = extent(table_at("lens.outline", data))
     if sizes is None:
         return None

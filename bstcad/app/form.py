@@ -1,6 +1,6 @@
 """The form of a scene, as records and as HTML: a field for each key that the schema allows in its tables.
 
-A table that the scene lacks, such as a wavefront or a second target, is an addition: a button that adds the table.
+For a table that the scene lacks, such as a wavefront or a second target, there is an addition: a button that adds it.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ ADDITIONS = {  # labels of buttons that add a table, by key
     "effects": "Add an effect (losses, ghosts)", "tolerance": "Add a tolerance",
 }  # fmt: skip
 LOCKED_SIDES = {"x": "y", "y": "x", "width": "height", "height": "width"}  # side: the other side, which a lock changes
-OPTIONAL_TABLES = ("mount",)  # tables without a required key that a button adds; other such tables are always shown
+OPTIONAL_TABLES = ("mount",)  # tables that a button adds, though no key in them is required; others are always shown
 MAX_TABLES = 1000  # largest number of tables in a list, if the schema states no number
 MIN_STEPS = 100  # smallest number of steps of a slider
 STEP_DIGITS = (5, 2, 1)  # possible first digits of a slider's step; its other digits are 0
@@ -203,7 +203,7 @@ def _without(group: Group, taken: set[str]) -> Group:
 
 
 def _group(key: str, node: Node, table: Table, data: Table, removable: bool = False) -> Group:
-    """Return the group of the table at a key; if the table states no known kind, only the field of the kind."""
+    """Return the group of `table`, at `key` in `data`; if it states no known kind, only with the field of the kind."""
     union = records_at(key, data)
     kinds = matching_records(union, table)
     tag, nodes = tags(union[0]), kinds[0]["properties"]
@@ -322,7 +322,7 @@ class Slider:
 
 
 def slider(field: Field) -> Slider | None:
-    """Return a slider from half to twice a field's number or the width of its pair; None without number or limits."""
+    """Return a slider from half to twice a field's number, or its pair's width; None without number or limits."""
     words, middle = field.value or field.default or field.example, ""
     value = number(words) if field.control == "number" else None
     if field.control == "pair":

@@ -115,8 +115,8 @@ def _refusal(why: str, code: int) -> Response:
 def _redirect(path: str, from_own: bool) -> Response:
     """Return an answer that leads to the same page without the token in its address.
 
-    Browsers count a redirect as a request of the page with the link.  If this page is foreign, such as a terminal in a
-    browser, they omit the strict cookie; then, a page of this server leads to the address instead.
+    Browsers count a redirect as a request of the page with the link.  If this page is foreign (not from_own), such as a
+    terminal in a browser, they omit the strict cookie; then, a page of this server leads to the address instead.
     """
     address = quote("/" + path.lstrip("/"))  # //name would be another server; `quote` leaves no quotation mark
     if from_own:

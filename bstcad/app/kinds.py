@@ -79,7 +79,7 @@ def kinds_at(key: str, data: Table) -> list[Any]:
 
 
 def matching_records(union: list[Node], table: Table) -> list[Node]:
-    """Return the records of a union that match the table's tag; the whole union if none does."""
+    """Return those records (possible tables) of a union that have the kind stated in `table`; all if none has it."""
     chosen = [record for record in union if tags(record) and tags(record).items() <= _hashable(table).items()]
     return chosen or union
 
@@ -142,7 +142,10 @@ def _hashable(table: Table) -> dict[str, str]:
 
 
 def convert_table(key: str, tag: Mapping[str, str], data: Table) -> dict[str, Any]:
-    """Return the table at a key as a table of kind `tag`: common keys stay, others go, and required keys are added."""
+    """Return the table at a key with another kind, which `tag` states, such as {"kind": "point"}.
+
+    Keys that both kinds have stay, others are removed, and required keys are added.
+    """
     union, old = records_at(key, data), table_at(key, data)
     chosen = next((record for record in union if tag.items() <= tags(record).items()), None)
     if chosen is None:  # no such kind
@@ -190,7 +193,7 @@ def new_table(key: str, data: Table) -> dict[str, Any]:
 
 
 def _completed(key: str, record: Node, common: Table, data: Table) -> dict[str, Any]:
-    """Return a table of a record, in the schema's order: its tag, the keys in `common`, and its required keys."""
+    """Return a table of a record, in the schema's order: keys of its kind, keys in `common`, and required keys."""
     needed = {*record.get("required", ())}
     options = [option["required"] for option in record.get("oneOf", ())]  # for a circle: radius, or diameter
     if options and not any(name in common for option in options for name in option):

@@ -26,7 +26,7 @@ from bstcad.sweep.plan import plan
 
 STAGES = ("preview", "settled", "effects", "predicted")  # names of the answers to a request, in their order
 MAX_PAGES = 32  # largest number of pages with a stored request
-IDLE_DELAY = 0.7  # pause (s) between a preview and the next of STAGES, in case another change comes
+IDLE_DELAY = 0.7  # pause (s) after the first preview of a request, in case another change comes
 JOIN_TIMEOUT = 0.5  # time (s) in which the thread has to end
 PAGE_TIMEOUT = 60.0  # time (s) after a page's last poll until the thread stops working for it, up to its next poll
 
@@ -149,7 +149,7 @@ class PreviewDesk:
             self._news.notify_all()
 
     def _make(self, request: PreviewRequest, stage: str) -> Any:
-        """Return the answer of a stage: a preview, or entries of `plan --json`; effects also state the chosen `net`.
+        """Return the answer of a stage: a preview, or entries of `plan --json` (for "effects", with the chosen `net`).
 
         Outdated once the request is replaced or another one has fewer answers.
         """

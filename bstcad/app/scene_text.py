@@ -42,12 +42,12 @@ def tables(text: str) -> dict[str, Any]:
     """Return the tables of a scene's text."""
     found = scene_file.tables(text, Path("the text"))
     if _has_huge(found):
-        raise SceneError("the text: contains a number of over 300 digits; shorten it")
+        raise SceneError("the text contains a number of over 300 digits; shorten it")
     return found
 
 
 def _has_huge(value: Any) -> bool:
-    """Return True if the value contains an integer that is too large for a float."""
+    """Return True if the value contains an integer of more than 300 digits."""
     if isinstance(value, dict | list):
         return any(map(_has_huge, value.values() if isinstance(value, dict) else value))
     return isinstance(value, int) and abs(value) >= 10**300
@@ -57,7 +57,6 @@ def changed(text: str, key: str, value: Any) -> str:
     """Return the text with another value of a dotted key, as `dotted_keys.override` sets it; None removes the key.
 
     A value may come from JSON: 20 is written as 20.0 if the schema has a float.
-
     With another kind (source.kind, lens.outline.shape) the table is converted: keys with the same meaning in both kinds
     stay, other keys are removed, and missing keys are added with values that fit the scene.  A key or table is removed
     with its comments: after it on the line, on the lines below in the same column, and inside the table.
@@ -174,7 +173,7 @@ def _names(lines: str) -> tuple[str, ...]:
 
 
 def _read(lines: str) -> tuple[tuple[str, ...], Item]:
-    """Return the names of a key or a header, such as lens, back, z, and its item of tomlkit."""
+    """Return the names of a key or a header, such as lens, back, z, and its item as tomlkit reads it."""
     node: Any = tomlkit.parse(lines)
     names: list[str] = []
     while isinstance(node, tomlkit.TOMLDocument) or (isinstance(node, Table) and len(node)):
@@ -234,7 +233,7 @@ def _update(found: list[Piece], path: KeyPath, before: Any, after: Any) -> list[
 def _update_table(
     found: list[Piece], path: KeyPath, before: Mapping[str, Any], after: Mapping[str, Any]
 ) -> list[Piece]:
-    """Replace a table; new keys are put at the first removed key, or else at their position in the schema."""
+    """Change a table key by key; new keys are put in place of the first removed key, or else in the schema's order."""
     gone = [name for name in before if name not in after]
     for name, value in after.items():
         if name in before:
@@ -247,7 +246,7 @@ def _update_table(
 
 
 def _update_list(found: list[Piece], path: KeyPath, before: Sequence[Any], after: Sequence[Any]) -> list[Piece]:
-    """Replace a list of tables that have headers: tables change, one table is removed, or tables are appended."""
+    """Change a list of tables that have headers: tables change, one table is removed, or tables are appended."""
     k = next(
         (k for k, (one, other) in enumerate(zip(before, after, strict=False)) if not is_same(one, other)), len(after)
     )

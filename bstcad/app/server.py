@@ -131,12 +131,10 @@ class Workbench:
         return self._sentence_answer(request, f"{name}{error.strerror or type(error).__name__}; {remedy}", 400)
 
     def _note_disconnect(self, request: Request, error: Exception) -> Response:
-        """Report in the terminal that the client disconnected before its request was complete."""
         print(f"bstcad: {request.url.path}: the browser cancelled this request; nothing was done", file=sys.stderr)
         return Response(status_code=400)
 
     def _report_fault(self, request: Request, error: Exception) -> Response:
-        """Report a fault of bstcad: a sentence on the page, the traceback in the terminal."""
         traceback.print_exception(error)
         words = f"{type(error).__name__}: {files.first_line(error)}"
         return self._sentence_answer(request, f"{words}; see the terminal of the workbench for the traceback", 500)

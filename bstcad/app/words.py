@@ -28,8 +28,9 @@ from bstcad.scene.schema import Node, records
 BARE = re.compile(r"[A-Za-z0-9_-]+")  # name that TOML allows without quotes
 MAX_DIGITS = 300  # largest length of a number (characters)
 SPACES = re.compile(r"(?<=\d)[ \u00a0\u2009\u202f'’_](?=\d{3}(?!\d))")  # separators of thousands, before three digits
-THOUSANDS = {mark: re.compile(rf"[+-]?\d{{1,3}}(\{mark}\d{{3}})+") for mark in ",."}  # integer: 1.000.000, by separator
-DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")  # number with a decimal point
+# Integers such as 1.000.000, by their separator of thousands
+THOUSANDS = {mark: re.compile(rf"[+-]?\d{{1,3}}(\{mark}\d{{3}})+") for mark in ",."}
+DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")  # number, with a decimal point or without
 BOOLEAN_WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 
 

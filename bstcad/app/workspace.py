@@ -28,7 +28,7 @@ from bstcad.scene.schema import contents
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")  # name of a scene or a design: no path, no hidden file
 PICTURES = "pictures"  # folder of uploads, beside the scenes
-UNSAVED = "unsaved"  # kind of the hidden file with unsaved changes
+UNSAVED = "unsaved"  # ending of the hidden file with unsaved changes
 LARGEST_UPLOAD = 100_000_000  # largest size of a picture or of measured points (bytes)
 DESIGN_FILES = ("report.json", "design.npz")  # files by which a design's folder is recognised
 
@@ -362,7 +362,7 @@ def _encoded(name: str, text: str) -> bytes:
     try:
         return text.encode()
     except UnicodeEncodeError:
-        raise SceneError(f"{name}: contains half a character (a lone surrogate); delete it") from None
+        raise SceneError(f"{name}: contains half a character (a lone surrogate); delete this character") from None
 
 
 def _with_unix_ends(text: str) -> str:

@@ -75,7 +75,7 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
     """Return the lens whose back is the net through the points of the map.
 
     The initial point lies on the ray through the centre of the first surface, in the plane of the back.  If the back
-    would come too near to the front, the integration is repeated from an initial point further along +z.
+    would come too near to the front, the integration is repeated from a point further along +z.  first: as in `march`.
     """
     knobs, screen = task.knobs, task.goals[0].receiver
     source, exact, z = task.heaviest.source, lens.plain(), lens.back.z
@@ -138,7 +138,7 @@ class _Grid:
 
     @classmethod
     def of(cls, coming: Rays, aim: Tensor, z: float) -> _Grid:
-        """Return the grid of rays on the way to the face; the values of a lost ray are arbitrary but finite."""
+        """Return the grid of the rays; z: plane (mm) of the initial point.  Lost rays get arbitrary finite values."""
         alive = coming.alive
         straight = torch.tensor([0.0, 0.0, coming.sense]).to(aim).view(3, 1, 1)
         direction = torch.where(alive, coming.direction, straight)
@@ -151,7 +151,6 @@ class _Grid:
         return self._mapped(lambda t: t[(..., *where)])
 
     def transposed(self) -> _Grid:
-        """Return the grid with rays and lines exchanged."""
         return self._mapped(_transposed)
 
     def _mapped(self, change: Callable[[Tensor], Tensor]) -> _Grid:

@@ -114,7 +114,7 @@ def transport(task: Task, lens: Lens) -> Mapping:
 
 
 def tent_average(target: Tensor) -> Tensor:
-    """Return what tent binning makes of a picture, constant in each pixel: the filter [1, 6, 1] / 8 along each axis.
+    """Return what tent binning makes of a picture that is constant in each pixel: filter [1, 6, 1] / 8 along each axis.
 
     Compared with this result, not with the sharp picture, the picture of a perfect lens has merit zero.
     """
@@ -190,7 +190,7 @@ def random_bundles(channels: tuple[Channel, ...], lens: Lens, count: int, seed: 
 
 
 def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = ()) -> Lens:
-    """Return the lens with new values of (heights, free parameters of the front in the order of `free`)."""
+    """Return the lens with new parameters: heights of the back, then parameters of the front in the order of `free`."""
     heights, *shape = parameters
     front = lens.front.with_parameters(**dict(zip(free, shape, strict=True)))
     return lens.with_front(front).with_back(lens.back.with_parameters(heights=heights))

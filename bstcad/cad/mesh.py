@@ -161,8 +161,8 @@ def _has_plane_front(lens: Lens) -> bool:
 def fit_mesh(lens: Lens, tolerance: float, max_triangles: int | None = None) -> tuple[int, Mesh]:
     """Return nearly the smallest number of cells per side that meets a chordal tolerance (mm), and the mesh.
 
-    If `max_triangles` (None: DEFAULT_MAX_TRIANGLES) do not suffice, the finest mesh with at most this number of
-    triangles, and at most DEFAULT_MAX_TRIANGLES, is returned.
+    If `max_triangles` (None: DEFAULT_MAX_TRIANGLES) do not suffice, the mesh is the finest with at most that many
+    triangles, or at most DEFAULT_MAX_TRIANGLES if this is fewer.
     """
     allowed = DEFAULT_MAX_TRIANGLES if max_triangles is None else max_triangles
     cells, last, goal = MIN_MESH_CELLS, max_cells(lens, allowed), chordal_error_goal(lens, tolerance)
@@ -285,7 +285,7 @@ class FaceNumbers(NamedTuple):
 
 @njit(inline="always")
 def _basis(u, m):
-    """Return (k, B_k, B_{k+1}, B_{k+2}) at u (pitches), m control points: bspline.basis, as numba caches per file."""
+    """Return (k, B_k, B_{k+1}, B_{k+2}) at u (pitches), m control points: bspline.basis, copied for numba's cache."""
     if u < 1.5:
         k, s = 0, 2.0 - math.sqrt(4.0 - 2.0 * u)
     elif u > m - 2.5:
@@ -300,7 +300,6 @@ def _basis(u, m):
 
 @njit(inline="always")
 def _sag(face, x, y):
-    """Return z (mm) of a face at (x, y)."""
     net = face.net
     m, n = net.shape
     if m == 0:
@@ -334,7 +333,7 @@ def _chordal_error(vertices, faces, max_parts, radius, back, front):
 
     A triangle whose unit normal has |z| <= WALL_NORMAL_Z belongs to the wall: a cylinder of the given radius, or planes
     (radius 0).  Edges and interior of a triangle on a face are sampled in two steps per `Surface.detail`, with at most
-    2 * max_parts steps per edge; of a triangle on a round wall, only the middles of its edges are.
+    2 * max_parts steps per edge.  On a round wall only the middles of the edges are sampled.
     """
     worst = 0.0
     for k in range(len(faces)):

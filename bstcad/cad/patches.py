@@ -77,8 +77,8 @@ def _check_round(surface: BSplineSurface, radius: float) -> None:
     reach = min(-x0, x1, -y0, y1) - 1.5 * dx  # the end spans, where x(u) is quadratic, are 1.5 pitches wide
     if radius > reach + 1e-9 * dx:
         raise ValueError(
-            f"lens: x(u) of the net is linear only up to {reach:g} mm, which is inside the rim at {radius:g} mm; "
-            "extend the net to two spans beyond the rim"
+            f"lens: the net extends to {reach + 1.5 * dx:g} mm, less than 1.5 control-point spacings beyond the rim at "
+            f"{radius:g} mm; extend it to two spacings beyond the rim"
         )
 
 
@@ -100,9 +100,9 @@ def level_patch(z: float) -> Patch:
 def _sphere_patch(front: Sphere, outline: Outline) -> Patch:
     """Return a sphere with polar axis ±x and u = π at the vertex, so that no pole (x = ±R) or seam is on the patch.
 
-    With s = sign(c): x = s R sin v, y = -R cos v sin u, z - z_centre = s R cos v cos u; normal away from the centre.
-    With a centre 10⁵ mm away, digits would be lost.  Such a sphere is written as the parabola z0 + c r²/2 if it
-    deviates from the parabola by c³ r⁴/8 < PARABOLA_TOLERANCE.
+    With s = sign(c) and R = 1/|c| for curvature c, x = s R sin v, y = -R cos v sin u, z - z_centre = s R cos v cos u.
+    The normal points away from the centre.  With a centre 10⁵ mm away, digits would be lost.  Such a sphere is written
+    as the parabola z0 + c r²/2 if it deviates from the parabola, at the rim r, by c³ r⁴/8 < PARABOLA_TOLERANCE.
     """
     (c, _), r = front.conic(), float(np.hypot(*outline.farthest))
     if abs(c) * r >= 1:
@@ -124,9 +124,10 @@ def _sphere_patch(front: Sphere, outline: Outline) -> Patch:
 def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]:
     """Return poles (3, 3, 3) in mm and weights (3, 3) of a conic for |u| <= a, |v| <= b (mm).
 
-    With K = (1 + k) c², w = 1 + K (u² + v²) / 4: x = u / w, y = v / w, z = z0 + c/2 (u² + v²) / w.  Since w x, w y, w z
-    and w are quadratic in u and v, a rational patch of degree 2 x 2 is exactly the conic; (u, v) is the projection
-    of (x, y, z) from the conic's far vertex onto the plane z = z0.  The blossom of u² on [-a, a] is a² (1, -1, 1).
+    With curvature c, conic constant k, K = (1 + k) c² and w = 1 + K (u² + v²) / 4, the conic has x = u / w, y = v / w,
+    z = z0 + c/2 (u² + v²) / w.  Since w x, w y, w z and w are quadratic in u and v, a rational patch of degree 2 x 2 is
+    exactly the conic; (u, v) is the projection of (x, y, z) from the conic's far vertex onto the plane z = z0.  The
+    blossom of u² on [-a, a] is a² (1, -1, 1).
     """
     ends, blossom = np.array([-1.0, 0.0, 1.0]), np.array([1.0, -1.0, 1.0])
     square = a * a * blossom[:, None] + b * b * blossom[None, :]
@@ -301,4 +302,4 @@ def _surface_of(own: bytes) -> Geom_BSplineSurface:
 
 _PLACEHOLDER_NET = (np.zeros((2, 2, 3)), *[np.array([0.0, 0.0, 1.0, 1.0])] * 2)  # control net and knot vectors
 _PLACEHOLDER_FILE = to_bytes(_face_on(bspline_surface(*_PLACEHOLDER_NET)))
-SURFACE_OFFSET = _PLACEHOLDER_FILE.index(surface_bytes(*_PLACEHOLDER_NET))  # offset (bytes) in a face's file
+SURFACE_OFFSET = _PLACEHOLDER_FILE.index(surface_bytes(*_PLACEHOLDER_NET))  # offset (bytes) of a face's surface

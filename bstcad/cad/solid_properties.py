@@ -54,7 +54,7 @@ class WholePart:
 
 
 def whole_part(reread: StepLens, properties: MassProperties | None) -> WholePart | None:
-    """Return the part around the lens of a STEP file; None for a bare lens."""
+    """Return the whole part in a STEP file, which has these properties; None for a bare lens."""
     if reread.edge is None:
         return None
     box = Bnd_Box()
@@ -90,7 +90,8 @@ def _of_face(face: TopoDS_Face, z_ref: float) -> Sums:
 def _in_parameters(face: TopoDS_Face, surface: BRepAdaptor_Surface, z_ref: float) -> Sums:
     """Integrate over a face: ∫∫ g du dv = -∮ G du, where G = ∫ g dv from a fixed v to the border.
 
-    g is computed from position r and n dA = ∂r/∂u x ∂r/∂v du dv.  A face that OCC has reversed has a reversed border.
+    g is computed from the position r, relative to (0, 0, z_ref), and n dA = ∂r/∂u x ∂r/∂v du dv.  A face that OCC has
+    reversed has a reversed border.
     """
     u, v, du = (each[:, None] for each in _concatenate(_edge_in_parameters(edge, face) for edge in _edges(face)))
     spline = surface.GetType() == Kind.GeomAbs_BSplineSurface

@@ -182,7 +182,8 @@ def _lens_in(solid: TopoDS_Solid) -> StepLens:
     net = patches.net_of(back.BSpline())
     middle = (net[0, 0, :2] + net[-1, -1, :2]) / 2
     if not np.abs(middle).max() <= AXIAL_TOLERANCE:
-        raise ValueError(f"the net of the back is centred at {middle} mm; centre the lens on the axis")
+        x, y = middle
+        raise ValueError(f"the net of the back is centred at ({x:g}, {y:g}) mm; centre the lens on the axis")
     rest = [face for face in faces if face not in nets]
     chosen = fronts[0] if fronts else _front_face(rest)
     others = [face for face in rest if face[0] is not chosen[0]]

@@ -55,7 +55,10 @@ Loop = list[tuple[TopoDS_Edge, bool]]  # edges, each with True if used forwards
 
 
 def face_inside(surface: Geom_Surface, outward: bool, *loops: Loop) -> TopoDS_Face:
-    """Return the face inside the first loop (counterclockwise seen from outside) and outside the others (clockwise)."""
+    """Return the face inside the first loop (counterclockwise seen from outside) and outside the others (clockwise).
+
+    outward: True if the normal of `surface`, ∂u x ∂v, points out of the solid.
+    """
     builder, face = BRep_Builder(), TopoDS_Face()
     builder.MakeFace(face, surface, SHAPE_TOLERANCE)
     for loop in loops:

@@ -91,7 +91,7 @@ def wire_loop(given: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list
 
 
 def shape_in(given: Any) -> tuple[Any, str]:
-    """Return (shape or only object of a Workplane, name of its type), otherwise (None, number of objects in words)."""
+    """Return (shape, name of its type) for a shape or a Workplane of one object; else (None, words on its objects)."""
     values = given.vals() if hasattr(given, "vals") else [given]
     if len(values) != 1:
         return None, f"a Workplane of {len(values)} objects"
@@ -162,7 +162,7 @@ def reversed_loop(loop: Sequence[LoopPiece]) -> list[LoopPiece]:
 
 
 def polygon(rim: Sequence[LoopPiece], *holes: Sequence[LoopPiece]) -> shapely.Polygon:
-    """Return the polygon inside a rim and outside holes, with corners along the curves."""
+    """Return the polygon inside a rim and outside holes, with its corners on the curves."""
     return shapely.Polygon(_corners(rim), [_corners(hole) for hole in holes])
 
 
