@@ -1,7 +1,8 @@
 """Run designs in new processes (cold runs), measure their time and error, calibrate this machine, and store records.
 
-The time of a run is the time of the whole command: imports, picture, tailoring, writing and verification.  The RRMSD of
-all lenses is measured with one reference: stratified rays on the pixels of the base scene.
+A run designs a base scene with changed settings.  Its time is the time of the whole command: imports, picture,
+tailoring, writing and verification.  The reference by which the RRMSD of every lens is measured is stratified rays on
+the pixels of the base scene.  The calibration kernel is a fixed computation whose time shows a machine's speed.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ SceneFiles = Mapping[str, bytes]  # contents of a scene file and its pictures, b
 
 
 class StoredRecord(BaseModel):
-    """Base of frozen records that are stored in files."""
+    """Base class of immutable records that are stored in files."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
@@ -60,7 +61,7 @@ Record = TypeVar("Record", bound=StoredRecord)
 
 
 def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
-    """Read a record from a file; raise MachineError if the file is damaged or has another format."""
+    """Read a record of class `kind`; raise MachineError, which ends with `remedy`, if the file is not such a record."""
     try:
         return kind.model_validate_json(files.contents(path, MAX_RECORD_SIZE))
     except ValueError:  # pydantic's errors are ValueErrors
@@ -68,12 +69,12 @@ def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
 
 
 def write_record(path: Path, record: StoredRecord) -> None:
-    """Write a record at full precision."""
+    """Write a record as JSON, with numbers at full precision."""
     files.put(path, f"{record.model_dump_json(indent=1)}\n".encode())
 
 
 def round_numbers(value: Any, digits: int = SIGNIFICANT_DIGITS) -> Any:
-    """Return a JSON value with its numbers rounded to significant digits; null for numbers that are not finite."""
+    """Return a JSON value with its floats rounded to `digits` significant digits, or None where they are not finite."""
     if isinstance(value, Mapping):
         return {key: round_numbers(part, digits) for key, part in value.items()}
     if isinstance(value, list | tuple):
@@ -105,7 +106,7 @@ POOL_INTERVAL = 0.2  # interval (seconds) at which a waiting pool calls `tick`
 class LocalPool:
     """Pool of at most `room` child processes, each with a thread that waits for it.
 
-    Processes that are still running when the block ends are terminated; their checkpoints remain.
+    Processes that are still running at the end of the `with` block are terminated; checkpoints in their folders remain.
     """
 
     def __init__(self, room: int) -> None:
@@ -121,11 +122,11 @@ class LocalPool:
         self._threads.shutdown(cancel_futures=True)
 
     def start(self, key: Any, work: Callable[..., Any], *arguments: Any) -> None:
-        """Start work(*arguments, tick) in a thread; `work` must call `tick` regularly."""
+        """Start work(*arguments, tick) in a thread; `work` must call `tick` regularly.  `next` returns the answer."""
         self._keys[self._threads.submit(work, *arguments, self._tick)] = key
 
     def next(self, tick: Tick) -> Answer:
-        """Wait until a process has ended, and return its answer."""
+        """Wait until one of the calls has ended, and return its answer; `tick` is called regularly and may raise."""
         while True:
             for future in wait(self._keys, timeout=POOL_INTERVAL, return_when=FIRST_COMPLETED).done:
                 key, error = self._keys.pop(future), future.exception()
@@ -141,16 +142,16 @@ class LocalPool:
 
 # --- calibration ------------------------------------------------------------------------------------------------------
 
-KERNEL_TUBES, KERNEL_PIXELS = 1024, 512  # flux tubes and pixels per side
-KERNEL_NET, KERNEL_INDEX = 257, 1.49  # control points per side; refractive index
-KERNEL_WIDTH, KERNEL_THICKNESS = 20.0, 5.0  # width and thickness of the lens, mm
-KERNEL_SCREEN_Z = 200.0  # distance of the screen from the front, mm
-WAVE_HEIGHT, WAVE_PERIODS = 0.003, 3  # amplitude of the waves of the back (mm), number of periods across the width
+KERNEL_TUBES, KERNEL_PIXELS = 1024, 512  # flux tubes and target pixels per side of the calibration kernel
+KERNEL_NET, KERNEL_INDEX = 257, 1.49  # control points per side, and refractive index, of the kernel's lens
+KERNEL_WIDTH, KERNEL_THICKNESS = 20.0, 5.0  # width and thickness of the kernel's lens, mm
+KERNEL_SCREEN_Z = 200.0  # distance of the kernel's screen from the front of its lens, mm
+WAVE_HEIGHT, WAVE_PERIODS = 0.003, 3  # waves of the back of the kernel's lens: amplitude (mm), periods across the width
 KERNEL_REPEATS = 3  # number of evaluations of the kernel; the time of the fastest is used
 
 
 def measure_seconds(work: Callable[[], object]) -> float:
-    """Return the time (s) of a call of `work`."""
+    """Call `work`, and return the time (s) that the call took."""
     start = time.perf_counter()
     work()
     return time.perf_counter() - start
@@ -191,7 +192,7 @@ def sorted_settings(entries: Mapping[str, Value]) -> Settings:
 
 
 def format_value(value: Value) -> str:
-    """Format a value for --set."""
+    """Return a value of a setting as text for the option --set."""
     return f"[{value[0]}, {value[1]}]" if isinstance(value, tuple) else str(value)
 
 
@@ -205,7 +206,7 @@ StoredSettings = Annotated[Settings, BeforeValidator(_from_json), PlainSerialize
 
 
 class HistoryPoint(TypedDict):
-    """RRMSD of a design at one time: from the light of its tailoring, or at the end of a stage from other rays."""
+    """RRMSD of a design at one time, from the flux tubes of tailoring, or at the end of a stage from new rays."""
 
     seconds: float  # time since the start of the command
     rrmsd: float | None  # RRMSD; null: not finite
@@ -244,7 +245,7 @@ class ColdRun(StoredRecord):
 
     @property
     def done(self) -> bool:
-        """True if there is a lens."""
+        """True if the run gave a lens."""
         return self.status == DONE
 
     @property
@@ -255,7 +256,7 @@ class ColdRun(StoredRecord):
 
     @property
     def comparable(self) -> bool:
-        """True if the time is comparable: the run was done on this machine, where only one run is active at a time."""
+        """True if the run gave a lens on this machine, where runs do not overlap, so that times are comparable."""
         return self.done and self.where == THIS_MACHINE
 
 
@@ -288,7 +289,7 @@ def warm_up(contents: SceneFiles, tick: Tick) -> None:
 
 
 def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick: Tick) -> ColdRun:
-    """Run `bstcad generate` for a scene file in a new process; return a record with the figures of its report."""
+    """Run `bstcad generate` with settings `point`, for at most `limit` s, in a new process; return the run's record."""
     changes = [word for key, value in point for word in ("--set", f"{key}={format_value(value)}")]
     process = processes.run(["generate", str(scene), "-o", str(folder), *changes], limit, tick)
     times: dict[str, Any] = {"settings": point, "seconds": process.seconds, "cpu_seconds": process.cpu_seconds}
@@ -313,7 +314,7 @@ def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick:
 
 
 def judge_run(run: ColdRun, base: Scene, folder: Path, effort: Effort) -> ColdRun:
-    """Return the run with the RRMSD of its lens by the reference: the largest on any target of the base scene."""
+    """Return the run with the largest RRMSD of the lens in `folder` on any target of `base`, measured with `effort`."""
     lens, channels = read_nominal(folder)[1].lens, base.verification_channels()
     lights = [measure_goal(lens, channels, goal, effort, ghost=base.ghost, draw=base.draw) for goal in base.goals]
     if not all(light.rrmsd >= 0 for light in lights):

@@ -1,8 +1,8 @@
 """Estimate the effects that a design neglects, and diagnose a finished design.
 
-Before a design the effects are estimated (analysis.neglected_effects) with a coarse lens, made from two transport maps
-and slope fits in a second or two; most estimates are accurate within a factor of two.  Reports state estimates for the
-finished lens.  The diagnosis of a finished design uses its picture and the history of the run.
+Before a design the effects are estimated (analysis.neglected_effects) with a coarse lens, made in a second or two by
+two rounds of transport and slope fit; most estimates are accurate within a factor of two.  Reports state estimates for
+the finished lens.  The diagnosis of a finished design uses its picture and the history of the run.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def _downsample(picture: np.ndarray, limit: int) -> np.ndarray:
 
 
 def _central_channel(scene: Scene, *more: Effect) -> Channel:
-    """Return the channel from the source's centre at its main wavelength, with the losses of the scene and `more`."""
+    """Return the channel of the source's centre at its main wavelength; losses: by the scene's effects and `more`."""
     source = scene.source.central
     loss_factors = losses((*scene.effects, *more), scene.lens, source.main_wavelength)
     return Channel(source, scene.index, losses=loss_factors, around=scene.around(source.main_wavelength))
@@ -84,15 +84,15 @@ def _central_channel(scene: Scene, *more: Effect) -> Channel:
 # --- neglected effects ------------------------------------------------------------------------------------------------
 
 VISIBLE_BAND = (400.0, 700.0)  # band of white light, nm
-SUN_ANGLES = (0.5, 0.56)  # range of divergence (degrees) treated as sunlight; the mean of the sun is 0.53
+SUN_ANGLES = (0.5, 0.56)  # range of full divergence angles (degrees) treated as sunlight; the sun's mean is 0.53
 LINE_WIDTH = 10.0  # assumed width (nm) of a spectral line; LEDs have 20 to 40, lasers less than 1
 DEFAULT_DIAMETER = 0.1  # assumed diameter of a point source, mm
 DEFAULT_DIVERGENCE = 0.1  # assumed divergence of parallel light, degrees
 # Assumed sizes for each Emitter.size_key: (size, shape, unit).
 DEFAULT_SIZES = {"diameter": (DEFAULT_DIAMETER, "disc", "mm"), "divergence": (DEFAULT_DIVERGENCE, "cone", "degrees")}
-LINE_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # uniform line: (offset / half width, weight)
-DISC_POINTS = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # (x, y, weight) of a disc of radius 1
-FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"  # scene keys
+LINE_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # band: points (offset / half width, weight)
+DISC_POINTS = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # points (x, y, weight) in the unit disc
+FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"  # scene lines
 
 
 def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ...]:
@@ -165,7 +165,7 @@ def _dispersion(scene: Scene, reference: Reference) -> LeftOut:
 
 
 def band(scene: Scene) -> tuple[float, float]:
-    """Return the band (nm) that a single wavelength represents: VISIBLE_BAND for sunlight, else LINE_WIDTH wide."""
+    """Return the ends (nm) of the band that one wavelength represents: VISIBLE_BAND in sunlight, else of LINE_WIDTH."""
     source = scene.source
     if isinstance(source, Collimated):
         divergence = source.divergence or source.real_divergence or 0.0

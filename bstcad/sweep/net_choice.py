@@ -42,11 +42,12 @@ MEMORY_FRACTION = 0.8  # fraction of the machine's memory that a design may use
 DENSITY_TUBES = 256  # flux tubes per side for the flux density at the back
 # Coefficients of the error bound (ControlCells.floor) of the net, and of a net with half as many cells per side.
 FLOOR_FACTOR, HALVED_FACTOR = 0.68, 0.43
-QUALITY_TERMS = {"draft": (1.5, 0.012), "standard": (1.0, 0.002), "fine": (0.7, 0.004)}  # (factor, offset) of the RRMSD
+# (factor, offset) by quality: RRMSD due to the net = factor · RMS of both bounds + offset.
+QUALITY_TERMS = {"draft": (1.5, 0.012), "standard": (1.0, 0.002), "fine": (0.7, 0.004)}
 MIN_SEAM_SHIFT = 7.0  # seam shift (pixels) below which cells are too fine for the tool
 # Cells per pixel above which finer nets reduce the RRMSD further by at most a factor, and this factor.
 SUFFICIENT_CELLS, MAX_FURTHER_GAIN = 5.0, 1.4
-MIN_RRMSD_RATIO = 0.43  # smallest observed RRMSD of a finer net / RRMSD of a coarser one (portrait.toml, 1025 and 513)
+MIN_RRMSD_RATIO = 0.43  # smallest observed RRMSD with a finer net / with a coarser net (portrait.toml, 1025 and 513)
 MIN_RELATIVE_FLUX = 1e-3  # flux of a tile / mean flux below which the mean area per flux is used
 
 
@@ -102,7 +103,7 @@ class Choice:
 
 
 def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
-    """Return (scene with a net, choice of the net; None if the scene states it).  SceneError: no light on the back."""
+    """Return the scene with a net, and its choice (None: the scene states a net); SceneError: no light on the back."""
     if scene.lens.back.control_points is not None:
         return scene, None
     levels = scene.tailoring.levels
@@ -141,9 +142,9 @@ def _choose_for_target(scene: Scene) -> Choice:
 
 
 def rrmsd_ratio(scene: Scene, finer: Scene, lenses: Sequence[Lens]) -> float:
-    """Return the ratio of the RRMSD with a finer net to the RRMSD of the scene, for the target that improves least.
+    """Return the RRMSD of the scene with a finer net (`finer`) / RRMSD of `scene`, for the target that improves least.
 
-    lenses: a coarse lens for each target.
+    It is at least MIN_RRMSD_RATIO and at most 1.  lenses: a coarse lens for each target.
     """
     ratios = []
     for one, other, lens in zip(scene.single_target_scenes(), finer.single_target_scenes(), lenses, strict=True):
@@ -159,7 +160,7 @@ def _is_worthwhile(coarse: Candidate, fine: Candidate) -> bool:
 
 
 def _affordable(scene: Scene, candidates: list[Candidate]) -> tuple[tuple[Candidate, ...], str]:
-    """Return the candidates that tool, time and memory allow (or the coarsest), and the limit that excludes others."""
+    """Return the candidates that tool, time and memory allow (or the coarsest), and, in words, what excludes others."""
     max_time, radius = scene.tailoring.max_time, scene.lens.tool_radius
     available = MEMORY_FRACTION * psutil.virtual_memory().total / 1e9
     bounds = (

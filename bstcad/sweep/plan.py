@@ -131,7 +131,7 @@ def reach_drawn(scene: Scene) -> tuple[bytes, ...]:
 
 
 def _request_of(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[str, Any]:
-    """Return what requests an effect: its line in the scene file (None: --set or a default), and words for a table."""
+    """Return {line, asked_by} for a key: its line by `at` (None: --set or a default), and words for a table."""
     for other in keys:
         if other == key or key.startswith(f"{other}.") or other.startswith(f"{key}."):
             return {"line": None, "asked_by": f"--set {other}"}
@@ -145,8 +145,8 @@ def _request_of(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[st
 def predict_qualities(scene: Scene, lenses: Sequence[Lens], tick: Tick = lambda: None) -> dict[str, Any]:
     """Return {predicted, not_predicted, finer, notes}: predictions for each quality, or the reason why there are none.
 
-    notes: remarks on steepness and on limits that end a design early.  finer: predictions for twice the spans per side;
-    None: net too large, or no predictions.  lenses: a coarse lens per target.
+    notes: remarks on steepness and on limits that end a design early.  finer: {control_points, predicted} for a net
+    with twice the spans per side; None: net too large, or no predictions.  lenses: a coarse lens per target.
     """
     entries: dict[str, Any] = {"predicted": None, "not_predicted": None, "finer": None, "notes": []}
     try:

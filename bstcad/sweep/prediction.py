@@ -122,7 +122,7 @@ def pilot_scene(scene: Scene) -> tuple[Scene, float]:
 
 
 def replace_net(scene: Scene, net: Sides, changes: Mapping[str, object] = {}) -> Scene:
-    """Return the scene with another net of the back, a freeform front in proportion, and further changes."""
+    """Return the scene with another net of the back, a freeform front's net in proportion, and `changes` by key."""
     nets = {"lens.back.control_points": net, "tailoring.levels": None}
     if scene.lens.front.is_tailored and scene.lens.front.control_points is not None:
         nets["lens.front.control_points"] = scene.lens.front_net(net)
@@ -130,7 +130,7 @@ def replace_net(scene: Scene, net: Sides, changes: Mapping[str, object] = {}) ->
 
 
 def detail(picture: np.ndarray, pixels: int) -> float:
-    """Return the relative RMS of a picture's cosines with more than `pixels` half waves along its longer side."""
+    """Return the RMS of a picture's cosines with more than `pixels` half waves on the longer side / RMS of them all."""
     from scipy.fft import dctn
 
     energy = dctn(picture, norm="ortho") ** 2
@@ -176,7 +176,7 @@ def predicted_rrmsd(pilot: Pilot, quality: str) -> float:
 
 
 def predicted_seconds(scene: Scene, pilot: Pilot) -> float:
-    """Return the time of a design (seconds): stages of the pilot scaled by their sizes, and the rest by the pace."""
+    """Return the time (s) of a design: times of the pilot's stages, scaled by their sizes, and the rest by `pace`."""
     whole, small, times = typical_seconds(scene), typical_seconds(pilot.scene), pilot.seconds
     tailored = times.first * whole.first / small.first + times.search * whole.search / small.search
     return tailored + times.rest + pace() * whole.rest
@@ -186,7 +186,7 @@ def predicted_seconds(scene: Scene, pilot: Pilot) -> float:
 
 # Sizes (per side, or iterations) for which the following times (s) and memory (GB) are stated, on two cores of pace 1.
 UNIT_TUBES, UNIT_POINTS, UNIT_PIXELS, UNIT_GRID, UNIT_ITERATIONS = 1024, 513, 512, 256, 40
-KERNEL_SECONDS = 0.115  # time of an evaluation of cold_run.calibration_kernel
+KERNEL_SECONDS = 0.115  # time of an evaluation of cold_run.calibration_kernel; defines pace 1
 ROUND_SECONDS, TRANSPORT_SECONDS, FIT_SECONDS = 0.06, 0.2, 0.6  # time of a round, transport, slope fit in stage 1
 TWO_FACE_TRANSPORT_SECONDS = 2.4  # time of a transport behind two freeform faces, between which light is traced
 TWO_FACE_SECONDS = 3.0  # additional time in stage 1 for two freeform faces of any size
@@ -199,8 +199,8 @@ ADAM_SECONDS = 0.1  # time of a step of the paper's procedure
 START_SECONDS = 2.8  # time of the imports and of the end of the process
 WRITE_SECONDS, NET_SECONDS, PICTURE_SECONDS = 1.5, 2.4, 1.1  # time of writing: constant part, net, pixels
 MOUNT_SECONDS = 2.5  # time of cutting and verifying the mounted part
-RAY_SECONDS, DRAFT_RAY_SECONDS = 1.6, 1.0  # time of rays of parallel light, per target and line; twice for other light
-WITNESS_SECONDS, DRAFT_WITNESS_SECONDS = 6.0, 2.5  # time to verify two nets with flux tubes, per target
+RAY_SECONDS, DRAFT_RAY_SECONDS = 1.6, 1.0  # time of parallel rays, per target and spectral line; twice for other light
+WITNESS_SECONDS, DRAFT_WITNESS_SECONDS = 6.0, 2.5  # time to verify a lens of two nets with flux tubes, per target
 LIBRARIES_GB = 1.5  # memory of the libraries in both processes
 TUBES_GB, NET_GB, PIXELS_GB = 0.12, 0.27, 0.02  # memory of tubes, net and pixels
 GOAL_MEMORY_FACTOR = 3.0  # memory of tubes per goal with several goals / memory with one target

@@ -44,11 +44,11 @@ TRADEOFF_COLUMNS = (
     "knobs", "settings", "status", "seconds", "cpu_seconds", "kernel_seconds", "units", "rrmsd", "rrmsd_noise",
     "rrmsd_reported", "peak_memory_gb", "on_front", "predicted_seconds", "cost_seconds", "where", "reason",
 )  # fmt: skip
-PRIVATE_FIELDS = {"allowed_seconds", "history", "machine", "versions", "version"}  # fields of ColdRun in RunFile only
+PRIVATE_FIELDS = {"allowed_seconds", "history", "machine", "versions", "version"}  # fields of ColdRun that results omit
 
 
 class KnobPoint(StoredRecord):
-    """Point of a knob: median time and error of its seeds, and the range of the error."""
+    """Value of a knob (varied setting): medians of time and error over its seeds, and the range of the error."""
 
     label: str  # value of the knob in words
     settings: StoredSettings  # settings of the run
@@ -133,7 +133,7 @@ class TradeoffTable(StoredRecord):
 
     @property
     def base_run(self) -> ColdRun | None:
-        """Run of the base scene; None: not run, or failed."""
+        """Run of the base scene; None: not run, failed, or its time is not comparable but those of other runs are."""
         return next((run for run in self.plotted if not run.settings), None)
 
     @property
@@ -153,7 +153,7 @@ class TradeoffTable(StoredRecord):
 
 
 def pareto_front(runs: Iterable[ColdRun]) -> list[ColdRun]:
-    """Return the Pareto front: runs that no other run dominates in time and error, the fastest first."""
+    """Return the Pareto front: comparable runs that none of them dominates in time and error, the fastest first."""
     front: list[ColdRun] = []
     for run in sorted((run for run in runs if run.comparable), key=lambda run: run.time_and_error):
         if not front or run.time_and_error[1] < front[-1].time_and_error[1]:
@@ -287,7 +287,7 @@ def draw_legend(axes: Axes) -> None:
 
 # --- the page and the terminal ----------------------------------------------------------------------------------------
 
-VERDICT_STYLES = {"pass": "bold green", "remarks": "bold yellow", "fail": "bold red"}  # page class: terminal style
+VERDICT_STYLES = {"pass": "bold green", "remarks": "bold yellow", "fail": "bold red"}  # CSS class: terminal style
 PAGE_TEMPLATE = Path(__file__).with_name("tradeoff.html.j2")
 
 

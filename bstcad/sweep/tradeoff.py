@@ -43,7 +43,7 @@ GRID_LIMITS = (32, 2048)  # minimum and maximum transport cells per side
 PIXEL_LIMITS = (8, 4096)  # minimum and maximum pixels per side
 COUNT_LIMITS = (1, 16_384)  # minimum and maximum of all other varied numbers
 ROUND_COUNTS = (1, 2, 3, 5, 8)  # numbers of rounds of transport and slope fit in stage 1
-ADAM_FRACTIONS = (1 / 8, 1 / 4, 1 / 2, 1.0)  # numbers of steps of the procedure of Wang et al., relative to the preset
+ADAM_FRACTIONS = (1 / 8, 1 / 4, 1 / 2, 1.0)  # numbers of steps of Wang et al.'s procedure / those in the preset paper
 
 Points = Mapping[str, Settings]  # settings by label ("768"), in the order of increasing work
 
@@ -146,7 +146,7 @@ def _pixels(scene: Scene) -> Points:
 
 
 def _adam_points(own: bool) -> Points:
-    """Return points of the procedure of Wang et al. with fewer steps, then its preset; own: the scene uses it."""
+    """Return points of the preset paper with fewer steps, then unchanged; own: True if the scene has this preset."""
     points = {}
     for factor in ADAM_FRACTIONS:
         steps = {name: round(factor * PRESETS["paper"][name]) for name in ("stage1_iterations", "stage2_iterations")}
@@ -195,7 +195,7 @@ def run_order(scene: Scene, knobs: Sequence[Knob]) -> list[Settings]:
 
 
 def _neighbour(knob: Knob, steps: int) -> list[Settings]:
-    """Return a list of the point that is `steps` steps from the base (negative: less work); [] if there is none.
+    """Return [the point that is `steps` steps from the base] (negative: less work), or [] if there is none.
 
     If the base is not a point of the knob, the first point is the neighbour with less work, the second with more work.
     """
@@ -229,7 +229,7 @@ REFERENCE_TEXT = (
     "stratified rays that were not used in tailoring, in independent sets, until the standard error is below {:.2%} of "
     "the RRMSD; {} pixels; the lens as read back from its folder"
 )
-NO_TIMES = dict.fromkeys(("seconds", "cpu_seconds", "kernel_seconds", "cost_seconds"))  # null for a run not done
+NO_TIMES = dict.fromkeys(("seconds", "cpu_seconds", "kernel_seconds", "cost_seconds"))  # null times of a run not done
 
 
 class RunFile(StoredRecord):
@@ -241,7 +241,7 @@ class RunFile(StoredRecord):
 def tradeoff(
     scene: Scene, folder: Path, *, budget: float, progress: Progress = no_progress, machines: Machines | None = None
 ) -> TradeoffTable:
-    """Do the most important runs that the budget allows, and write tradeoff.csv, .json, .png and .html.
+    """Do the most important runs that the budget (s) allows, and write tradeoff.csv, .json, .png and .html.
 
     machines: machines of the runs; None: this machine.  The csv and json files are written after each run, so that they
     exist after an interruption.
@@ -392,7 +392,7 @@ def predicted_work(scene: Scene, point: Settings) -> tuple[bool, float]:
 
 
 def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: float = math.inf) -> TradeoffTable:
-    """Return the table of a sweep.  runs: ended runs, then runs not yet done, both in order of importance."""
+    """Return the table of a sweep.  runs: ended runs, then runs not done, both in order of importance; budget in s."""
     own, best = scene.lens.back.net, pareto_front(runs)
     comparable = {run.settings: run for run in runs if run.comparable}
     selected = comparable or {run.settings: run for run in runs if run.done}
@@ -460,7 +460,7 @@ def knob_points(
 
 
 def _knob_keys(knobs: Sequence[Knob], point: Settings) -> tuple[str, ...]:
-    """Return the keys of the knobs with a point at these settings, with any seed."""
+    """Return the keys of the knobs with a point at these settings, with any seed; ("base",) for the base scene."""
     without = tuple(entry for entry in point if entry[0] != "tailoring.seed")
     return tuple(knob.key for knob in knobs if without in knob.points.values()) if without else ("base",)
 

@@ -26,7 +26,7 @@ from bstcad.optics.outlines import inside
 from bstcad.optics.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 
-PENALTY_MARGIN = 0.01  # relative distance from a bound at which the penalty begins (thickness: in units of its excess)
+PENALTY_MARGIN = 0.01  # distance from a bound at which the penalty begins / bound (for thickness: / unit of its excess)
 QUARTER_RIM_POINTS = 1025  # number of points along a quarter of the rim
 CELL_POINTS = 4  # control points per axis on which a cell may depend: it lies in at most two knot spans
 TILE_CELLS = 16  # number of cells per axis in a tile
@@ -42,7 +42,7 @@ def unit(lens: Lens, bounds: Bounds) -> float:
 
 
 def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], float]:
-    """Return (penalty, its gradients (1/mm), largest excess) of the thickness t over its bounds.
+    """Return (penalty, its gradients in the heights (1/mm), largest excess) of the thickness t over its bounds.
 
     The excess is e = max(thinnest - t, t - thickest) / unit, along the rim with max(thinnest, edge) as thinnest.  With
     m = PENALTY_MARGIN the penalty is the mean of max(e + m, 0)² over the grid, plus the mean along the rim if `edge` is
@@ -82,7 +82,7 @@ def _points_near_bounds(lens: Lens, bounds: Bounds, margin: float) -> Iterator[t
 
 
 def _excess(lens: Lens, x: Tensor, y: Tensor, bounds: Bounds) -> tuple[Tensor, Tensor]:
-    """Return the excess (mm) of the thickness over the nearer bound, and 1 for the maximum or -1 for the minimum."""
+    """Return the excess (mm) of the thickness over the nearer bound, and 1 if it is the maximum, -1 if the minimum."""
     front, back = (evaluate(net.heights, *net.along_net(x, y))[0] for net in (lens.front_net, lens.back_net))
     glass = (lens.back.z - lens.front.z) + back - front
     thin = bounds.thinnest - glass

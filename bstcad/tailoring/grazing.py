@@ -6,9 +6,9 @@ reachable part has one more term, which depends on the slopes of the face alone:
 
     PENALTY_WEIGHT · mean over the light of max(0, u)²,    u = (η² sin² θ - sin² θ'_max) / (1 - sin² θ'_max)
 
-θ is the angle of incidence, and θ'_max the largest angle of refraction allowed (optics.reach.grazing_of): u = 0 at
-θ'_max, and u = 1 at total internal reflection.  Within a knot span ∂z/∂x is linear in x and quadratic in y, and ∂z/∂y
-the reverse, so their values at the ends and centres of spans are close to the extremes.
+θ is the angle of incidence, θ'_max the largest angle of refraction allowed (optics.reach.grazing_of), and η the index
+before the face / index behind it: u = 0 at θ'_max, and u = 1 at total internal reflection.  Within a knot span ∂z/∂x is
+linear in x and quadratic in y, and ∂z/∂y the reverse, so that at ends and centres of spans they are near the extremes.
 """
 
 from __future__ import annotations

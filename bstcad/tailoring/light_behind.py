@@ -46,15 +46,15 @@ from bstcad.tailoring.slope_map import centroid, pixel_corners, resample_picture
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Points, Solver, grid_coordinates, solve
 
-MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds; max(n / 4, 64) cells per side before the last
+MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds, before the last of max(transport grid / 4, 64)² cells
 MAX_WAVE_ITERATIONS = 40  # largest number of iterations for the point of a wave that sends a ray to a given point
 WAVE_TOLERANCE = 1e-9  # change (mm) below which the iterations for a point of the wave have converged
-SOURCE_FLOOR = 0.02  # smallest irradiance of the map's source picture, relative to its mean: black would leave holes
-# Standard deviations (pixels) of the blur of the source picture; maps are computed in this order.  For a portrait with
-# dark parts beside bright ones, Newton's method ends at a mass error of 0.003, and without blur at 0.06 to 0.25.
+SOURCE_FLOOR = 0.02  # smallest irradiance of the picture where a map begins / its mean: black would leave holes
+# Standard deviations (pixels) of the blur of the picture where a map begins, in the order of the maps.  For a portrait
+# with dark parts beside bright ones, Newton's method ends at a mass error of 0.003, and without blur at 0.06 to 0.25.
 SOURCE_BLURS = (4.0, 2.0, 1.0)
 FINE_FACTOR = 2  # cells per side of the last map, relative to the transport grid: few cells light a thin letter
-# Solver with floors under the map's target picture, relative to its mean, used one after another
+# Solver with floors under the picture where a map ends, relative to its mean, used one after another
 TARGETS_SOLVER = Solver(floors=(0.1, 0.03, 0.01, 0.003))
 CONTRAST_RATIO = 1.5  # ratio of contrasts above which rays pass through pixel corners of the higher-contrast picture
 INTERSECTION_STEPS = 8  # Newton iterations for the intersection with a face
@@ -272,7 +272,7 @@ def without_crossings(light: LightBehind, screen: Screen, surface: Surface, n: i
 
 
 def _inverted(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return a mask (m - 1, n - 1) of the inverted quads between points x, y (m, n)."""
+    """Return True (m - 1, n - 1) where four neighbours of the points x, y (m, n) span an inverted (crossed) quad."""
     return (x[1:, 1:] - x[:-1, :-1]) * (y[:-1, 1:] - y[1:, :-1]) - (x[:-1, 1:] - x[1:, :-1]) * (
         y[1:, 1:] - y[:-1, :-1]
     ) <= 0

@@ -129,7 +129,7 @@ def excess(lens: Lens, bounds: Bounds) -> Excess:
     return Excess(square, given, worst)
 
 
-PartExcess = tuple[float, dict[int, Tensor], float]  # mean square, gradients by the number of the face, worst
+PartExcess = tuple[float, dict[int, Tensor], float]  # mean square, its gradients by face number, largest excess
 
 
 def _parts(lens: Lens, nets: dict[int, BSplineSurface], bounds: Bounds) -> Iterator[PartExcess]:
@@ -169,7 +169,7 @@ def _shape_excess(net: BSplineSurface, outline: Outline, bounds: Bounds) -> tupl
 def _spans_near_bounds(
     net: BSplineSurface, outline: Outline, bounds: Bounds
 ) -> Iterator[tuple[Spans, Tensor, float, Callable[[Jet], Tensor]]]:
-    """Yield (spans, mask of their points inside the outline, bound, function for its quantity) for spans near it."""
+    """Yield (spans near a bound, mask of their points inside the outline, bound, function: Jet -> limited quantity)."""
     for bound, upper_limit, quantity in (
         (bounds.concave, partial(bspline.curvature_bounds, net, 1.0), lambda jet: jet.curvatures[0]),
         (bounds.convex, partial(bspline.curvature_bounds, net, -1.0), lambda jet: -jet.curvatures[1]),
@@ -221,8 +221,8 @@ def enforce_bounds(lens: Lens, bounds: Bounds) -> Lens:
     flat = _with_back_moved(_flat(lens, bounds), bounds)
     if _exceeds(flat, bounds):
         raise SceneError(
-            "lens.max_thickness: with this front, not even a flat back meets both lens.max_thickness and "
-            "lens.edge_thickness; raise lens.max_thickness or lower lens.edge_thickness"
+            "lens.max_thickness: with this front, not even a flat back meets both lens.max_thickness and the minimum "
+            "thickness; raise lens.max_thickness, or lower lens.edge_thickness or lens.min_thickness"
         )
     return _nearest(lens, flat, bounds, _with_back_moved)
 

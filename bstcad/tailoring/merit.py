@@ -74,12 +74,12 @@ WEIGHT_SMOOTHING = 1.5  # standard deviation of the smoothing of the weight's lo
 MAX_LOCAL_WEIGHT = 4.0  # largest local weight; the smallest is 1 / MAX_LOCAL_WEIGHT, before division by the leverage
 # Range of the leverage / median in which the weight is proportional to 1 / leverage.
 MIN_LEVERAGE, MAX_LEVERAGE = 3.0, 96.0
-LEVERAGE_STEP = 1e-6  # shift of t for difference quotients of the slopes p(b, t), relative to the target's distance
+LEVERAGE_STEP = 1e-6  # shift of target points t / their largest distance, in difference quotients of p(b, t)
 LEVERAGE_STRIDE = 8  # every 8th control point is checked first, since few lenses have a large leverage anywhere
 
 
 def mean_square_miss(rays: Landed, aim: Tensor) -> Tensor:
-    """Return the mean of |P_t - P|² over rays that land at P with the aim P_t (Wang et al. 2023, Eq. 14: sum)."""
+    """Return the mean of |P_t - P|² over rays that land at P with the aim P_t (a sum in Wang et al. 2023, Eq. 14)."""
     lit = rays.alive & (rays.flux > 0)
     miss = (rays.position[0] - aim[0]) ** 2 + (rays.position[1] - aim[1]) ** 2
     return total(torch.where(lit, miss, torch.zeros_like(miss))) / lit.sum()
@@ -220,7 +220,7 @@ class Merit:
 
 
 def _from_source(lens: Lens, wave: Wave | None) -> Lens:
-    """Return the lens; for a wavefront goal `freeform` begins with interface 0: paths need tubes that start there."""
+    """Return the lens, for a wavefront goal with interface 0 first in `freeform`: paths need tubes that start there."""
     if wave is None or lens.freeform[0] == 0:
         return lens
     return replace(lens, shaped=(0, *lens.freeform))
@@ -258,10 +258,10 @@ def _corner_flux(flux: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class SobolevVariable:
-    """Sobolev variable: heights h (m, n) in mm as a function of c (m, n), h = p C^T (λ^-q · C (w c) C^T) C.
+    """Sobolev variable c (m, n): the changes (mm) of a net's heights are h (m, n) = p C^T (λ^-q · C (w c) C^T) C.
 
-    C is the orthonormal cosine transform, p the geometric mean spacing of control points (mm), and q the exponent.
-    λ_ij = 4 - 2 cos(π i / m) - 2 cos(π j / n) are the eigenvalues of the negative Laplacian; 0 is used for λ_00^-q.
+    C is the orthonormal cosine transform, p the geometric mean spacing of control points (mm), w the local weight, q
+    the exponent.  λ_ij = 4 - 2 cos(π i/m) - 2 cos(π j/n) are eigenvalues of the negative Laplacian; 0 replaces λ_00^-q.
     """
 
     weight: Tensor  # local weight w, (m, n)
@@ -282,17 +282,17 @@ class SobolevVariable:
         return torch.zeros_like(self.weight)
 
     def heights(self, c: Tensor) -> Tensor:
-        """Return the heights h (mm) at c."""
+        """Return the changes h (mm) of the heights at c."""
         return inverse_cosine(self.scale * cosine(self.weight * c))
 
     def adjoint(self, g: Tensor) -> Tensor:
-        """Apply the transpose of `heights`: from a gradient in the control points to one in c."""
+        """Apply the transpose of `heights`: turn g, the gradient in the net's heights, into the gradient in c."""
         return self.weight * inverse_cosine(self.scale * cosine(g))
 
 
 @dataclass(frozen=True)
 class CoarseVariable:
-    """Heights h (m, n) in mm of a net as a function of the variable c of a coarser net: h = P h'(c) Q^T.
+    """Changes h (m, n) of a net's heights (mm) as a function of the variable c of a coarser net: h = P h'(c) Q^T.
 
     P (m, m') and Q (n, n') fit the finer net to the spline of h' (m', n') by least squares (bspline.resample).
     (A cosine has zero slope at the rim.  With the cosines of the finer net, a slope of the surface there needs many of
@@ -314,11 +314,11 @@ class CoarseVariable:
         return self.coarse.zero()
 
     def heights(self, c: Tensor) -> Tensor:
-        """Return the heights h (mm) at c."""
+        """Return the changes h (mm) of the heights at c."""
         return _apply_both(self.along_x, self.coarse.heights(c), self.along_y)
 
     def adjoint(self, g: Tensor) -> Tensor:
-        """Apply the transpose of `heights`: from a gradient in the control points to one in c."""
+        """Apply the transpose of `heights`: turn g, the gradient in the net's heights, into the gradient in c."""
         return self.coarse.adjoint(_apply_both(self.along_x.T, g, self.along_y.T))
 
 
@@ -390,7 +390,7 @@ def _excess_leverage(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, on_sc
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Sobolev variable c of the slope fit: heights h = inverse cosine transform of c · scale, Σ c² = mean |∇h|²."""
+    """Variable c of the slope fit: height changes h = inverse cosine transform of c · scale, with Σ c² = mean |∇h|²."""
 
     energy: Tensor  # slope energy of each cosine (1/mm²), (m, n), zero for the piston
     scale: Tensor  # sqrt(m n / energy), (m, n), zero for the piston
@@ -404,11 +404,11 @@ class Spectrum:
         return cls(energy.to(surface.heights), scale.to(surface.heights))
 
     def heights(self, c: Tensor) -> Tensor:
-        """Return the heights h (mm) at c."""
+        """Return the changes h (mm) of the heights at c."""
         return inverse_cosine(c * self.scale)
 
     def adjoint(self, g: Tensor) -> Tensor:
-        """Apply the transpose of `heights`: from a gradient in the control points to one in c."""
+        """Apply the transpose of `heights`: turn g, the gradient in the net's heights, into the gradient in c."""
         return cosine(g) * self.scale
 
 

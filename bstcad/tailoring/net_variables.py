@@ -58,7 +58,7 @@ class NetVariables:
         return [block.zero() for block in self.blocks]
 
     def heights(self, c: Sequence[Tensor]) -> list[Tensor]:
-        """Return the change of the heights of each net (mm) at c."""
+        """Return the changes (mm) of the heights of each net at c."""
         parts = [block.heights(at) for block, at in zip(self.blocks, c, strict=True)]
         if self.along is None:
             return parts
@@ -66,7 +66,7 @@ class NetVariables:
         return [front, back + _multiply(self.along, front, back)]
 
     def adjoint(self, g: Sequence[Tensor]) -> list[Tensor]:
-        """Apply the transpose of `heights`: from gradients in the control points to gradients in c."""
+        """Apply the transpose of `heights`: turn g, gradients in the heights of each net, into gradients in c."""
         if self.along is not None:
             front, back = g
             g = [self.scale * (front + _multiply(self.along.T, back, front)), back]

@@ -110,7 +110,7 @@ def same_order(grid: FaceGrid, aims: Points) -> Points:
 
 
 def _inside(corners: Tensor, screen: Screen, few: Screen) -> np.ndarray:
-    """Return True (rows, columns) for pixels of a screen where `corners`, values at the corners of `few`, are >= 0."""
+    """Return True (rows, columns) for pixels of `screen` with values >= 0 at all corners; corners: values for `few`."""
     where = np.meshgrid(
         *(np.linspace(0, a, n + 1) for a, n in ((few.columns, screen.columns), (few.rows, screen.rows))), indexing="ij"
     )

@@ -373,7 +373,7 @@ class Driver:
         self._record = replace(record, history=(*record.history, (record.seconds, value)))
 
     def end(self, name: str, value: float | None = None) -> None:
-        """Record the end of a part of the design; it began at the end of the previous part.  value: RRMSD, or None."""
+        """Record the end of a part of the design; it began at the end of the previous part.  value: RRMSD, if known."""
         record = self.record
         spent = sum(stage.seconds for stage in record.stages)
         cpu = None  # unknown for the first part, most of which precedes this driver

@@ -57,7 +57,7 @@ SLOPE_FLOOR = 1e-3  # smallest density of light over slopes, relative to its mea
 GATHERING_NET, GATHERING_SAMPLES = 33, 96  # control points per side of g, and samples per side for its fit
 GATHERING_WIDTH = (GATHERING_NET - 1) / (GATHERING_NET - 5)  # width of g / width of the window: end spans lie outside
 GATHERING_FIT = Fit(bending=1e-3, steps=40, degree=5)  # fit of g
-PARABOLOID_FIT = Fit(steps=0, degree=2)  # fit of g by a paraboloid, if no face can focus the light
+PARABOLOID_FIT = Fit(steps=0, degree=2)  # fit of g by a paraboloid, if no face can send all light to m
 PREVIEW_FIT, PREVIEW_SAMPLES = Fit(steps=0, degree=5), 32  # fit and samples per side of g in a preview, 5 times faster
 TARGET_FLOOR = 1e-3  # smallest irradiance of the target in the map of the paper, relative to its mean
 
@@ -297,9 +297,8 @@ def light_density(values: np.ndarray, side: float) -> Density:
     """Return the density of light in the cells of a square of `side` mm; SceneError if no sample has light."""
     if not values.any():
         raise SceneError(
-            "source: its light at the lens is narrower than a cell of the transport grid "
-            f"({side / len(values):.3g} mm); make width and height of lens.outline less different, or raise "
-            "tailoring.transport_grid"
+            f"source: its light at the lens is a strip narrower than a cell ({side / len(values):.3g} mm) of the "
+            "square transport grid; make the lit part of lens.outline less oblong, or raise tailoring.transport_grid"
         )
     return Density.from_values(values)
 

@@ -47,8 +47,8 @@ ERROR_RAYS = 1448  # square root of the rays per spectral line in each of the tw
 ERROR_POINTS = 256  # source points in each of the two sets of rays that measure the error of the blur
 ERROR_SMOOTHING = 0.15  # standard deviation of the smoothing of the blur error / reach of the images (border - 2)
 MAX_TRANSFORM_BYTES, VALUE_BYTES = 2 << 30, 8  # largest size of the transforms of all images, size of one value (bytes)
-MIN_BORDER = 16  # border (pixels) allowed whatever MAX_TRANSFORM_BYTES and the size of the screen
-ERROR_SEED_OFFSET = 500_009  # offset of the seed of the rays of ERROR_RAYS: independent of the verification's rays
+MIN_BORDER = 16  # border (pixels) that is always allowed, whatever MAX_TRANSFORM_BYTES and the size of the screen
+ERROR_SEED_OFFSET = 500_009  # offset of the seed of the rays that measure the blur's error; verification has other rays
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class LocalImages:
         return cls(pixel[:, 0], pixel[:, 1:] - pixel[:, :1], flux[1:] / flux[0])
 
     def nearest(self, column: float, row: float) -> tuple[Tensor, Tensor]:
-        """Return offset (2, 9) and flux (9,) of the image nearest to a pixel; zeros and ones if there are no images."""
+        """Return offset (2, 9) and flux (9,) of the image nearest to a position in pixels; zeros and ones if none."""
         if not self.at.shape[1]:
             return torch.zeros(2, 9, dtype=torch.float64), torch.ones(9, dtype=torch.float64)
         point = int(torch.argmin((self.at[0] - column) ** 2 + (self.at[1] - row) ** 2))
@@ -144,7 +144,7 @@ class LocalImages:
 
 
 def _biquadratic(points: Sequence[tuple[float, float]]) -> Tensor:
-    """Return the weights (9, points) that interpolate 3 x 3 values at points, by Lagrange polynomials in x and y."""
+    """Return the weights (9, points) that interpolate 3 x 3 values to points (x, y) in half widths of the source."""
     d = POINT_DISTANCE
     axes = [
         (u * (u - d) / (2 * d**2), 1 - (u / d) ** 2, u * (u + d) / (2 * d**2))

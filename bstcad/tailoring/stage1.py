@@ -51,13 +51,13 @@ FINE_ROUNDS = 2  # number of fine rounds: the first has half the cells per side 
 # further rounds do not improve.
 RETRY_RRMSD, RETRY_CHANGE = 0.25, 0.025
 SETTLED_CHANGE = 0.01  # RMS change of the map, in the unit of RETRY_CHANGE, below which coarse rounds end
-MAX_RAY_CELLS = 1026  # largest number of rays per side in the slope fit; a finer grid interpolates between rays
+MAX_RAY_CELLS = 1026  # largest number of rays per side for the slope fit; further points are interpolated between them
 MIN_FLUX_RATIO = 0.9  # smallest accepted flux on the target after `follow_aims`, relative to the flux after the rounds
 AIM_ROUNDS = 5  # number of rounds of `follow_aims`
 SCALAR_EVALUATIONS = 8  # evaluations of the merit in the search for one parameter of the front
 SIMPLEX_EVALUATIONS = 40  # evaluations of the merit in the search for curvature and conic constant together
 MAX_RIM_SINE = 0.5  # sine of the largest slope angle of the front at the rim
-MAX_ELLIPSE, MAX_HYPERBOLA = 0.8, 6.0  # largest (1 + k) c² r² and -(1 + k) c² r² at the rim in the search
+MAX_ELLIPSE, MAX_HYPERBOLA = 0.8, 6.0  # largest (1 + k) c² r² and -(1 + k) c² r²: conic constant, curvature, rim radius
 UNBOUNDED = (-math.inf, math.inf)
 
 Range = tuple[float, float]  # lower and upper bound
@@ -117,7 +117,7 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
 def is_poor_result(task: Task, lens: Lens, by_rays: float, state: SlopeRound) -> bool:
     """Return True if the result of the rounds is poor: a large RRMSD, or a map that still changes.
 
-    The RRMSD is computed with no more pixels per side than control points: no method resolves finer detail.
+    by_rays: RRMSD of the lens; if large, it is computed again without detail that the net cannot resolve.
     """
     goal = task.goals[0]
     few = resample(goal, pixels=max(as_pair(task.knobs.levels[-1])))
@@ -228,8 +228,8 @@ def shaped_front(
 def best_front(merit: FrontMerit, lens: Lens, free: tuple[str, ...], rim_sags: Range = UNBOUNDED) -> Lens:
     """Return the lens whose front minimises `merit` in its free parameters; each evaluation refits the back.
 
-    Bounds: at the rim the slope angle of the front is at most 30°, half of the blank's thickness remains, and the sag
-    (mm) lies in `rim_sags`.
+    Bounds: at the rim the slope angle of the front is at most 30°, the sag is at most half of the blank's thickness,
+    and the sag (mm) lies in `rim_sags`, (low, high).
     """
     if "curvature" in free:
         bounds = _curvatures(lens, rim_sags, float(lens.front.curvature))
@@ -289,7 +289,7 @@ def _rim_radius(lens: Lens) -> float:
 def _curvatures(lens: Lens, rim_sags: Range, *included: float) -> Range:
     """Return the range of curvatures c (1/mm) that `best_front` allows with the front's conic constant k.
 
-    The slope angle at r has the sine S where c = S / (r sqrt(1 + k S²)).  included: values to include where possible.
+    A slope angle at r with the sine S needs c = S / (r sqrt(1 + k S²)).  included: values to include where possible.
     """
     rim, k = _rim_radius(lens), float(lens.front.conic_constant)
     room = (lens.back.z - lens.front.z) / 2

@@ -68,7 +68,7 @@ LARGE_PIXELS, FAR_OFF_RRMSD = 16, 0.04
 # since no coarse round can follow it: a stage must not end with few pixels.  (Draft of a plate with at most 2 mm of
 # glass: RRMSD 0.264 with a factor of 1.5, 0.236 with 3, but 0.408 if 60 evaluations on 64 pixels come last.)
 EVALUATION_FACTOR, SINGLE_ROUND_FACTOR = 1.5, 3.0
-IMAGE_POSITIONS, SECOND_MOMENT_POINTS = 16, 8  # cells per side of the back, and source points, for the image width
+IMAGE_POSITIONS, SECOND_MOMENT_POINTS = 16, 8  # cells per side of the back, source points, for the source image's width
 MIN_EVALUATIONS = 30  # evaluations below which stage 2 has a single round and stage 3 gets twice as many
 COMPARED_NET = 65  # largest number of control points per side in `compare_precisions`, for speed
 COMPARED_TUBES = 128  # tubes per side in `compare_precisions`
@@ -319,7 +319,7 @@ class Problem:
 
 
 def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariables:
-    """Return the variables of stage 2 for all nets; pixels: cells on the longer side of coarser nets, or None."""
+    """Return the variables of stage 2 for all nets; pixels: cells on the longer side of coarser nets; None: without."""
     nets = lens.nets
     if pixels is not None:
         lens = lens.with_nets(net.refined(coarser(net.shape, pixels + 1)) for net in nets)

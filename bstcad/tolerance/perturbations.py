@@ -301,7 +301,7 @@ def _alignments(lens: Lens) -> Iterator[Kind]:
 
 
 def _decentre_front(axis: int, setup: Setup, by: float) -> Setup:
-    """Shift the front and the rim of the lens (mm); the back stays fixed in the room.
+    """Shift the front and the rim of the lens by `by` mm along an axis (0: x, 1: y); the back stays fixed in the room.
 
     A lens is traced in the frame of its front.  Therefore the back is shifted inversely, and the whole lens moves with
     the front.  The net of the back is extended linearly to reach the rim; inside, the face does not change.
@@ -318,7 +318,7 @@ def _decentre_front(axis: int, setup: Setup, by: float) -> Setup:
 
 
 def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
-    """Rotate the back about its vertex v by `by` degrees; front, rim and all other parts stay fixed.
+    """Rotate the back by `by` degrees about an axis (0: x, 1: y) through its vertex v; front, rim and the rest stay.
 
     A point p = v + (x, y, ζ) of the rotated face was at v + q before, with q = Rᵀ (p - v).  In place of the
     unrotated face of height h, its tangent plane at (x, y) is used: q_z = h - h(v) + ∇h · ((q_x, q_y) - (x, y)), linear
@@ -395,7 +395,7 @@ def as_net(face: Surface, outline: Outline) -> BSplineSurface:
     """Convert a plane, a sphere or a conic into a net of FACE_NET control points per side; return a net unchanged.
 
     The net interpolates the face at each control point.  A uniform spline approximates a curve poorly in its end spans.
-    For a round outline the end spans lie outside the rim, where the net becomes level; for a rectangle, at its sides.
+    For a round outline these spans lie outside the rim, where the net becomes level; for a rectangle, along its sides.
     """
     if is_net(face):
         return face

@@ -155,7 +155,7 @@ DERIVATIVE_STEP = 0.5  # step of the central difference for each perturbation, i
 # more than its detail is not a polynomial of ξ, so strong directions need many nodes.
 SPLINE_NODES = ((0, (-3.0, -2.0, -1.2, -0.5, 0.5, 1.2, 2.0, 3.0)), (4, (-2.5, -1.0, 1.0, 2.5)), (8, (-1.0, 1.0)))
 NONLINEAR_DIRECTIONS = 12  # number of strongest directions with nodes; along weaker directions pictures are linear
-MIN_STRENGTH = 1e-3  # change of the picture, relative to the strongest direction, below which pictures are linear too
+MIN_STRENGTH = 1e-3  # change of the picture / change along the strongest direction, below which there are no nodes
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,8 +251,8 @@ WORST_SHOWN = 5  # number of reported worst trials
 SCREEN_ADJUSTMENTS = {f"screen.{motion}" for motion, *_ in MOTIONS}  # motions by which a user adjusts the screen
 ADJUSTMENT_RANGE = 8.0  # largest adjustment (±) of each motion of the screen, in standard deviations
 ADJUSTMENT_FACTOR = 10.0  # limit, relative to the default grade, of an adjustment that is not an error of the study
-QUOTIENT_STEP = 1e-4  # step of the difference quotients, in standard deviations
-INDEPENDENT_SEED = 7919  # offset of the seed of independent trials
+QUOTIENT_STEP = 1e-4  # step of the difference quotients in `adjusted_rrmsd`, in standard deviations
+INDEPENDENT_SEED = 7919  # offset of the seed of the independent trials in `loosest_limits`
 
 Yield = tuple[float, float, float]  # fraction of trials within a limit: low, estimate, high (Wilson's 95 % interval)
 
@@ -305,7 +305,7 @@ class Study:
 
     @property
     def bias(self) -> float:
-        """Squared numerical error of the tubes: squared RRMSD by tubes minus squared RRMSD by independent rays."""
+        """Squared numerical error of the tubes: squared RRMSD of the design by tubes minus that by independent rays."""
         return self.model.rrmsd**2 - self.rrmsd**2
 
     def within_limit(self, amounts: np.ndarray) -> np.ndarray:

@@ -187,7 +187,7 @@ def _gradient(u, x, y):
 
 @njit(cache=True, nogil=True)
 def _rows_reached(x):
-    """Return the range (first, last + 1) of the rows of pixels that boxes centred between the corners x can touch."""
+    """Return the range (first, last + 1) of the rows of cells that boxes centred between the corners x can touch."""
     n = x.shape[1] - 1
     least, most = float(n), 0.0
     for i in range(x.shape[0]):

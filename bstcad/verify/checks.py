@@ -42,15 +42,15 @@ if TYPE_CHECKING:
 
 VERTEX_ROUNDING = 2e-7  # largest distance of a float32 vertex from a sloped face, relative to the largest coordinate
 VERIFY_SEED = 1_000_003  # offset of the seed, for rays that tailoring has not used
-TARGET_TOLERANCE = 1e-3  # largest difference of a target due to versions of picture libraries, relative to its maximum
+TARGET_TOLERANCE = 1e-3  # largest difference of the target in design.npz from the scene's / maximum (libraries change)
 DEFAULT_RRMSD_LIMIT = 0.25  # limit of the RRMSD in remarks, plans and tolerance studies if accept.rrmsd is not set
 LINE_TUBES = 1031  # smallest number of tubes per side for the picture of one line of a spectrum
 CLEAR_APERTURE_TOLERANCE = 1e-3  # largest distance (mm) between the rims of measured and designed apertures
-MIN_MOUNT_LOSS = 1e-3  # fraction of the light that a mount must cut away to be given as the reason for a failure
+MIN_MOUNT_LOSS = 1e-3  # smallest fraction of light cut away by a mount that a failed check states as its reason
 MAX_FLANGE_LIGHT = 1e-3  # largest fraction of the light through the clear apertures that may meet the flange
 WAVEFRONT = "wavefront error, RMS in waves, piston and tilt removed"
 DRAFT_ACCURACY = 0.01  # relative standard error of the RRMSD at which ray tracing ends, for draft quality
-MAX_FLOOR = 0.1  # largest ratio of the wavefront error's rounding error to accept.wavefront, for a certain verdict
+MAX_FLOOR = 0.1  # largest rounding error of the wavefront error / accept.wavefront that leaves the verdict certain
 TIME_LIMIT, TIME_LIMIT_PER_MB = 120.0, 3.0  # timeout of OCC (s) and its increase per MB, 100 times the usual time
 
 R = TypeVar("R")
@@ -106,7 +106,7 @@ class Proof:
     lens: Lens  # lens re-read from lens.step or, with a mount, from part.step, including clear apertures
     lights: tuple[Light, ...]  # light of the lens on each target
     shape: dict[str, float | None]  # figures by key: lens within the mount's rim, volume of lens.step (mm³), ripple
-    stability: dict[str, float | int | None]  # figures of stability by key, see `_stability`
+    stability: dict[str, float | int | None]  # figures of stability by key (record.Contents)
     blur: Blur | None = None  # blur due to the source's size on the worst target; None: the source has no size
     lines: Lines = ()  # pictures of the lines of a spectrum on the worst target
     at_bounds: dict[str, AtBound] | None = None  # bounds that the lens reaches, by key; None: no bound is reached
@@ -140,7 +140,7 @@ def verify(
 
     Raises ValueError if lens.step or lens.stl cannot be read or a target receives no light.  submit: with
     bstcad.runs.processes.submit, OCC reads the STEP file in a second process, while this one reads text and mesh.
-    on_lens: called with the re-read lens.  on_light: called for each target, as OnLight states.
+    on_lens: called with the re-read lens.  on_light: called for each target (OnLight).  effort: see `Nominal.effort`.
     """
     effort = nominal.effort(effort)
     effort = replace(effort, seed=effort.seed + VERIFY_SEED, seconds=effort.seconds / len(nominal.goals))
@@ -264,7 +264,7 @@ def _aperture_check(name: str, measured: Outline, designed: Outline) -> Check:
 def _stability(
     lens: Lens, nominal: Nominal, lights: Sequence[Light], shape: Mapping[str, float | None]
 ) -> tuple[dict[str, float | int | None], list[Check]]:
-    """Return figures of stability (degrees, 1/mm), and checks of total internal reflection and of finite values."""
+    """Return figures of stability (record.Contents), and checks of total internal reflection and of finite values."""
     margin = margins(nominal.channels, lens, nominal.goals[0].receiver, nominal.scene.tailoring.seed + VERIFY_SEED)
     keys = (f"{face}radius_min_{kind}" for face in ("", "front_") for kind in ("concave", "convex"))
     radii = [radius for key in keys if (radius := shape.get(key))]

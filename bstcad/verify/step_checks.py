@@ -38,8 +38,8 @@ from bstcad.verify.verdict import Check
 NORMAL_TOLERANCE = 1e-9  # largest angle (rad) between written and designed normals
 CURVATURE_TOLERANCE = 1e-12  # largest difference (1/mm) of written and designed curvature
 CONIC_TOLERANCE = 1e-9  # largest difference of sag (mm) due to the conic constant, which a flat front hardly defines
-GAP_TOLERANCE = 5e-7  # largest gap (mm); shapes are written with a tolerance of 1e-7 mm
-PART_EDGE_TOLERANCE = 1e-6  # largest distance (mm) between edges of two parts, written with a tolerance of 1e-7 mm
+GAP_TOLERANCE = 5e-7  # largest gap (mm) at an edge or vertex, or between edge and face; shapes are exact to 1e-7 mm
+PART_EDGE_TOLERANCE = 1e-6  # largest distance (mm) between edges of part.step and of the scene's part, exact to 1e-7 mm
 PART_FILE = "part.step"
 
 
@@ -54,7 +54,7 @@ def one_sentence(work: Callable[..., Any]) -> Callable[..., Any]:
             raise
         except Exception as error:  # OCC has a hundred classes of errors without a common base
             name, kind = path.name if path.suffix else PART_FILE, type(error).__name__
-            raise ValueError(f"{name}: read by OpenCASCADE: the solid is damaged ({kind}); write it again") from error
+            raise ValueError(f"{name}: OpenCASCADE finds the solid damaged ({kind}); write it again") from error
 
     return checked
 
@@ -286,7 +286,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
 
 
 def _part_edge_check(wanted: Any, reread: Any, why: str) -> Check:
-    """Check the distance (mm) between edges of two solids; wanted: part of the mount, None if not built, see `why`."""
+    """Check the distance (mm) between edges of two solids; wanted: the scene's part, or None if not built (`why`)."""
     name = f"{PART_FILE}: distance of edges from the mount's"
     if wanted is None:
         return Check.true(name, False, why, id="part-edges")

@@ -22,7 +22,7 @@ from bstcad.verify.verdict import Check
 SOURCE = "STEP text"  # source of the checked values, at the beginning of the checks' names
 NET_TOLERANCE = 1e-11  # absolute tolerance of control points (mm), larger than their rounding in the text
 RELATIVE_ROUNDING = 2e-15  # relative tolerance of coordinates, larger than NET_TOLERANCE beyond 5 m from the origin
-MEASURE_TOLERANCE = 1e-6  # relative tolerance of area, volume and centroid; integrals over a rough back err by 1e-9
+MEASURE_TOLERANCE = 1e-6  # tolerance of area and volume, relative, and of centroid / diagonal; integrals err by 1e-9
 VALUE_TOLERANCE = 1e-12  # absolute tolerance of stated numbers (mm or g/cm³), more than their rounding in the text
 
 Numbers = tuple[float, ...]

@@ -31,14 +31,14 @@ class Check:
     def at_most(
         cls, name: str, value: float, limit: float | None, unit: str = "", where: str = "", *, id: str = ""
     ) -> Check:
-        """Return a check that passes if value <= limit; a value that is not finite fails."""
+        """Return a check that passes if value <= limit, or limit is None; a value that is not finite fails."""
         return cls._judged(name, value, limit, unit, passed=limit is None or value <= limit, where=where, id=id)
 
     @classmethod
     def at_least(
         cls, name: str, value: float, limit: float | None, unit: str = "", where: str = "", *, id: str = ""
     ) -> Check:
-        """Return a check that passes if value >= limit; a value that is not finite fails."""
+        """Return a check that passes if value >= limit, or limit is None; a value that is not finite fails."""
         return cls._judged(name, value, limit, unit, passed=limit is None or value >= limit, where=where, id=id)
 
     @classmethod
