@@ -348,7 +348,7 @@ def examine(path: Path) -> Examined:
 
 
 def read(folder: Path) -> Made:
-    """Read the design in a folder, with stages and history from report.json."""
+    """Read the design in a folder, with the stages and history of its making from report.json."""
     scene, nominal = folders.read_nominal(folder)
     making, sent = record.making(folder / "report.json"), folders.read_transport(folder, scene)
     return Made(scene, nominal.lens, nominal.goals, making, transport=sent, stored=nominal.stored)
@@ -407,7 +407,7 @@ def _write_report(
 ) -> None:
     """Write the report as JSON, HTML and JUnit XML, with prescription.txt and figures/.
 
-    lens: the lens as read back.  studied: HTML of the report's section on tolerances.
+    lens: lens as read from lens.step.  studied: HTML of the report's section on tolerances.
     """
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     pictures = drawn.result()

@@ -156,7 +156,7 @@ def _fine_mesh(face: Face, aperture: Outline, lens: Lens, screen: Screen, up: bo
 
 
 def _scene(bench: dict[str, Entry], channels: Sequence[Channel], lens: Lens, *, edges: int, folder: Path) -> Any:
-    """Load the scene `bench` with the lamps of channels of one index; edges: most segments of a path."""
+    """Load the scene `bench` with the lamps of channels of one index; edges: maximum number of segments of a path."""
     material = {"type": "dielectric", "int_ior": channels[0].index, "ext_ior": 1.0}
     if not lens.passes.enters:
         material = {"type": "conductor", "material": "none"}

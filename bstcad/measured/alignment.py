@@ -36,11 +36,11 @@ MAX_OUTLIER_ROUNDS = 6  # maximum number of rounds of outlier rejection
 STEP_TOLERANCE = 1e-10  # largest component (mm at the rim) of a step that ends the iteration
 FOOT_ITERATIONS = 3  # iterations for the foot of a perpendicular; each multiplies the error by distance x curvature
 INDEPENDENT_PATCHES = 100  # assumed number of patches of a face with independent form errors
-SCALE_PATCHES = 16  # assumed number of independent patches of form errors that resemble a scale error, such as power
+SCALE_PATCHES = 16  # assumed number of independent patches of form errors that resemble a scale error, as power does
 MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty of a motion due to form errors / BackFace.reach, above which it stays zero
 MIN_SENSITIVITY = 1e-7  # smallest RMS change of the distances per motion (mm/mm); smaller ones are rounding errors
 RIM_MARGIN = 2e-3  # width, in half widths, of the rim that is ignored: points there may lie on the edge
-FACE_DISTANCE_FRACTION = 0.25  # largest distance along z of a point from the face, per smallest thickness of the lens
+FACE_DISTANCE_FRACTION = 0.25  # largest distance along z of a point from the face / smallest thickness of the lens
 MOTION_NAMES = ("shift in x", "shift in y", "shift in z", "rotation about x", "rotation about y", "rotation about z")
 
 

@@ -27,7 +27,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import sag, sampled
 
 POLYNOMIAL_DEGREE = 2  # degree of the polynomial in x and y
-NET_MARGIN = 0.2  # margin of the field's net beyond the lens's, relative to its side, since cosines end with zero slope
+NET_MARGIN = 0.2  # margin of the field's net around the lens's / side of the lens's: cosines end with zero slope
 POINTS_PER_NET_CELL = 6.0  # mean number of measured points in a cell of the field's net
 FIELD_NET_LIMITS = (9, 513)  # limits of the field's control points per side, before they are rounded up for the FFT
 MAX_REFINEMENT = 4  # refinement factor per side of a lens's net to which a finer field is added; nets are not nested

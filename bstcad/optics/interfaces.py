@@ -244,7 +244,7 @@ def net_bounds(surface: BSplineSurface, dtype: torch.dtype, sense: int = 1) -> N
 def first_root(
     net: BSplineSurface, start: Tensor, path: Tensor, rays: Rays, bounds: NetBounds
 ) -> tuple[Tensor, Tensor]:
-    """Return (path s (mm) of rays from points `start` (3, …) on z = net.z to the net, mask of rays that meet it).
+    """Return (s, meets): length (mm) along each ray from `start` (3, …) on z = net.z to the net, and mask of hits.
 
     path: signed length (mm) from the position of each ray to `start`; roots behind the position do not count.  Rays
     that are steep to the surface must begin in the glass.
@@ -274,7 +274,7 @@ def _select(vectors: Tensor, index: tuple[Tensor, ...]) -> Tensor:
 def _newton(
     net: BSplineSurface, start: Tensor, direction: Tensor, s: Tensor, searched: Tensor, tolerance: float, first: int = 0
 ) -> tuple[Tensor, Tensor]:
-    """Return (s* with |F| <= tolerance (mm), mask of success) by Newton steps from s, numbered from `first` on."""
+    """Return (s* with |F| <= tolerance (mm), mask of success) by Newton steps from s; first: steps made before."""
     dx, dy, dz = direction
     meets = torch.zeros_like(searched)
     for step in range(first, NEWTON_STEPS):

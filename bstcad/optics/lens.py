@@ -63,7 +63,7 @@ class Lens:
 
     @property
     def passes(self) -> Passes:
-        """Passes of the light through the solid."""
+        """Passes of the light through the solid: the faces, in the order in which they act on it."""
         return self.own_passes or (MIRROR if self.reflects else LENS)
 
     @property
@@ -177,7 +177,7 @@ class Lens:
 
     @property
     def like(self) -> Tensor:
-        """Tensor of the precision and device of the lens: the heights of a net, else float64 on the CPU."""
+        """Tensor of the precision and device of the lens: the heights of a net, else an empty one (float64, CPU)."""
         last = self.last_freeform.surface
         return last.heights if is_net(last) else torch.zeros(0, dtype=torch.float64)
 

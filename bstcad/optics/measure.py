@@ -69,7 +69,7 @@ EVEN_POINT_PAIRS = 2048  # number of pairs of points that represent a uniformly 
 class Effort:
     """Limits of the work of a measurement; the default is the effort of a verification."""
 
-    rays: int = 2896  # maximum rays per side of the window in each of SETS sets: 67 million per spectral line
+    rays: int = 2896  # maximum rays per side of the window, in each of SETS sets of a pass: 67 million per line
     seed: int = 0  # seed of the rays
     places: int = 1025  # points per side of the lens at which a verification evaluates the thickness
     points: int = 1 << 17  # points per face at which the written file is compared with the design
@@ -460,7 +460,7 @@ class RayTubes:
 def tubes_picture(
     lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, over_the_back: bool = False
 ) -> Tensor:
-    """Return the flux in each pixel as a fraction of the source's, by n x n tubes per channel (`tubes.picture`)."""
+    """Return the flux per pixel as a fraction of the source's, by n x n tubes per channel; options: `tubes.picture`."""
     few = COARSE_SHEET if over_the_back else tubes.SHEET_TUBES
     lights = ((c.source, c.through(lens)) for c in channels)
     pictures = (tubes.picture(*light, screen, n, few=few, over_the_back=over_the_back) for light in lights)

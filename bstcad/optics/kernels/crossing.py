@@ -51,9 +51,9 @@ def _load(position, direction, status, first, count, work):
 def _cross(net, faces, tilted, lands, position, direction, status, out, path, cosine, first, last):
     """Trace rays first … last - 1 to the face and refract or reflect them.
 
-    lands: True: out (2, n) receives the landing points (mm); None: out (6, n) receives hit (mm) and direction behind
-    the face.  path (n,) receives the path to the face (mm), status (n,) is updated, and cosine receives the cosine of
-    the angle of incidence, (n,), or nothing if it is empty.
+    If lands is True, out (2, n) receives the landing points (mm); if None, out (6, n) receives hit (mm) and direction
+    behind the face.  path (n,) receives the path to the face (mm), status (n,) is updated, and cosine (n,) receives the
+    cosine of the angle of incidence, if it is not empty.
     """
     work, active = np.empty(WORK), np.empty(BLOCK, np.uint32)
     for begin in range(first, last, BLOCK):

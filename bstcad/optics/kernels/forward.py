@@ -29,7 +29,7 @@ from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Landed, Status
 from bstcad.optics.receivers import Receiver
 
-BLOCK = 256  # rays in a block
+BLOCK = 256  # number of rays in a block
 # Offset of each quantity in `work`; constants, so that the compiler sees that they do not overlap.
 X, Y, Z, DX, DY, DZ, FLUX, FATE, S, SAG, SLOPE_X, SLOPE_Y, U, V, U_S, V_S = (BLOCK * k for k in range(16))
 COS_FRONT, COS_BACK, PATH = (BLOCK * k for k in range(16, 19))  # offsets used only where there are losses
@@ -133,7 +133,7 @@ def to_net(faces, count, work):
 
 @njit(error_model="numpy", fastmath={"contract"})
 def search(net, faces, count, work, active):
-    """Find path s from the net's plane to the back by Newton steps of all rays in turn, as `interfaces._newton`.
+    """Find path s from the net's plane to the back by Newton steps of all rays in turn, as `interfaces._newton` does.
 
     On return `work` contains s after a ray's last step, and sag and slopes (in u and v) before that step.
     """

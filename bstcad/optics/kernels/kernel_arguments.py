@@ -85,7 +85,7 @@ def _table(interface: Interface) -> np.ndarray:
 
 
 def beam(source: Emitter, lens: Lens, tables: bool = True) -> Beam | None:
-    """Return the light of a source on the plane of the first vertex of a lens; None: the plain form traces it.
+    """Return the light of a source on the plane of the first vertex of a lens; None: plain torch traces it.
 
     tables: allow a table of the light if no formula is known.
     """

@@ -26,8 +26,8 @@ from bstcad.optics.kernels.compiling import compiled
 
 MAX_PARTS = 16  # maximum number of parts; a power of two, so that two, four or eight threads have equal work
 MIN_PART = 1 << 14  # minimum number of rays or tubes in a part
-ROW_LENGTH = 4096  # numbers summed by one thread
-ELEMENTARY = 1024  # numbers whose exp, sin or cos torch computes at once, by one thread: it divides only 2048 or more
+ROW_LENGTH = 4096  # count of numbers summed by one thread
+ELEMENTARY = 1024  # count of numbers whose exp, sin or cos one thread of torch computes; torch divides 2048 or more
 
 
 def parts(n: int) -> int:

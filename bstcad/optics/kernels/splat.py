@@ -84,7 +84,7 @@ def _splat_adjoint(position, flux, frame, g, g_outside, d_position):
 
 
 class Splat(torch.autograd.Function):
-    """Map (position (2, n), flux (n,), frame, shape) to (image (rows, columns), outside), as `irradiance.collect`.
+    """Map (position (2, n), flux (n,), frame, shape) to (image (rows, columns), outside), as `irradiance.collect` does.
 
     frame: x_min, columns per unit, y_max, rows per unit (of the receiver).  The gradient is taken in the position.
     """
