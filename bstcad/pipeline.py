@@ -128,7 +128,7 @@ def design(
     """
     began, merit = time.perf_counter() if began is None else began, options.merit
     if merit is not None and (len(scene.targets) > 1 or scene.wavefront is not None):
-        raise SceneError("merit: it needs a scene with one goal, not several; omit merit, or omit the other goals")
+        raise SceneError("merit: a merit function needs a scene with one goal; omit it, or omit the other goals")
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
     goals, edge = within_reach(scene, hooks.progress)

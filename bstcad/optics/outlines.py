@@ -21,7 +21,7 @@ STRICT = {"extra": "forbid", "arbitrary_types_allowed": True, "revalidate_instan
 # are boxes with round corners; a circle (a = b = 0) and a rectangle (r = 0) are the limiting cases.
 Limits = tuple[float, float, float]
 SIZE_RANGE = (1e-3, 1e6)  # smallest and largest width, height or radius of an outline in a scene, mm
-OUTLINE_POINTS = 720  # rim points on the arcs of an outline together, and about as many on its straight sides together
+OUTLINE_POINTS = 720  # number of rim points on all arcs of an outline, and about the number on all its straight sides
 
 
 class _Box(ABC):
@@ -36,7 +36,7 @@ class _Box(ABC):
 
     @property
     def farthest(self) -> tuple[float, float]:
-        """Point (x, y) (mm) of the rim that is farthest from the axis, with x, y >= 0: a corner, or an arc's middle."""
+        """Point (x, y) (mm) of the rim farthest from the axis, x, y >= 0: in line with the axis and an arc's centre."""
         a, b, r2 = self.limits
         r, d = math.sqrt(r2), math.hypot(a, b)
         return (a * (1 + r / d), b * (1 + r / d)) if d else (r, 0.0)
@@ -68,7 +68,7 @@ class _Box(ABC):
         return x, y
 
     def inset_direction(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the shift (x, y) of rim points per mm of inset: along the normal, on a rectangle (-x/a, -y/b)."""
+        """Return the shift (x, y) of rim points per mm of inset: the inward normal, (-x/a, -y/b) on a box 2a x 2b."""
         a, b, r2 = self.limits
         if r2 == 0:
             return -x / a, -y / b

@@ -76,11 +76,11 @@ class Passes:
 
     @property
     def reversal(self) -> int:
-        """Direction along z of the emergent light relative to the incident light: 1 or -1."""
+        """Direction along z of the emergent light relative to the incident light: 1, or -1 if it is reversed."""
         return (-1) ** sum(law is Reflect for _, law in self.steps)
 
     def deflection(self, face: Face, index: float) -> float:
-        """Return the deflection, by all passes at a face, divided by the slope angle of the face, for small angles."""
+        """Return the deflection of a ray by all its passes at a face, divided by the face's (small) slope angle."""
         by_law = {Reflect: 2.0 * (index if self.enters else 1.0), Refract: abs(index - 1)}
         return sum(by_law[self.steps[k].law] for k in self.numbers_of(face))
 
@@ -99,7 +99,7 @@ class Passes:
         return f"by a {self.optic}'s {', '.join(step.face for step in self.steps)}"
 
     def name(self, face: Face) -> str:
-        """Return "front" or "back" if a face refracts, "mirror face" if it only reflects, "rear" if light misses it."""
+        """Name a face: "front" or "back" if it refracts, "mirror face" if it only reflects, "rear" if it stays dark."""
         laws = [self.steps[k].law for k in self.numbers_of(face)]
         return face if Refract in laws else "mirror face" if laws else "rear"
 

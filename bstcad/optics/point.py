@@ -75,7 +75,7 @@ class Point(Emitter):
         return self.position[2] + (reach if upwards else -reach)
 
     def complaints(self, z: float, optic: str) -> Iterator[str]:
-        """Yield "key: sentence" for a missing, superfluous or too large size, larger than the distance to z (mm)."""
+        """Yield "key: sentence" for a size that is missing, superfluous or larger than the distance to z (mm)."""
         given = [name for name in ("width", "height") if getattr(self, name) is not None]
         if given and self.diameter is not None:
             yield f"diameter: the source also has a {given[0]}; give a diameter, or width and height"
@@ -150,7 +150,7 @@ class Point(Emitter):
         return replace(self, diameter=diameter, width=width, height=height)
 
     def element(self, x: float, y: float) -> Point:
-        """Return the point source at (x, y) of the extent (mm)."""
+        """Return the point source at (x, y) (mm) of the extent."""
         e_x, e_y, _ = self.axes
         position = point_along(point_along(self.position, x, e_x), y, e_y)
         return replace(self, position=position, diameter=None, width=None, height=None)

@@ -1,6 +1,6 @@
 """Integrals over any face inside any border, from which area, volume and centroid follow.
 
-They use Green's theorem and are exact to about 1e-9; the tests compare them with the exact integral of a control net.
+They use Green's theorem; their relative error is about 1e-9.  The tests compare them with exact integrals of a net.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ CHORD_POINTS = 96  # Gauss points of a chord over a face without net; exact to r
 END_PARTS = 12  # minimum number of parts of an end span, where heights are not polynomial; gives volumes to 1e-12
 BORDER_POINTS_PER_STRIP = 512  # number of border points evaluated at a time
 MIN_RELATIVE_DX = 1e-14  # |dx| / ds up to which border points are left out, since they add nothing to ∮ … dx
-EDGE_PARTS = 256  # minimum number of parts of a curve of a border
+EDGE_PARTS = 256  # minimum number of parts into which each curve of a border is divided
 
-gauss_rule = functools.cache(np.polynomial.legendre.leggauss)  # points and weights on [-1, 1], by their number
+gauss_rule = functools.cache(np.polynomial.legendre.leggauss)  # Gauss points and weights on [-1, 1], by their number
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ class Sums:
 def of_face(face: Surface, border: Border, raised: float = 0.0) -> Sums:
     """Return the sums over z = h(x, y) + raised (mm) inside a border, with n dA = (-h_x, -h_y, 1) dx dy.
 
-    ∫∫ g dx dy = -∮ G dx, where G = ∫ g dy along a chord of constant x from y = 0 to the border; a Gauss quadrature
-    each.  h: heights of the face, in float64.
+    ∫∫ g dx dy = -∮ G dx, where G = ∫ g dy along a chord of constant x from y = 0 to the border; both are Gauss
+    quadratures.  h: heights of the face, in float64.
     """
     total = Sums()
     counted = np.flatnonzero(np.abs(border.dx) > MIN_RELATIVE_DX * border.ds)
@@ -155,7 +155,7 @@ def _chords(face: Surface, x: np.ndarray, y: np.ndarray, dx: np.ndarray) -> tupl
 
 
 def _chord_ends(face: Surface, y: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return y of the ends of each chord's parts, (n, parts + 1), some parts of length 0; and the points per part."""
+    """Return y (mm) of the ends of each chord's parts, (n, parts + 1), some of length 0, and the points per part."""
     low, high = np.minimum(y, 0.0)[:, None], np.maximum(y, 0.0)[:, None]
     if not is_net(face):
         return np.hstack([low, high]), CHORD_POINTS
@@ -167,7 +167,7 @@ def _points(face: BSplineSurface) -> int:
 
 
 def _smooth_parts(face: BSplineSurface, axis: int, parts: int) -> np.ndarray:
-    """Return breaks (mm) that divide an axis of a net into at least `parts` parts of nearly polynomial heights."""
+    """Return breaks (mm) that divide x (axis 0) or y (1) of a net into at least `parts` parts, nearly polynomial."""
     (first, last), pitch = (face.x, face.y)[axis], face.pitch[axis]
     lines = np.concatenate([[first], first + pitch * (np.arange(1, face.shape[axis] - 2) + 0.5), [last]])
     ends = [np.linspace(low, high, END_PARTS + 1) for low, high in (lines[:2], lines[-2:])]
@@ -190,13 +190,13 @@ class MassProperties:
 
     @classmethod
     def of(cls, total: Sums, z: float) -> MassProperties:
-        """Return the properties of a solid from the sums over its surface, whose origin is at z (mm) on the axis."""
+        """Return the properties of a solid from the sums over its surface; z: origin of the sums on the axis (mm)."""
         c_x, c_y, c_z = (total.moment / total.volume).tolist()
         return cls(total.area, total.volume, (c_x, c_y, z + c_z))
 
 
 def of_lens(lens: Lens) -> MassProperties:
-    """Return the properties of a bare lens to 1e-9; OpenCASCADE needs minutes for a large net, with errors of 1e-5."""
+    """Return the properties of a bare lens to 1e-9 (relative); OpenCASCADE takes minutes, and errs by 1e-5."""
     lens, total = lens.plain(), Sums()
     z_ref = lens.front.z  # origin of z in the sums: a near one limits rounding
     for face, sign in ((lens.back, 1), (lens.front, -1)):

@@ -3,8 +3,8 @@
 A face of relative index η = n / n' > 1 deflects a ray by θ' - θ, sin θ' = η sin θ.  The deflection grows with θ.  At
 the critical angle, sin θ = 1 / η, light leaves along the face and the deflection is 90° - asin(1 / η): 48° at η =
 1.4936.  A point of the face can send its light to an aim if the deflection is at most that of a ray that leaves at
-MAX_EXIT_ANGLE, and if the normal required by Snell's law, parallel to η d - d', belongs to a slope of at most
-MAX_SLOPE.  A mirror is limited by its slope alone.
+MAX_EXIT_ANGLE, and if the normal required by Snell's law, parallel to η d - d' for the directions d before and d'
+behind the face, belongs to a slope of at most MAX_SLOPE.  A mirror is limited by its slope alone.
 
 A transport map assigns the points of the face to the aims (tailoring/reachable.py).
 """
@@ -26,12 +26,12 @@ from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import Receiver, dot
 from bstcad.optics.tubes import rays_to
 
-MAX_EXIT_ANGLE = math.radians(85)  # largest angle of refraction in air (rad); in PMMA 0.2° below the critical angle
+MAX_EXIT_ANGLE = math.radians(85)  # largest angle of refraction in air (rad); incidence in PMMA 0.2° below critical
 MAX_SLOPE = math.tan(math.radians(70))  # largest slope: a steeper face cannot be machined and makes the lens thick
 
 
 def largest_deflection(index: float, grazing: float = MAX_EXIT_ANGLE) -> float:
-    """Return the deflection (rad), by a face of relative index `index`, of a ray that leaves at the angle `grazing`."""
+    """Return the deflection (rad), by a face of relative index `index`, of a ray that leaves at `grazing` (rad)."""
     return grazing - math.asin(math.sin(grazing) / index)
 
 
@@ -46,9 +46,10 @@ def grazing_of(index: float, others: Iterable[float], spread: float = 0.0) -> fl
 
 
 def spread_at(source: Emitter, lens: Lens) -> float:
-    """Return half the angle (rad) of an extended source's light that meets the last freeform face; 0 for a point.
+    """Return half the angle (rad) that a source subtends at the last freeform face, in the medium before it.
 
-    It is the largest angle at the face's centre between light from the source's centre and from the ends of its axes.
+    It is the largest angle at the face's centre between light from the source's centre and from the ends of its axes;
+    0 for a point.
     """
     if source.extent is None:
         return 0.0

@@ -123,11 +123,11 @@ class Receiver(ABC):
         return self.throw(z)
 
     def areas(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray | None:
-        """Return areas or solid angles of (rows, columns) cells of ranges x, y, relative to their mean; None: equal."""
+        """Return areas or solid angles of (rows, columns) cells of ranges x, y, divided by their mean; None: equal."""
         return None
 
     def to_level_plane(self, x: Array, y: Array, eye: float) -> tuple[Array, Array]:
-        """Return (x, y) (mm) of points of coordinates, projected from (0, 0, eye) onto the centre's level plane."""
+        """Return (x, y) (mm) of the receiver's points projected from (0, 0, eye) onto the level plane of its centre."""
         p_x, p_y, p_z = self.point(x, y)
         scale = self.throw(eye) / (p_z - eye)
         return scale * p_x, scale * p_y

@@ -55,7 +55,7 @@ def hash_seed(seed: int) -> int:
 
 
 def jitter(key: int, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two numbers in (0, 1) per cell number, from both halves of 64 bits of SplitMix64; key: hashed seed."""
+    """Return two numbers in (0, 1) per cell number, from the two 32-bit halves of SplitMix64; key: hashed seed."""
     bits = _mix(np.uint64(key) + cell.astype(np.uint64) * np.uint64(SPLITMIX_INCREMENT))
     upper, lower = ((half + 0.5) * 2.0**-32 for half in (bits >> np.uint64(32), bits & np.uint64(0xFFFFFFFF)))
     return upper, lower
@@ -69,7 +69,7 @@ def _mix(z: np.ndarray) -> np.ndarray:
 
 
 def random(window: Rectangle, count: int, seed: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """Return `count` independent uniform points, x and y (count,)."""
+    """Return x and y (mm), (count,) each, of `count` independent uniform points."""
     points = torch.rand((2, count), generator=torch.Generator().manual_seed(seed), dtype=dtype) - 0.5
     return points[0] * window.width, points[1] * window.height
 
@@ -79,7 +79,7 @@ def point_pairs(outline: Outline, pairs: int, draw: int = 0) -> list[tuple[float
 
     A golden lattice, a = (k + 1/2) / pairs and b = (k φ + shift) mod 1 for k = 0, 1, … (φ: GOLDEN_RATIO), covers one
     half: of a rectangle as (a, 2 b - 1), of a disc as the sunflower spiral r² = a, ψ = π b.  `draw` determines the
-    shift.  For two or more pairs the second moments are made those of the outline, so that a point may lie outside a
+    shift.  For two or more pairs the second moments are set to those of the outline, so that a point may lie outside a
     rectangle by hundredths of its size.  32 points of a disc have 2/3 of the noise of 128 random ones at a hard edge of
     a picture, 1/5 at a soft one.
     """

@@ -167,8 +167,8 @@ class _Revolved(Surface):
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
         """Return (path s in mm along rays from (x, y) on the plane z0, True where they meet the part with the vertex).
 
-        Of a s² - 2 g s + c r² = 0, with a = c (1 + k d_z²), g = d_z - c (x d_x + y d_y) and the unit direction d, it is
-        the root s = c r² / (g + sqrt(g² - a c r²)), at which a ray comes from below, d_z > ∇z · (d_x, d_y).
+        s = c r² / (g + sqrt(g² - a c r²)) is the root of a s² - 2 g s + c r² = 0 at which a ray comes from below, d_z >
+        ∇z · (d_x, d_y); d: unit direction, a = c (1 + k d_z²), g = d_z - c (x d_x + y d_y).
         sense: -1 for light along -z, which meets the surface at the other root.
         """
         c, (dx, dy, dz) = self.curvature, direction

@@ -59,7 +59,7 @@ class TiltedSurface(Surface):
         return self.unit_normal[2] ** 2 - self.face_curvature * f
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (h in mm, ∂h/∂x, ∂h/∂y), ∂h/∂x = (c u_x - N_x) / (N_z - c h); meaningless where it has no point."""
+        """Return (h in mm, ∂h/∂x, ∂h/∂y), ∂h/∂x = (c u_x - N_x) / (N_z - c h); meaningless where no surface exists."""
         x, y, f = self._from_vertex(x, y)
         cos2 = self._cos2(f)
         root = torch.sqrt(torch.where(cos2 > MIN_COS2, cos2, torch.full_like(cos2, MIN_COS2)))  # no NaN in the gradient
@@ -73,8 +73,8 @@ class TiltedSurface(Surface):
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
         """Return (path s in mm along rays from (x, y) on the plane z = V_z, True where they meet the surface).
 
-        Of c s² - 2 g s + f = 0, with g = N · d - c u · d and the unit direction d, it is the root near the vertex,
-        s = f / (g + sense sqrt(g² - c f)).
+        s = f / (g + sense sqrt(g² - c f)) is the root near the vertex of c s² - 2 g s + f = 0; d: unit direction,
+        g = N · d - c u · d, sense: see Rays.
         """
         (n_x, n_y, n_z), (dx, dy, dz) = self.unit_normal, direction
         x, y, f = self._from_vertex(x, y)

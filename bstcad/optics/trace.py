@@ -223,7 +223,7 @@ def simulate_plain(lights: Lights, screen: Screen, n: int) -> Simulation:
 
 
 def _as_fractions(lights: Lights, box: Tensor, tent: Tensor, flux: dict[str, float], count: int) -> Simulation:
-    """Return the sums as fractions of the source's light; light not launched missed the lens or met its underside."""
+    """Return the sums as fractions of the source's light; light not launched is beside the lens or on its underside."""
     launched = sum(flux.values())
     whole = max(launched, 1.0)  # the sum may exceed 1 slightly: a cell at the rim of a beam counts whole
     flux = {line: value / whole for line, value in flux.items()}

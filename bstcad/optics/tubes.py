@@ -51,7 +51,7 @@ class Tubes:
     flux: Tensor  # flux launched in each tube (rows, columns), as a fraction of the source's
 
     def landing(self, lens: Lens, plane: Receiver) -> Landed:
-        """Trace the corners to the receiver without the solid's apertures: `flux` excludes the light that they stop."""
+        """Trace the corners to the receiver without the solid's apertures; `flux` excludes light that these stop."""
         return from_first_net(self.rays, lens.unbounded(), plane)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
@@ -330,7 +330,7 @@ def rays_to(
 
 
 def _inverse_jacobian(arrive: Callable[..., Rays], step: float, p: Tensor, q: Tensor, height: Tensor) -> list[Tensor]:
-    """Return the inverse of ∂(point met) / ∂(p, q) by difference quotients of `step` (mm): [xx, xy, yx, yy]."""
+    """Return [xx, xy, yx, yy], the inverse of ∂(hit of `arrive`) / ∂(p, q) by difference quotients of `step` (mm)."""
     shifted_p, shifted_q = torch.cat((p + step, p - step, p, p)), torch.cat((q, q, q + step, q - step))
     right, left, above, below = arrive(shifted_p, shifted_q, height.repeat(4, 1)).position.chunk(4, dim=1)
     one, two = right - left, above - below

@@ -80,7 +80,7 @@ class PlaneWave(_Wave):
         return torch.stack([torch.full_like(x, part) for part in self.normal])
 
     def complaints(self, back: float) -> Iterator[str]:
-        """Yield the common reasons, and a sentence if the direction does not lead away from the lens."""
+        """Yield the reasons of `_Wave`, and one if the direction does not lead away from the lens."""
         yield from super().complaints(back)
         if not self.direction[2] > math.cos(MAX_RAY_ANGLE) * math.hypot(*self.direction):
             yield f"direction: {list(self.direction)} is 89 degrees or more from +z; give one such as [0.0, 0.0, 1.0]"
@@ -121,7 +121,7 @@ class SphericalWave(_Wave):
         return self.sense * from_focus / length(from_focus)
 
     def complaints(self, back: float) -> Iterator[str]:
-        """Yield the common reasons, and a sentence if the focus is in the plane, where a sphere has no wavefront."""
+        """Yield the reasons of `_Wave`, and one if the focus is in the plane, where a sphere has no wavefront."""
         yield from super().complaints(back)
         if not abs(self.centre[2]) >= MIN_FOCUS_DISTANCE:
             yield f"focus: the point lies in the plane at z = {self.z:g} mm; move the point or the plane along z"
@@ -173,7 +173,7 @@ class ZernikeWave(_Wave):
         return w, w_x / self.radius, w_y / self.radius
 
     def complaints(self, back: float) -> Iterator[str]:
-        """Yield the common reasons, and a sentence if the list of coefficients is empty."""
+        """Yield the reasons of `_Wave`, and one if the list of coefficients is empty."""
         yield from super().complaints(back)
         if not self.coefficients:
             yield "coefficients: the list is empty; give one such as [0.0, 0.0, 0.0, 1.5], or choose kind = 'plane'"

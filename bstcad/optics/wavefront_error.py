@@ -57,7 +57,7 @@ class ExitPupil:
 def exit_pupil(source: Emitter, lens: Lens, z: float, n: int = RAYS_PER_SIDE) -> ExitPupil:
     """Return the light of a point or parallel source that passes the lens, on the plane z (mm)."""
     if source.extent is not None:
-        raise ValueError("an extended source has no single wavefront; pass source.central, or another point of it")
+        raise ValueError("an extended source has no single wavefront; pass source.central or source.element(x, y)")
     lens, source = lens.plain(), source.central
     area = clear_window(source, lens)
     x, y = sampling.grid(area, n)
@@ -113,7 +113,10 @@ def optical_path(source: Emitter, lens: Lens, rays: Rays, z: float) -> tuple[Ray
 
 
 def path_from_reference(source: Emitter, z: float, rays: Rays, sense: int) -> Tensor:
-    """Return the length (mm) of rays from the wavefront where `optical_path` starts to the first surface (vertex z)."""
+    """Return the length (mm) of rays from the wavefront where `optical_path` starts to the first surface.
+
+    rays: rays on this surface; z: its vertex (mm); sense: see Rays.
+    """
     position = torch.stack([*rays.position[:2], rays.above(z)])
     return source.reference(position, z, sense)
 
@@ -193,7 +196,7 @@ def _compare(pupil: ExitPupil, wave: Wave, nm: float) -> tuple[Tensor, Tensor, _
     """Return (compared rays (n, n); for these: OPD without piston in mm, its plane fit, flux divided by its sum)."""
     compared = pupil.alive & wave.contains(pupil.x, pupil.y)
     if int(compared.sum()) < 3:
-        raise ValueError(f"too few rays reach the wave at z = {wave.z:g} mm; change z, or the circle of a Zernike wave")
+        raise ValueError(f"too few rays reach the goal wave at z = {wave.z:g} mm; change z, or a Zernike wave's circle")
     x, y, path, flux = (part[compared] for part in (pupil.x, pupil.y, pupil.path, pupil.flux))
     opd, share = path - wave.path(x, y, nm), flux / float(total(flux))
     fit = _least_squares(x, y, opd, share=share)

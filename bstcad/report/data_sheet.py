@@ -1,4 +1,4 @@
-"""Data sheet of a part, after ISO 10110-1 and -10: drawing, tables, title block, pictures of the light; PDF, one page.
+"""Data sheet of a part, after ISO 10110-1 and -10: an A4 page with drawing, tables, title block and light, as PDF.
 
 data_sheet.txt.j2 has the text of the tables.  Equal designs give equal bytes: the only date is that of the scene.
 """
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 297.0, 210.0  # size of the page, A4 (mm)
 FRAME = (20.0, 10.0, 287.0, 200.0)  # left, lower, right and upper edge of the frame (mm, ISO 5457)
-TABLE_TOP, TITLE_LEFT, LIGHT_LEFT = 60.5, 205.0, 226.0  # top of tables, left of title block and of light (mm)
+TABLE_TOP, TITLE_LEFT, LIGHT_LEFT = 60.5, 205.0, 226.0  # y of the tables' top, x of title block and of light (mm)
 ROW_HEIGHT, TABLE_FONT, HEADING_FONT = 3.57, 2.3, 2.6  # height of a table row, font sizes of rows and headings (mm)
 PICTURE_PIXELS = 256  # largest number of pixels along the longer side of a picture of the light
 APERTURE_ROUNDING = 1e-4  # relative amount by which a printed clear aperture may be too small
@@ -146,7 +146,7 @@ def page(sheet: DataSheet) -> Figure:
 
 
 def _form(sheet: DataSheet) -> str:
-    """Return the form of the front in a few words: CX (convex) if a centre of curvature is on the +z side, else CC."""
+    """Return the form of the front, such as "R 50 CX"; CX (convex): centre of curvature on the +z side, else CC."""
     front = sheet.record["front"]
     radii = {name.removeprefix("radius"): radius for name, radius in front.items() if name[:6] == "radius" and radius}
     words = [f"R{way} {abs(radius):.5g} {'CX' if radius > 0 else 'CC'}" for way, radius in radii.items()]

@@ -128,13 +128,13 @@ def _files(
 
 
 def sag_table(lens: Lens, points: int) -> str:
-    """Return a CSV table of both faces at the same points inside the outline: x, y, z of the front, z of the back."""
+    """Return a CSV table of x, y and z of front and back on a grid, `points` along its wider side, in the outline."""
     x, y = _inside(lens, points)
     return _csv(x_mm=x, y_mm=y, front_z_mm=sag(lens.front, x, y), back_z_mm=sag(lens.back, x, y))
 
 
 def points_table(lens: Lens, face: Surface, points: int) -> str:
-    """Return a CSV table of points of a face inside the outline with unit normals, which point out of the lens."""
+    """Return a CSV table of x, y, z and the unit normal, out of the lens, of a face on the grid of `sag_table`."""
     x, y = _inside(lens, points)
     z, z_x, z_y = (t.numpy() for t in face.plain().sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
     length = np.sqrt(1 + z_x * z_x + z_y * z_y) * (1.0 if face is lens.back else -1.0)
@@ -161,7 +161,7 @@ def turning_cloud(lens: Lens, points: int, face: Surface | None = None) -> str:
 
 
 def _sidecar(name: str, lens: Lens, points: int, light: GridLight | None) -> Iterator[tuple[str, str]]:
-    """Yield (name, text) of the sidecar of a table of sags, with a sentence for each face that is a net."""
+    """Yield (name, text) of the sidecar of a table of sags, a sentence for each net; nothing if `light` is None."""
     sentences = []
     for side, face in (("front", lens.front), ("back", lens.back)):
         if light is not None and face.is_net:

@@ -17,7 +17,7 @@ from bstcad.scene.target import drawing
 from bstcad.verify.checks import Proof
 
 Fraction = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]  # number from 0 to 1, with the rounding error of a sum
-Size = Annotated[float, Field(ge=0, le=1e12)]  # number that is not negative
+Size = Annotated[float, Field(ge=0, le=1e12)]  # number from 0 to 1e12
 Rrmsd = Annotated[float, Field(gt=0, le=1e3)]
 
 

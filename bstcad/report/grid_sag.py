@@ -2,8 +2,8 @@
 
 OpticStudio interpolates between the points of a grid by bicubic Hermite patches.  Except in the end spans, a net is one
 biquadratic polynomial in each knot span (optics/bspline.py), and the patch over the four corners of the span equals
-this polynomial.  A grid that includes all knots is exact there.  In an end span x is quadratic in the parameter t, so
-the net is not a polynomial in x; if it is inside the rim, the grid is refined until the shift is at most MAX_SHIFT.
+this polynomial.  A grid that includes all knots is exact there.  In end spans x is quadratic in the parameter t, so the
+net is not a polynomial in x; if they reach inside the rim, the grid is refined until the shift is within MAX_SHIFT.
 
 `Patches` is the surface that OpticStudio interpolates.  Rays through it and through the exact face give the shift.
 """

@@ -216,7 +216,7 @@ def _side_by_side(
 
 
 def _largest(values: np.ndarray, spot: float = MIN_SCALE) -> float:
-    """Return the end of a scale of differences: their 99.5th percentile, at least `spot` times the maximum."""
+    """Return the rounded end of a scale: 99.5th percentile of |values|, at least `spot` times their maximum."""
     size = np.abs(values)
     return round_up(max(float(np.percentile(size, 99.5)), spot * float(size.max())))
 

@@ -168,7 +168,7 @@ def width_of(text: str, size: float, bold: bool = False) -> float:
 
 
 def fitted(text: str, size: float, room: float, bold: bool = False) -> tuple[str, float]:
-    """Return (text, size) that fit into `room` (mm): scaled down to MIN_FONT_SCALE at least, then cut at the end."""
+    """Return (text, size) that fit into `room` (mm): `size` times MIN_FONT_SCALE or more, then cut at the end."""
     size *= max(MIN_FONT_SCALE, min(1.0, room / max(width_of(text, size, bold), 1e-9)))
     if width_of(text, size, bold) > room * (1 + 1e-9):
         while text and width_of(f"{text}\u2026", size, bold) > room:

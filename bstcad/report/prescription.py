@@ -172,7 +172,7 @@ def text(record: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Order:
-    """File for a shop and its facts, in mm and in the frame of the file; None: not stated, or unknown."""
+    """File for a shop and its facts, in mm and in the frame of the file; a fact is None if not stated, or unknown."""
 
     file: str  # name of the file with the geometry: part.step for a scene with a mount, else lens.step
     sha256: str  # SHA-256 of that file, hexadecimal

@@ -115,7 +115,7 @@ class LineFigures:
 
 @dataclass(frozen=True)
 class DesignCourse:
-    """Course of a design; None: unknown, since the earlier report of the design is missing."""
+    """Course of a design; a field is None if unknown, as when the earlier report of the design is missing."""
 
     seconds_total: Seconds = 0.0  # time from the command to the verified lens and the pictures of its report
     stages: tuple[StageRecord, ...] = ()
@@ -330,7 +330,7 @@ def _unreached(scene: Scene, goal: Goal) -> dict[str, float | None] | None:
 
 
 def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
-    """Return the contents with a made part and its checks.  place: its folder, relative to the report's folder."""
+    """Return the contents with a made part and its checks; place: folder of the part, relative to the report's."""
     measured = part.facts | {"deviation_map": [f"{place}{name}" for name in MAP_FILES]}
     passed, checks = contents.passed and part.facts["passed"], (*contents.checks, *part.checks)
     contents = replace(contents, checks=checks, passed=passed, measured=measured)
@@ -380,7 +380,7 @@ def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: 
 
 
 def too_steep(found: Steepness) -> list[str]:
-    """Return the remark on light that needs slopes above 70°; empty if it is at most 0.1 % of the target's light."""
+    """Return the remark on light that needs slopes above 70°; empty for at most 0.1 % of the target's light."""
     sent = {"steep_share": found.share, "steepest_deg": found.steepest}
     return [remark.text for remark in written("remarks.txt.j2", "steep", sent=sent)]
 

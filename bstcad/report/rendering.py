@@ -35,8 +35,9 @@ FEATURE_ANGLE = 35.0  # angle between facets above which their edge is drawn sha
 # The lens in clay.
 PICTURE_SIZE = (1120, 800)  # size of the picture (pixels)
 CLAY = "#d3d9e0"
-CLAY_LIGHTS = (((-1.0, 0.5, 0.7), 0.8), ((0.5, -1.0, 0.35), 0.5), ((0.1, -0.2, 1.0), 0.25))  # (direction, intensity)
-FINISH = {"ambient": 0.12, "diffuse": 0.9, "specular": 0.2, "specular_power": 30.0}  # surface of the clay
+# Lights: (direction from the lens to the light, intensity) each.
+CLAY_LIGHTS = (((-1.0, 0.5, 0.7), 0.8), ((0.5, -1.0, 0.35), 0.5), ((0.1, -0.2, 1.0), 0.25))
+FINISH = {"ambient": 0.12, "diffuse": 0.9, "specular": 0.2, "specular_power": 30.0}  # reflection of light by the clay
 EYE = (0.75, -1.5, 1.7)  # position of the eye relative to the centre, in diagonals of the bounding box
 VIEW_ANGLE = 26.0  # vertical angle of view (degrees)
 
@@ -46,7 +47,7 @@ VIEW_WIDTHS = (5, 9)  # relative widths of the two views
 GROUND, INK, SOFT = "#0e1116", "#e6eaee", "#8b96a1"  # colours of the background, of the title, of captions and frames
 GLASS_FINISH = {"color": "#b9d4ea", "specular": 0.9, "opacity": 0.42}
 METAL_FINISH, LAMP = {"color": "#9aa3ad", "specular": 0.4}, "#fff3c4"
-DARKEST = 0.35  # place of zero flux in the colour map (0 to 1), whose darker part the background would hide
+DARKEST = 0.35  # place (0 to 1) of zero flux in the colour map, whose darker colours vanish on the dark background
 ASIDE = (0.95, 0.42, 0.62)  # direction (x, y, z) to the eye for the whole path; z is multiplied by -seen_along
 NEAR = (0.9, 0.5, 0.75)  # direction (x, y, z) to the eye in the close view, which shows the back
 TITLE_WIDTH = 46  # largest number of letters per line of the title
@@ -78,7 +79,7 @@ def lens_picture(mesh: Mesh) -> bytes | None:
 
 
 def draw(path: LightPath, picture: Path | None) -> bool:
-    """Write `picture` (PNG), or show a window until the user closes it; False if this machine cannot draw in 3-D."""
+    """Write `picture` (PNG; None: show a window until the user closes it); False if this machine cannot draw in 3-D."""
     given = vars(path).items()
     arrays = {name: np.asarray(value) for name, value in given if not isinstance(value, tuple)}
     arrays |= {f"{name} {k}": each for name, value in given if isinstance(value, tuple) for k, each in enumerate(value)}
