@@ -176,10 +176,7 @@ def junit(report: Contents) -> bytes:
 
 
 def summary(report: Contents | Examined, verbose: bool = False) -> Group:
-    """Return verdict, remarks, first figures, failed checks and the number of passed ones, for `rich.print`.
-
-    verbose: list all checks, not only the failed ones.
-    """
+    """Return verdict, remarks, first figures, failed checks (verbose: all) and numbers of checks, for `rich.print`."""
     from rich.console import Group
     from rich.text import Text
 

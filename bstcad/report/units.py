@@ -27,10 +27,7 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float | bool | None) -> str:
-    """Return a value as text: three digits (0.0284), an integer in full (6 512), or yes, no or none.
-
-    A number below 1e-3 or from 1e6 on that is not an integer has two digits and a power of ten (3.2 × 10⁻⁷).
-    """
+    """Return text such as 0.0284 (three digits), 6 512 (integer), 3.2 × 10⁻⁷ (below 1e-3 or from 1e6 on), yes, none."""
     if value is None:
         return "none"
     if isinstance(value, bool | np.bool_):

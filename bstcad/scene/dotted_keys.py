@@ -101,6 +101,5 @@ def _no_such_table(tables: list[Any], name: str, number: int, shown: str) -> Sce
 
 
 def _step_text(step: Step) -> str:
-    """Return a step as it is written in a key, such as target[1]."""
     name, number = step
     return name if number is None else f"{name}[{number}]"

@@ -99,9 +99,9 @@ class Plate:
         return self.magnification * self.side / self.light.pixels
 
     def source_image(self, distance: float) -> float:
-        """Return the width (mm) of the source's image at distance L (mm) behind the plate; s: size of the source.
+        """Return the width (mm) of the source's image at this distance L (mm) from the plate.
 
-        It is s L / before for a lamp, 2 L tan(s / 2) for parallel light.
+        It is s L / before for a lamp of size s, and 2 L tan(s / 2) for parallel light of full angle s.
         """
         if self.before:
             return self.light.size * distance / self.before
@@ -242,8 +242,7 @@ def _align_comment(line: str) -> str:
 
 
 def _toml_string(text: str) -> str:
-    """Return a text as a TOML string, with the syntax of JSON."""
-    return json.dumps(text, ensure_ascii=False)
+    return json.dumps(text, ensure_ascii=False)  # JSON and TOML have one syntax for it
 
 
 def templates() -> dict[str, str]:

@@ -43,15 +43,15 @@ MAX_PICTURE_PIXELS = 64_000_000  # largest number of pixels of a picture
 MAX_PICTURE_SIDE = 65_535  # largest number of pixels along a side, the limit of JPEG
 TILE_WIDTH, TILE_LENGTH = 322, 323  # tags with the size of a TIFF file's tiles, each of which is decoded as a whole
 MAX_TILE = 4096**2  # largest number of pixels of a tile; programs write tiles of up to 1024 per side
-MAX_PICTURE_SIZE = 400_000_000  # bytes; 64 million pixels of three 16-bit channels
-MAX_PROFILE_SIZE = 10_000_000  # bytes of an ICC profile; profiles of printers have a few millions
+MAX_PICTURE_SIZE = 400_000_000  # largest file of a picture (bytes): 64 million pixels of three 16-bit channels
+MAX_PROFILE_SIZE = 10_000_000  # largest ICC profile that is used (bytes); those of printers have a few millions
 STRIP_ROWS = 256  # rows of a picture that are processed at a time
 INTEGERS = "16 bits or more and no colour tag: its values are read as sRGB; with gamma = 1, as irradiance"
 FLOATS = "floats and no colour tag: they are read as irradiance; with gamma = 2.2, as brightness on a screen"
-MAX_BLACK = 8 / 255  # largest value that counts as black; a picture in black on transparency is read from its opacity
-MAX_GAMMA = 10.0  # largest exponent that a file may state; the smallest is its inverse
+MAX_BLACK = 8 / 255  # largest pixel value, from 0 to 1, that counts as black in a picture in black on transparency
+MAX_GAMMA = 10.0  # largest gamma that is used if a file states it; the smallest is 1 / MAX_GAMMA
 LINEAR, PQ, HLG = 8, 16, 18  # transfer characteristics of a cICP chunk (ITU-T H.273)
-SWAPPED = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}  # opposite of Pillow's byte orders
+SWAPPED = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}  # opposite of each Pillow byte order
 DEVICE = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.IGNORECASE)  # names of devices on Windows
 Sample = Literal["astronaut", "camera"]  # scikit-image's bundled pictures, public domain and CC0
 SAMPLES: tuple[str, ...] = get_args(Sample)
@@ -69,7 +69,7 @@ Conversion: TypeAlias = Callable[[Image.Image], Image.Image]  # conversion of a 
 
 @dataclass(frozen=True)
 class Picture(FileContent):
-    """A picture file with its unchanged content."""
+    """The picture in a file: the unchanged content of the file, and a safe name for its copy."""
 
     name: str  # safe file name with the suffix of the format
     data: bytes = field(repr=False)  # content of the file
@@ -80,7 +80,7 @@ class Picture(FileContent):
 
 
 def safe_name(text: str) -> str:
-    """Return a file name of up to 80 letters, digits, '.', '_' and '-' that starts with no '.' or '-'; may be empty."""
+    """Return a text as a file name: up to 80 letters, digits, '.', '_' and '-', no '.' or '-' first; may be empty."""
     plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()  # é -> e
     name = re.sub(r"[^A-Za-z0-9._-]+", "-", plain.replace("\\", "/").rpartition("/")[2]).lstrip(".-")[:80].rstrip(".")
     return f"_{name}"[:80] if DEVICE.fullmatch(name) else name
@@ -97,13 +97,13 @@ def read_picture(path: Path) -> Picture:
 
 
 def kind_of(data: bytes, name: str = "the picture") -> str:
-    """Return a picture's file name suffix by its content, such as ".png"; SceneError if too large or not a picture."""
+    """Return the file name suffix of a picture's format, such as ".png"; SceneError if too large or not a picture."""
     with decoding(name):
         return FORMATS[str(_open_picture(name, data).format)]
 
 
 def from_array(values: np.ndarray) -> Picture:
-    """Return a picture of an array of irradiance on any scale, (rows, columns), row 0 at the top.
+    """Return an array of irradiance (rows, columns) on any scale, row 0 at the top, as a picture.
 
     The array is stored as a TIFF file of float32 with maximum 1.  SceneError if it is not an irradiance.
     """
@@ -115,7 +115,6 @@ def from_array(values: np.ndarray) -> Picture:
 
 
 def _array_faults(values: np.ndarray) -> Iterator[str]:
-    """Yield the faults of an array that is not an irradiance."""
     if values.ndim != 2 or values.size == 0:
         yield f"an array of shape {values.shape} is not a picture; give irradiance of shape (rows, columns)"
     if values.size > MAX_PICTURE_PIXELS or max(values.shape) > MAX_PICTURE_SIDE:
@@ -133,7 +132,7 @@ def _array_faults(values: np.ndarray) -> Iterator[str]:
 
 @contextlib.contextmanager
 def decoding(given: Picture | str) -> Iterator[None]:
-    """Raise each error of a decoder as SceneError on the picture `given` (or its name), and silence warnings."""
+    """Raise each decoder's error in the block as SceneError on the picture `given` (or its name); silence warnings."""
     name = given if isinstance(given, str) else given.name
     try:
         with _DECODING, warnings.catch_warnings(), _silent():
@@ -148,7 +147,7 @@ def decoding(given: Picture | str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """Redirect the error stream of the process, to which libtiff writes its messages, to nowhere."""
+    """Discard what is written in the block to the error stream of the process, where libtiff writes its messages."""
     try:
         saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     except OSError:  # the process has no error stream
@@ -241,7 +240,7 @@ class Photo:
     several: bool = False  # True if the file has further pictures
 
     def part(self, box: PixelBox) -> Photo:
-        """Return a part of the picture."""
+        """Return the part of the picture in a box."""
         return replace(self, image=self.image.crop(box), low=self.low and self.low.crop(box))
 
     def negative(self) -> Photo:
@@ -250,7 +249,7 @@ class Photo:
         return replace(self, curve=_negative_curve(self.curve), other_curve=other)
 
     def light(self, box: PixelBox) -> np.ndarray:
-        """Return the grey irradiance (h, w) of a part, from 0 to 1, with transparency as black."""
+        """Return the grey irradiance (h, w) in a box, from 0 to 1, with transparency as black."""
         numbers, alpha = self.numbers(box)
         if alpha is not None:
             numbers = _as_floats(numbers) * alpha[..., None]
@@ -261,13 +260,13 @@ class Photo:
         return sum(light_of[channel] for channel in channels) / len(channels)  # .mean(-1) takes three times as long
 
     def silhouette(self, box: PixelBox) -> np.ndarray:
-        """Return the irradiance (h, w) of a part from its opacity alone."""
+        """Return the irradiance (h, w) in a box, read from the opacity alone as from grey pixel values."""
         _, alpha = self.numbers(box)
         assert alpha is not None  # `transparency` has found a logo
         return self.curve(alpha)
 
     def numbers(self, box: PixelBox) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return pixel values (h, w, channels), integers or floats from 0 to 1, and opacity (h, w); None: opaque."""
+        """Return pixel values (h, w, channels), integers or floats from 0 to 1; and opacity (h, w), None: opaque."""
         image, low, alpha = self.image.crop(box), self.low and self.low.crop(box), None
         if image.mode.startswith(("I", "F")):
             return self._one_channel(image)
@@ -296,7 +295,7 @@ class Photo:
         return values[..., None] / self.white, alpha
 
     def transparency(self) -> tuple[bool, str]:
-        """Return (is_logo, remark): True for a picture in black on transparency, and a remark on transparent parts."""
+        """Return (is_logo, remark): True for a picture in black on transparency; remark on transparent parts, or ""."""
         brightest = clear = opaque = 0.0
         for box in strips((0, 0, *self.image.size)):
             numbers, alpha = self.numbers(box)
@@ -327,8 +326,8 @@ def _as_floats(numbers: np.ndarray) -> np.ndarray:
 def photo(given: Picture | str, gamma: float | None = None, invert: bool = False) -> Photo:
     """Return the decoded picture of a file, or one of SAMPLES.
 
-    gamma: irradiance = (pixel value) ** gamma; None: as the file states, and 1 for a sample, as in the paper and in
-    other programs.  invert: return the negative.
+    gamma: irradiance = (pixel value) ** gamma; None: as the file states, and for a sample 1, as in other programs.
+    invert: return the negative.
     """
     if isinstance(given, str):
         from skimage import data  # loads much of scikit-image, needed for samples only
@@ -358,7 +357,7 @@ def photo_size(given: Picture | str) -> tuple[int, int]:
 
 
 def _white(image: Image.Image) -> float:
-    """Return the pixel value of white: 1 for floats, 65535 for 32 bits, or the largest value if it is larger."""
+    """Return the pixel value of white: 1 for floats, 65535 for 32-bit integers, or if larger the largest value."""
     if image.mode not in ("I", "F"):
         return 1.0
     usual, (_, largest) = 65535.0 if image.mode == "I" else 1.0, image.getextrema()
@@ -372,7 +371,7 @@ def _negative_curve(curve: Curve) -> Curve:
 
 
 def _second_bytes(image: Image.Image, data: bytes) -> Image.Image | None:
-    """Return the second bytes of colours of 16 bits as a picture; None for a picture without colours.
+    """Return a picture of the second bytes of colours of 16 bits, from its file `data`; None if it has no such colours.
 
     Pillow keeps the first byte.  With the opposite byte order in its decoder, it keeps the second byte.
     """
@@ -390,7 +389,7 @@ def _second_bytes(image: Image.Image, data: bytes) -> Image.Image | None:
 
 
 def _meaning(image: Image.Image, data: bytes) -> tuple[Curve, Conversion | None] | None:
-    """Return (curve, profile) as the file states them; None if it states nothing."""
+    """Return (curve, profile or None) as the file `data` of a picture states them; None if it states neither."""
     header = data.partition(b"IDAT")[0] if image.format == "PNG" else b""
     if transfer := re.search(rb"\x00\x00\x00\x04cICP.(.)", header, re.DOTALL):
         if transfer[1][0] in (PQ, HLG):
@@ -434,7 +433,7 @@ def _grey_curve(profile: Conversion) -> Curve:
 
 
 def letters(text: str, width: int, height: int) -> Image.Image:
-    """Draw a text in a picture of this size (mode L), centred; it fills 84 % of the width or 80 % of the height."""
+    """Draw a text, centred, in a picture of this size (pixels); it fills 84 % of the width or 80 % of the height."""
     at_100 = _ink(text, 100.0)
     scale = min(0.84 * width / at_100.width, 0.80 * height / at_100.height)
     ink = _ink(text, max(100.0 * scale, 1.0))

@@ -18,8 +18,8 @@ from bstcad.scene.schema import LENGTHS, Record
 
 # Gauss-Legendre nodes per quadrature cell of a super-Gaussian: in cells up to w / n wide, and in cells below w / (4 n).
 NODES, FEWER_NODES = 8, 4
-MAX_VALUES = 1 << 20  # values of E computed at a time
-DARK = 1e-20  # E, relative to the centre, below which a pixel has no light
+MAX_VALUES = 1 << 20  # number of values of E that are computed at a time
+DARK = 1e-20  # E, as a fraction of E at the centre, below which a pixel has no light
 
 Pixels: TypeAlias = tuple[int, int]  # (columns, rows)
 Size: TypeAlias = tuple[float, float]  # (width, height), mm
@@ -46,11 +46,11 @@ class DiscProfile(_Profile):
 
     @property
     def half_extent(self) -> tuple[float, float]:
-        """Radius (R, R) of the disc (mm)."""
+        """(R, R): the radius of the disc (mm)."""
         return self.radius, self.radius
 
     def light(self, pixels: Pixels, size: Size) -> np.ndarray:
-        """Return the fraction of each pixel inside the circle, exact: second differences of `corner_area`."""
+        """Return the exact fraction of each pixel inside the circle, from second differences of `corner_area`."""
         x, y = edges(pixels, size)
         within = corner_area(x[None, :], y[:, None], self.radius)
         fraction = np.abs(np.diff(np.diff(within, axis=0), axis=1)) / cell(pixels, size)
@@ -72,7 +72,7 @@ class RectangleProfile(_Profile):
         return self.width / 2, self.height / 2
 
     def light(self, pixels: Pixels, size: Size) -> np.ndarray:
-        """Return the fraction of each pixel inside the rectangle, exact."""
+        """Return the exact fraction of each pixel inside the rectangle."""
         ends = zip(edges(pixels, size), self.half_extent, strict=True)
         along_x, along_y = (np.abs(np.diff(np.clip(at, -half, half))) for at, half in ends)
         return np.outer(along_y, along_x) / cell(pixels, size)
@@ -90,7 +90,7 @@ class GaussianProfile(_Profile):
         return self.radius_1e2, self.radius_1e2
 
     def light(self, pixels: Pixels, size: Size) -> np.ndarray:
-        """Return exact means: ∫ exp(-2 x² / w²) dx = w sqrt(pi / 8) erf(sqrt(2) x / w), along x and along y."""
+        """Return the exact means, by ∫ exp(-2 x² / w²) dx = w sqrt(pi / 8) erf(sqrt(2) x / w) along x and along y."""
         w, scale = self.radius_1e2, self.radius_1e2 * math.sqrt(math.pi / 8)
         along_x, along_y = (scale * np.abs(np.diff(erf(math.sqrt(2) * at / w))) for at in edges(pixels, size))
         return np.outer(along_y, along_x) / cell(pixels, size)
@@ -112,7 +112,7 @@ class SuperGaussianProfile(_Profile):
         return self.radius_1e2, self.radius_1e2
 
     def light(self, pixels: Pixels, size: Size) -> np.ndarray:
-        """Return means by Gauss-Legendre quadrature in cells no wider than w / n; the error is about 1e-11."""
+        """Return the means by Gauss-Legendre quadrature in cells no wider than w / n; their error is about 1e-11."""
         w, n = self.radius_1e2, self.order
         reach = w * (-math.log(DARK) / 2) ** (1 / n)
         found = np.zeros(pixels[::-1])
@@ -138,7 +138,7 @@ Profile = Annotated[
 
 
 def edges(pixels: Pixels, size: Size) -> tuple[np.ndarray, np.ndarray]:
-    """Return x of the columns' edges, ascending, and y of the rows' edges, descending (mm from the centre)."""
+    """Return x of the edges of the columns, ascending, and y of the edges of the rows, descending (mm; 0: centre)."""
     columns, rows = (np.arange(-n, n + 1, 2) / (2 * n) for n in pixels)  # symmetric to the last bit
     return columns * size[0], -rows * size[1]
 
@@ -166,14 +166,14 @@ def corner_area(x: np.ndarray, y: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _distances(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distances (mm) of each pixel's nearest and farthest point from the centre, along one axis."""
+    """Return the distances (mm) of each pixel's nearest and farthest point from 0, along one axis with edges `at`."""
     ends = np.abs(at[1:]), np.abs(at[:-1])
     across = at[1:] * at[:-1] < 0  # True for a pixel that contains 0
     return np.where(across, 0.0, np.minimum(*ends)), np.maximum(*ends)
 
 
 def _lit_pixels(at: np.ndarray, reach: float) -> tuple[np.ndarray, slice]:
-    """Return the edges (mm) of the pixels within `reach` (mm) of the centre, and the slice of these pixels."""
+    """Return those of the pixel edges `at` (mm) that bound pixels within `reach` (mm) of 0, and the slice of these."""
     low, high = np.minimum(at[1:], at[:-1]), np.maximum(at[1:], at[:-1])
     lit = np.flatnonzero((low < reach) & (high > -reach))
     first, last = int(lit[0]), int(lit[-1]) + 1
@@ -181,7 +181,7 @@ def _lit_pixels(at: np.ndarray, reach: float) -> tuple[np.ndarray, slice]:
 
 
 def _nodes(at: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes (pixels, nodes) and weights (nodes,) for means between edges `at`, in cells up to `width` (mm)."""
+    """Return nodes (pixels, nodes) and weights (nodes,) for means over pixels; at: their edges; cells up to `width`."""
     pitch = abs(float(at[1] - at[0]))
     node, weight = np.polynomial.legendre.leggauss(FEWER_NODES if 4 * pitch < width else NODES)
     cells = max(math.ceil(pitch / width), 1)

@@ -23,17 +23,17 @@ PRESETS: dict[str, dict[str, Any]] = {
     | {"method": "adam", "overshoot": 0.0, "precision": "float32"}
     | {"transport_grid": 1024, "rays": 1024, "stage2_iterations": 500, "source_points": 64},
 }
-BASELINES = {  # methods without limits of time, accuracy or shape: name in messages, key that selects another method
+BASELINES = {  # method without limits of time, accuracy or shape: (name in messages, key that selects another one)
     "adam": ("the paper's procedure", "tailoring.quality"),
     "integration": ("point-by-point integration", "tailoring.method"),
 }
-COARSEST_GRID = 64  # smallest default of cells per side of the transport map; such a grid costs almost no time
-VERIFICATION_POINTS = 32  # points of an extended source in a verification; the RRMSD is from random points instead
+COARSEST_GRID = 64  # cells per side of the transport map that cost almost no time: its default is not reduced further
+VERIFICATION_POINTS = 32  # points of an extended source in a verification; the RRMSD uses random points instead
 VERIFICATION_DRAW = 1 << 12  # number of the set of these points; each further spectral line has the next number
 
 
 class Tailoring(Record):
-    """The effort of tailoring; a setting that is None has its value in PRESETS[quality], if any (see `resolved`)."""
+    """The effort of tailoring; a setting that is None has the value in PRESETS[quality], if there (see `resolved`)."""
 
     quality: Annotated[Literal["draft", "standard", "fine", "paper"], Key("Effort; fine has the smallest error.")] = (
         "standard"
@@ -89,7 +89,8 @@ class Tailoring(Record):
         """Return the settings with all values set; net: control points per side of the back, or along x and along y.
 
         Levels of an oblong net become pairs with its proportions.  Defaults: at least two rays per cell of the net
-        along x and along y (draft: √2); a map of up to twice the net's cells per side or COARSEST_GRID (paper: any).
+        along x and along y (draft: √2); the transport grid of PRESETS, reduced to twice the net's cells per side, but
+        not below COARSEST_GRID (paper: not reduced).
         """
         levels = tuple(level if isinstance(level, tuple) else coarser(net, level) for level in self.levels or ())
         preset = dict(PRESETS[self.quality], levels=levels or coarse_to_fine(net))
@@ -149,7 +150,7 @@ class ResolvedTailoring(Tailoring):
 
 
 def coarse_to_fine(net: Sides) -> tuple[Sides, ...]:
-    """Return nets of 33, 129 and 513 control points on the longer side, if clearly coarser than `net`, and `net`."""
+    """Return nets of 33, 129 and 513 control points on the longer side (those below 2/3 of net's), then `net`."""
     points = max(as_pair(net))
     return (*(coarser(net, m) for m in (33, 129, 513) if 1.5 * m < points), net)
 
@@ -175,7 +176,7 @@ NONE = "none"  # grade of an error that is always zero
 
 
 class Tolerance(Record):
-    """The tolerance of one error, or of several; a key that is None has the value of an earlier table or the grade."""
+    """The tolerance of one error or of several; a key that is None has the value of an earlier table or the grade."""
 
     name: Annotated[Name | None, Key("Name of the error; lens.decentre is both x and y; all errors if absent.")] = None
     grade: Annotated[
@@ -191,7 +192,7 @@ class Tolerance(Record):
     pattern: Annotated[Literal["raster", "spiral"] | None, Key("Pattern of the tool marks.", example="spiral")] = None
 
     def covers(self, error: str) -> bool:
-        """Return True if the table applies to this error."""
+        """Return True if the table applies to this error, such as lens.tilt_x (a table on lens.tilt does)."""
         return self.name is None or error == self.name or error.startswith(f"{self.name}_")
 
     @property
@@ -201,7 +202,7 @@ class Tolerance(Record):
 
 
 def settings_of(tables: Sequence[Tolerance], error: str) -> dict[str, Any]:
-    """Return the settings of an error from all tables; a later grade replaces an earlier limit, and vice versa."""
+    """Return the keys of an error from all tables that cover it; a later grade replaces a limit, and vice versa."""
     merged: dict[str, Any] = {}
     for stated in (table.stated for table in tables if table.covers(error)):
         for one, other in (("grade", "limit"), ("limit", "grade")):
@@ -212,7 +213,7 @@ def settings_of(tables: Sequence[Tolerance], error: str) -> dict[str, Any]:
 
 
 def tolerance_complaints(tables: Sequence[Tolerance]) -> Iterator[str]:
-    """Yield the faults of the tables."""
+    """Yield the faults of the tables [[tolerance]], each as "key: sentence"."""
     for k, table in enumerate(tables):
         where, stated = f"tolerance[{k}]", table.stated
         if not stated:

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 MESH_TOLERANCE = 1e-3  # mm; default maximum distance of mesh facets from a lens up to 100 mm wide
 IMAGE_KEY = re.compile(r"target(\[\d+\])?\.image")  # dotted keys of images
-SEARCH_RANGE = 0.999  # tailoring searches this fraction of the possible range of the front's sag at the rim
+SEARCH_RANGE = 0.999  # fraction of the possible range of the front's sag at the rim in which tailoring searches
 FLOAT32_ROUNDING = 2.0**-24  # largest relative rounding error of a coordinate in float32
 FINEST_MESH = 4 * FLOAT32_ROUNDING  # smallest tolerance of a mesh, as a fraction of the largest coordinate
 
@@ -77,7 +77,7 @@ class Accept(Record):
 
 
 class Output(Record):
-    """The written files: accuracy of the meshes, further file formats."""
+    """Settings of the written files: accuracy of the meshes, and further file formats."""
 
     mesh_tolerance: Annotated[float | None, Key("Maximum distance of meshes from the lens.", "mm", 1e-6, 1e3)] = None
     export: Annotated[tuple[files.Export, ...], Key("Additional files for the shop.", example=["zemax", "dxf"])] = ()
@@ -192,7 +192,7 @@ class Scene(Record):
 
     @property
     def goals(self) -> tuple[Goal, ...]:
-        """The pictures of the targets on their screens."""
+        """One Goal per target: key, screen, picture and weight."""
         pairs = zip(self.target_keys, self.targets, strict=True)
         return tuple(Goal(key, target.screen, target.irradiance(), target.weight) for key, target in pairs)
 
@@ -230,14 +230,14 @@ class Scene(Record):
 
     @property
     def rim(self) -> Outline:
-        """Rim of the back after the cut to its mount; no light passes outside this rim."""
+        """Rim of the back after the lens is cut to its mount; no light passes outside this rim."""
         return self.lens.outline if self.mount is None else self.mount.rim_of(self.lens.outline).outline
 
     @property
     def rim_sags(self) -> tuple[float, float]:
         """Smallest and largest sag (mm) at the rim of a front that is optimised.
 
-        The blank keeps lens.min_thickness at the rim, and the rim stays behind the source.
+        Between these limits the blank keeps lens.min_thickness at the rim, and the rim stays behind the source.
         """
         lens, source = self.lens, self.source
         lowest = source.start_plane - lens.front.z if source.start_plane is not None else -math.inf
@@ -287,7 +287,7 @@ class Scene(Record):
         return self.assembled(Lens(front, back, outline, self.index, own_passes=passes))
 
     def assembled(self, lens: Lens) -> Lens:
-        """Return the lens with the scene's windows, mirrors, tailored faces and mount."""
+        """Return the lens with the scene's windows, mirrors and mount, and with its tailored faces marked."""
         before, behind = self.around(self.source.main_wavelength) or ((), ())
         return self.as_mounted(replace(lens, before=before, behind=behind).shaping(*self.lens.tailored_faces))
 
@@ -331,7 +331,7 @@ class Scene(Record):
 
     @property
     def ghost(self) -> GhostTracer | None:
-        """Function that traces the light reflected twice inside the lens; None if the scene names no ghost."""
+        """Function that traces the light reflected twice inside the lens; None if the scene has no effect `ghost`."""
         return effects.ghost(self.effects)
 
     @property
@@ -384,7 +384,7 @@ class Scene(Record):
         return made
 
     def toml(self) -> str:
-        """Return the text of a file that loads to an equal scene; an image is named by the file name of its copy."""
+        """Return the text of a file from which an equal scene is loaded; an image is named as its copy."""
         unused = set() if self.source.extent else {"source_points"}
         optic = f"refractive index {self.index:.6g}" if self.lens.passes.enters else f"a {self.optic}"
         comment = f"# {optic}; quality {self.tailoring.quality}"
@@ -412,7 +412,7 @@ def _wavefront_complaints(wave: Wave | None, source: Emitter, lens: LensBlank, a
 
 
 def _method_complaints(scene: Scene) -> Iterator[str]:
-    """Yield complaints about a method for one picture in a scene of several goals."""
+    """Yield complaints about a method that works for one picture only, if the scene has several goals."""
     goals = len(scene.targets) + (scene.wavefront is not None)
     who, key = quality.BASELINES.get(scene.tailoring.chosen_method, ("", ""))
     if who and goals > 1:
@@ -420,7 +420,7 @@ def _method_complaints(scene: Scene) -> Iterator[str]:
 
 
 def _doubts_of_goals(scene: Scene) -> Iterator[str]:
-    """Yield warnings: with fewer goals than tailored faces a face is idle; with more, no goal is met exactly."""
+    """Yield warnings: with fewer goals than tailored faces a face is idle; with more goals none is met exactly."""
     lens, wave = scene.lens, scene.wavefront
     different: list[Target] = []
     for target in scene.targets:  # light parallel to the axis makes one picture on every plane, which is one goal
@@ -522,7 +522,7 @@ def _validated(
 
 
 def _circle(outline: Any, key: str) -> None:
-    """Replace the diameter of a circle in a table by its radius, the field of the record."""
+    """Replace the diameter of a circle in the table `outline` by its radius, the field of the record."""
     if not isinstance(outline, dict):
         return
     if key == "lens.front.outline" and outline.setdefault("shape", "circle") != "circle":
@@ -568,7 +568,6 @@ def _from_python(value: Any, key: str, given: dict[str, FileContent]) -> Any:
 
 
 def _image(values: np.ndarray, key: str) -> Picture:
-    """Return an array as the picture of the target with this key."""
     try:
         return picture.from_array(values)
     except SceneError as error:

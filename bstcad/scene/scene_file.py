@@ -11,9 +11,9 @@ from typing import Any
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 
-MAX_SCENE_SIZE = 1_000_000  # bytes of a scene file
-MAX_DOTS = 100  # dots in a line; the time of tomllib grows with the square of a dotted key's length
-MAX_NESTING = 20  # levels of nested tables and lists; a scene has four
+MAX_SCENE_SIZE = 1_000_000  # largest scene file (bytes)
+MAX_DOTS = 100  # largest number of dots in a line; the time of tomllib grows with the square of a dotted key's length
+MAX_NESTING = 20  # largest number of levels of nested tables and lists; a scene has four
 NESTED = "is nested too deeply; give a scene file like those in templates"
 
 
@@ -34,7 +34,7 @@ def read(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 def tables(text: str, path: Path) -> dict[str, Any]:
-    """Parse the text of a scene file; path: path of the file, for messages."""
+    """Return the tables in the text of a scene file; path: path of the file, for messages."""
     if too_dotted(text):
         raise SceneError(f"{path}: a line has more than {MAX_DOTS} dots; shorten that line")
     try:
@@ -73,7 +73,7 @@ def toml_value(text: str) -> Any:
 
 
 def check_plain(data: Any, key: str = "", depth: int = 0) -> None:
-    """Raise SceneError for dates, NaN, numbers >= 1e300, lone surrogates; RecursionError beyond MAX_NESTING levels."""
+    """Raise SceneError for a date, NaN, a number beyond ±1e300, a lone surrogate; RecursionError: too deeply nested."""
     if depth > MAX_NESTING:
         raise RecursionError
     if isinstance(data, dict | list):

@@ -51,17 +51,17 @@ class FileContent:
 
     @property
     def copy(self) -> bytes:
-        """Content of the copy."""
+        """Content of the copy beside a design: `data`, unless a subclass writes another format."""
         return self.data
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the content and the other fields."""
+        """SHA-256 of `data` and the other fields, in hexadecimal digits."""
         return hashlib.sha256(repr(self).encode() + self.data).hexdigest()
 
 
 def contents(value: Any, key: str = "") -> Iterator[tuple[str, FileContent]]:
-    """Yield (dotted key, content) of all files that a value of a scene (a record or a tuple) names."""
+    """Yield (dotted key, content) of all files that the value of `key` in a scene (a record or a tuple) names."""
     if isinstance(value, FileContent):
         yield key, value
         return
@@ -79,8 +79,9 @@ def contents(value: Any, key: str = "") -> Iterator[tuple[str, FileContent]]:
 def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], example: str) -> tuple[Any, ...]:
     """Return the annotations of a field of type `kind` that is written as a path and contains the content of the file.
 
-    A path is relative to the scene file, or to the user's home with ~.  `bounds` in the context of a validation are
-    folders: a path into one of them must not lead out of them by symbolic links.
+    read: reads the file at a path.  example: such a key, for messages.  A path is relative to the scene file, or to the
+    user's home with ~.  `bounds` in the context of a validation are folders: a path into one of them must not lead out
+    of them by symbolic links.
     """
 
     def content(given: Any, info: ValidationInfo) -> Any:
@@ -115,7 +116,7 @@ def _check_links(path: Path, bounds: Sequence[Path]) -> None:
 
 
 def leaving_out(**defaults: Any) -> Any:
-    """Return a serializer that omits keys with the values `defaults`, so that older files are written unchanged."""
+    """Return a serializer that omits keys with the values `defaults`, so that older scenes are written unchanged."""
 
     def written(self: Any, handler: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
         found = handler(self)
@@ -128,7 +129,7 @@ def leaving_out(**defaults: Any) -> Any:
 
 
 class _Tables(GenerateJsonSchema):
-    """Generator of the JSON schema of TOML tables: without null, and with the tag of a union required."""
+    """Generator of the JSON schema of TOML tables: without null, and without defaults that are None or []."""
 
     def nullable_schema(self, schema: Any) -> dict[str, Any]:
         return self.generate_inner(schema["schema"])
@@ -142,7 +143,7 @@ class _Tables(GenerateJsonSchema):
 
 
 def of_model(model: type[BaseModel]) -> dict[str, Any]:
-    """Return the JSON schema of the record of a scene."""
+    """Return the JSON schema of the record of a scene, in which the tag of a table in a union is required."""
     made = model.model_json_schema(schema_generator=_Tables)
     tables = made["$defs"]
     for union in _nodes(made):
@@ -165,7 +166,7 @@ def of_model(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def _nodes(node: Any) -> list[dict[str, Any]]:
-    """Return all tables of a JSON value."""
+    """Return all objects in a JSON value, the value itself included."""
     parts = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
     return [node] * isinstance(node, dict) + [inner for part in parts for inner in _nodes(part)]
 
@@ -180,7 +181,7 @@ def schema() -> Node:
 
 
 def records(node: Node) -> list[Node]:
-    """Return the tables that are possible at a node, alone or in a list; each once."""
+    """Return the schemas of the tables that are possible at a node of the schema, alone or in a list; each once."""
     if "$ref" in node:
         return records(schema()["$defs"][node["$ref"].rpartition("/")[2]])
     if "properties" in node:
@@ -192,7 +193,7 @@ def records(node: Node) -> list[Node]:
 
 
 def tags(record: Node) -> dict[str, Any]:
-    """Return the tag of a table in a union, such as {"kind": "plane"}."""
+    """Return the tag by which a union recognises this table, such as {"kind": "plane"}; {} for a table without."""
     keys = record["properties"]
     return {name: keys[name]["const"] for name in TAGS if "const" in keys.get(name, ())}
 
@@ -216,7 +217,7 @@ class Row:
 
 
 def rows(record: Node | None = None, table: str = "") -> list[Row]:
-    """Return the keys of a table and of the tables in it, in the order of the records."""
+    """Return the keys of a table and of the tables in it.  record: its schema (None: the scene); table: its key."""
     record, found = record or schema(), []
     for name, node in record["properties"].items():
         inner, key = records(node), f"{table}.{name}".lstrip(".")
@@ -246,7 +247,7 @@ def _union(union: list[Node], table: str) -> list[Row]:
 
 
 def span(node: Node) -> str:
-    """Return the range or the choices of a key, in words."""
+    """Return the range or the choices of the key with this schema, in words."""
     if "const" in node or "enum" in node:
         return " | ".join(json.dumps(value).strip('"') for value in node.get("enum", [node.get("const")]))
     if records(node):

@@ -35,7 +35,7 @@ WITHOUT_GAMMA = ("text", "uniform", "profile")  # picture keys that allow no gam
 MAX_TARGETS = 8  # largest number of targets of a scene
 NOTICEABLE = 0.01  # RRMSD between two readings of a picture above which a remark states the reading
 PLANE_DISTANCE = 1e-3  # mm; smallest distance between the planes of two targets
-LARGEST_IN_METRES, FARTHEST_IN_METRES = 0.5, 10.0  # m; largest plausible width of a lens, and z or width of a target
+LARGEST_IN_METRES, FARTHEST_IN_METRES = 0.5, 10.0  # m; largest plausible width of a lens; z or width of a target
 MAX_REDUCTION = 20.0  # largest plausible ratio of the width of a lens to the width of its target
 EDGE_ON = math.sin(math.radians(1.0))  # sine of the smallest angle between the line of sight and a target's plane
 GRAZING_VIEW = 8.0  # degrees; a flatter view of a target gets a warning (RRMSD 0.07 at 30, 0.33 at 10, 1.6 at 5)
@@ -56,7 +56,7 @@ AIM = (
 
 
 class Target(Record):
-    """The picture on the plane z, or on a plane tilted about its centre, over the rectangle x by y."""
+    """The picture over the rectangle x by y on the plane z, or on a plane tilted about the centre of the rectangle."""
 
     z: Annotated[float, Key("Position of the target; if tilted, of its centre.", "mm", *COORDINATES, example=1000.0)]
     x: Annotated[tuple[float, float], Key("Ends of the target along x.", "mm", *COORDINATES, example=[-200.0, 200.0])]
@@ -91,7 +91,7 @@ class Target(Record):
     written = leaving_out(weight=1.0)
 
     def complaints(self) -> Iterator[str]:
-        """Yield the faults of the table."""
+        """Yield the faults of the table [target], each as "key: sentence"."""
         given = self._pictures
         if len(given) != 1:
             names = " and ".join(given) or "none"
@@ -206,13 +206,13 @@ class Target(Record):
             yield f"target.z: the target at z = {self.z:g} is not {behind} is at z = {back:g}; move it further along +z"
 
     def follows(self, words: str, z: float, sense: int) -> Iterator[str]:
-        """Yield complaints about a target that does not follow the element `words` at z (mm) along sense · z (±1)."""
+        """Yield complaints about a target that does not follow an element (words: name) at z (mm) along sense · z."""
         if not sense * (self.z - z) > 0:
             where = f"the target at z = {self.z:g} must follow the {words} at z = {z:g}"
             yield f"target.z: {where} along {DIRECTIONS[sense]}, as the light travels; move one of them"
 
     def clearance(self, lens: LensBlank, highest: float) -> float:
-        """Return the gap (mm) between the target's plane and a lens up to z = highest (mm); negative if they cross."""
+        """Return the gap (mm) between the target's plane and a lens that ends at z = highest (mm); < 0: they cross."""
         return self.screen.plane.clearance(lens.outline, highest)
 
     def grazed(self, lens: LensBlank) -> Iterator[str]:
@@ -264,7 +264,7 @@ class Target(Record):
 
 
 def is_faced(plane: PlaneReceiver, vertex: Vector) -> bool:
-    """Return True if the line of sight from a point (mm) meets a plane's front at more than a degree (EDGE_ON)."""
+    """Return True if the line from `vertex` (mm) to the plane's middle meets its front at over a degree (EDGE_ON)."""
     return -plane.height(vertex) > EDGE_ON * math.dist(plane.middle, vertex)
 
 
@@ -323,7 +323,7 @@ def _in_one_plane(one: Screen, other: Screen) -> bool:
 
 
 def _cuts(screen: Screen, other: Screen) -> bool:
-    """Return True if corners of the screen are on both sides of the other's plane."""
+    """Return True if the screen has corners on each side of the other's plane."""
     heights = _corner_heights(screen, other)
     return bool(heights) and min(heights) < 0 < max(heights)
 
@@ -379,7 +379,7 @@ def _drawing(target: Target) -> Drawing:
 
 
 def _photo_light(target: Target, given: Picture | str, pixels: Pixels, size: Size) -> tuple[np.ndarray, list[str]]:
-    """Return the irradiance (rows, columns) of a photo on the unrotated target, and remarks on it ("": none)."""
+    """Return the irradiance (rows, columns) of a photo over `pixels` of a target before its rotation, and remarks."""
     photo = picture.photo(given, target.gamma, target.invert)
     if target.crop is not None:
         photo = photo.part(crop_box(photo.image.size, target.crop))
@@ -392,7 +392,7 @@ def _photo_light(target: Target, given: Picture | str, pixels: Pixels, size: Siz
 
 
 def _curve_remark(photo: picture.Photo, light: np.ndarray, part: Window, pixels: Pixels) -> str:
-    """Return a remark on the assumed curve if the other curve changes the light by more than NOTICEABLE; else ""."""
+    """Return a remark on the assumed curve if the other curve changes the light by an RRMSD > NOTICEABLE; else ""."""
     if photo.other_curve is None:
         return ""
     other = average(replace(photo, curve=photo.other_curve).light, photo.image.size, part, pixels)
@@ -404,7 +404,7 @@ def _curve_remark(photo: picture.Photo, light: np.ndarray, part: Window, pixels:
 
 
 def _ink(text: str, pixels: Pixels, size: Size) -> np.ndarray:
-    """Return the fraction of ink per pixel (rows, columns) of a text that fills an area of `size` (width, height)."""
+    """Return the fraction of ink per pixel (rows, columns) of a text, centred in an area of `size` (width, height)."""
     aspect, side = size[0] / size[1], min(4 * max(pixels), 4096)  # drawn finer and averaged, for smooth edges
     width, height = max(round(side * min(aspect, 1.0)), 16), max(round(side * min(1 / aspect, 1.0)), 16)
     image = picture.letters(text, width, height)
@@ -438,7 +438,8 @@ Window = tuple[float, float, float, float]  # left, top, right, bottom in pixels
 def window(shown: Pixels, size: Size, fit: str) -> Window:
     """Return the part of a picture (width, height in pixels) that fills a target of this size (width, height).
 
-    fit "crop" returns the central part, "pad" extends outside the picture.  A difference below one pixel is ignored.
+    fit "stretch" returns the whole picture, "crop" its central part; "pad" extends outside it.  A difference below one
+    pixel is ignored.
     """
     width, height = shown
     across, down = height * size[0] / size[1], width * size[1] / size[0]
@@ -471,7 +472,8 @@ def _fit_remark(shown: Pixels, target: Target) -> str:
 def average(light: Callable[[PixelBox], np.ndarray], size: Pixels, window: Window, pixels: Pixels) -> np.ndarray:
     """Return the exact means (rows, columns) of a picture, dark outside its edges, over the pixels of a window.
 
-    light: function that returns the values of a box.  size: size of the picture, which is read in strips.
+    light: function that returns the values in a box.  size: of the picture, which is read in strips.  pixels: columns
+    and rows of the window.
     """
     left, top = (max(int(start), 0) for start in window[:2])
     right, bottom = (min(math.ceil(stop), side) for stop, side in zip(window[2:], size, strict=True))
@@ -495,7 +497,7 @@ def overlap(size: int, pixels: int, start: float = 0.0, stop: float | None = Non
 
 
 def inside(outline: Outline, pixels: Pixels, size: Size) -> np.ndarray:
-    """Return the fraction (rows, columns) of each pixel inside an outline centred in a rectangle of this size."""
+    """Return the fraction of each pixel (rows, columns) of a rectangle of this size inside an outline centred in it."""
     columns, rows = pixels
     fine = max(2048 // max(pixels), 4)  # sub-pixels along the side of a pixel
     x, y = (

@@ -1,7 +1,7 @@
 """The placements that a STEP file states for its solid, each as defined in ISO 10303-42 and -43.
 
-One of three statements makes a shape representation part of another one: a relationship with a transformation, which
-an assembly states for each of its parts, a MAPPED_ITEM, or a plain relationship, which keeps the coordinates.  An
+One of three statements makes a shape representation part of another one: a relationship with a transformation (an
+assembly states one for each of its parts); a MAPPED_ITEM; or a plain relationship, which keeps the coordinates.  An
 ITEM_DEFINED_TRANSFORMATION maps one AXIS2_PLACEMENT_3D to another.  Nested transformations are composed.
 """
 
@@ -16,10 +16,10 @@ import numpy as np
 from bstcad.step_text.entities import REAL, Entities, damaged, required
 from bstcad.step_text.placement import Placement, compose
 
-MAX_ASSEMBLY_DEPTH = 100  # largest number of nested representations between a part and the whole
-UNIT_SCALE_TOLERANCE = 1e-12  # largest deviation of a scale from 1
+MAX_ASSEMBLY_DEPTH = 100  # largest number of representations, each inside the next, that contain a solid
+UNIT_SCALE_TOLERANCE = 1e-12  # largest deviation from 1 of a scale that counts as 1
 Z_AXIS, X_AXIS = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
-NAMES = r"(?:'\d*'|\$),(?:'\d*'|\$)"  # pattern of an entity's name and description
+NAMES = r"(?:'\d*'|\$),(?:'\d*'|\$)"  # pattern of two attributes of an entity, its name and its description
 DIRECTION = re.compile(rf"\('\d*',\(({REAL}),({REAL}),({REAL})\)\)")
 AXES = re.compile(r"\('\d*',#(\d+),(?:#(\d+)|\$),(?:#(\d+)|\$)\)")
 OPERATOR = re.compile(rf"\((?:'\d*',)?{NAMES},(?:#(\d+)|\$),(?:#(\d+)|\$),#(\d+),({REAL}|\$),(?:#(\d+)|\$)\)")
@@ -30,14 +30,14 @@ TRANSFORMED = re.compile(r"REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION\(#(\d
 
 @dataclass(frozen=True)
 class Link:
-    """The relation of a representation to another one that contains it."""
+    """The relation of a representation to another one, its parent, which contains it."""
 
     parent: str  # number of the containing representation
     placement: Placement | None  # placement in the parent; None: the coordinates are those of the parent
 
 
 def placement_of(solid: str, entities: Entities) -> Placement:
-    """Return the placement of a solid in the file; ValueError if the file places it more than once."""
+    """Return the placement in the file of a solid (its number); ValueError if the file places it more than once."""
     homes, links = _representations_and_links(solid, entities)
     paths = [path for home in homes[:1] for path in _paths(home, links, frozenset())]
     if len(paths) > 1:
@@ -46,14 +46,14 @@ def placement_of(solid: str, entities: Entities) -> Placement:
 
 
 def products_of(solid: str, entities: Entities) -> set[str]:
-    """Return the product definitions whose own shape is this solid, without assemblies that contain it."""
+    """Return the numbers of the product definitions whose own shape is this solid, without assemblies around it."""
     homes, links = _representations_and_links(solid, entities)
     own = {name for home in homes[:1] for name in _equal_representations(home, links)}
     return {product for product, shapes in _shapes(entities).items() if not own.isdisjoint(shapes)}
 
 
 def _representations_and_links(solid: str, entities: Entities) -> tuple[list[str], dict[str, list[Link]]]:
-    """Return the representations that contain a solid, and the links of each representation to others."""
+    """Return the representations that list a solid among their items, and the links of each one to others."""
     items = dict(_items(entities))
     links: dict[str, list[Link]] = {name: [] for name in items}
     for name, link in _links(items, entities):
@@ -62,7 +62,7 @@ def _representations_and_links(solid: str, entities: Entities) -> tuple[list[str
 
 
 def _paths(home: str, links: dict[str, list[Link]], seen: frozenset[str]) -> list[list[Placement]]:
-    """Return the paths from `home` to representations without a parent, as placements, outermost first; stop at two."""
+    """Return the paths from `home` to representations without a parent, as placements, outermost first; two at most."""
     same = _equal_representations(home, links)
     if not same.isdisjoint(seen):
         raise damaged(f"representation #{home} is part of itself")
@@ -96,7 +96,7 @@ def _items(entities: Entities) -> Iterator[tuple[str, list[str]]]:
 
 
 def _links(items: dict[str, list[str]], entities: Entities) -> Iterator[tuple[str, Link]]:
-    """Yield each representation that is part of another one, and its link."""
+    """Yield (representation, link) for each representation that is part of another one."""
     components = dict(_components(entities))
     for relation, (kind, body) in entities.bodies.items():
         plain = kind == "SHAPE_REPRESENTATION_RELATIONSHIP"
@@ -123,7 +123,7 @@ def _links(items: dict[str, list[str]], entities: Entities) -> Iterator[tuple[st
 
 
 def _components(entities: Entities) -> Iterator[tuple[str, set[str]]]:
-    """Yield the relationship of each part of an assembly, and the representations of that part."""
+    """Yield (relationship, representations) of each part of an assembly."""
     shapes = _shapes(entities)
     for context in entities.of("CONTEXT_DEPENDENT_SHAPE_REPRESENTATION"):
         relation, shape = _pair(context, entities)
@@ -142,7 +142,7 @@ def _shapes(entities: Entities) -> dict[str, set[str]]:
 
 
 def _transformation(name: str, first: list[str], second: list[str], entities: Entities) -> Placement:
-    """Return the placement of the first representation in the second; first, second: items of the two."""
+    """Return the placement, by transformation `name`, of a first representation in a second; first, second: items."""
     if entities.bodies[name][0] != "ITEM_DEFINED_TRANSFORMATION":
         return _frame(name, entities)
     origin, target = _pair(name, entities)
@@ -171,7 +171,7 @@ def _frame(name: str, entities: Entities) -> Placement:
 
 
 def _axes(location: str, axis: str | None, reference: str | None, entities: Entities) -> Placement:
-    """Return the placement at entity `location`, z along `axis`, x along `reference`; None: axis of the representation.
+    """Return the placement at entity `location`, z along `axis`, x along `reference`; None: along the parent's axis.
 
     A z direction other than +z needs an x direction: ISO 10303-42 projects the x axis, some readers choose another.
     """
@@ -183,7 +183,7 @@ def _axes(location: str, axis: str | None, reference: str | None, entities: Enti
 
 
 def _pair(name: str, entities: Entities) -> list[str]:
-    """Return the two entities that an entity refers to; ValueError if it refers to fewer or more."""
+    """Return the numbers of the two entities to which an entity refers; ValueError if it refers to fewer or more."""
     found = entities.references(name)
     if len(found) != 2:
         raise damaged(f"statement #{name} = {entities.bodies[name][0]} refers to {len(found)} entities, not to two")

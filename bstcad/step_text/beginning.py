@@ -8,10 +8,10 @@ from pathlib import Path
 
 from bstcad.runs.files import SceneError
 
-BYTES_READ = 65_536  # number of bytes read from a file; comments before the first statement are shorter
+BYTES_READ = 65_536  # number of bytes read from a file; comments before its first statement must be shorter
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"  # byte order mark of UTF-8
 STEP_BEGINNING = re.compile(rb"(?:\s|/\*(?:[^*]|\*(?!/))*+\*/)*+ISO-10303-21\s*;")
-OTHER_FORMATS = {  # faults and remedies of files that are not STEP, by their first bytes
+OTHER_FORMATS = {  # fault and remedy of a file that is not STEP, by its first bytes
     b"\x1f\x8b": "it is compressed with gzip; unpack it first",
     b"PK\x03\x04": "it is a zip archive; unpack it first",
     b"BZh": "it is compressed with bzip2; unpack it first",
@@ -34,7 +34,7 @@ def fault(data: bytes) -> str | None:
 
 
 def check(path: Path) -> None:
-    """Raise SceneError in one sentence if a file is readable and does not begin as STEP; readers find other faults."""
+    """Raise SceneError if a file can be read and does not begin as STEP; other faults are left to the STEP readers."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):
             return

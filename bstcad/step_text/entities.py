@@ -16,7 +16,7 @@ import numpy as np
 from bstcad.runs.files import one_line
 
 MAX_COORDINATE = 1e12  # largest coordinate of a point, in the file's unit; coordinates of a scene are at most 1e8 mm
-MAX_NUMBER_LENGTH = 64  # largest number of characters of a number; a double has 17 digits, a sign and an exponent
+MAX_NUMBER_LENGTH = 64  # largest length of a number (characters); a double has 17 digits, a sign and an exponent
 
 ENTITY = r"[1-9]\d{0,17}"  # pattern of an entity's number, which fits into 64 bits
 REAL = r"[-+]?\d+\.\d*(?:E[-+]?\d+)?"
@@ -41,7 +41,7 @@ HUGE_NUMBER = re.compile(r"(?<=[(,])[-+]?\d++\.\d*+[Ee]\+?\d{3,}+")  # number wi
 
 @dataclass(frozen=True)
 class Entities:
-    """Entities of a STEP file, identified by the digits of their numbers."""
+    """Entities of a STEP file by their numbers, which are texts of digits."""
 
     bodies: Mapping[str, tuple[str, str]]  # number -> (kind, attributes without blanks); kind COMPLEX: several kinds
     strings: Sequence[str]  # strings as written; 'k' in the attributes stands for string k
@@ -49,7 +49,7 @@ class Entities:
     xyz: np.ndarray  # coordinates of these points, (n, 3), in the file's unit of length
 
     def of(self, kind: str) -> dict[str, str]:
-        """Return number and attributes of each entity of a kind."""
+        """Return the attributes of all entities of a kind, by number."""
         return {number: body for number, (its, body) in self.bodies.items() if its == kind}
 
     def references(self, number: str) -> list[str]:
@@ -57,7 +57,7 @@ class Entities:
         return re.findall(r"#(\d+)", self.bodies[number][1])
 
     def string(self, number: str, index: int) -> str:
-        """Return the first (index 0) or second (1) attribute of an entity as one line; "" if it is not a string."""
+        """Return the first (index 0) or second (1) attribute of an entity as a line of text; "" if it is no string."""
         attributes = required(re.match(r"\((?:'(\d*)')?(?:,'(\d*)')?", self.bodies[number][1])).groups()
         return decode(self.strings[int(attributes[index])]) if attributes[index] else ""
 
@@ -88,7 +88,7 @@ def without_blanks(text: str) -> tuple[str, list[str]]:
 
 
 def read_entities(text: str) -> tuple[str, Entities]:
-    """Return a STEP file's text without blanks, strings and rows of points, and its entities; ValueError if damaged."""
+    """Return a STEP file's text without blanks, strings and POINT_ROWS, and its entities; ValueError if damaged."""
     parts = [text] if POINTS_MARK in text else POINT_ROWS.split(text)
     data, strings = without_blanks(POINTS_MARK.join(parts[::2]))
     start, end = data.find("DATA;"), data.rfind("ENDSEC;")
@@ -127,14 +127,14 @@ def read_entities(text: str) -> tuple[str, Entities]:
 
 
 def required(hit: re.Match[str] | None) -> re.Match[str]:
-    """Return the match of an entity's text; LookupError if there is none, because the text has another form."""
+    """Return the match of an entity's text; LookupError if it is None, because the text has another form."""
     if hit is None:
         raise LookupError
     return hit
 
 
 def damaged(fault: str) -> ValueError:
-    """Return the error of a file whose text is damaged."""
+    """Return the error of a damaged file; fault: for example "it has no DATA section"."""
     return ValueError(f"the file is damaged ({fault}); write it again")
 
 
@@ -147,7 +147,7 @@ def decode(string: str) -> str:
 
 
 def _check_tokens(rest: str, hits: Sequence[re.Match[str]]) -> None:
-    """Raise ValueError with the statement if the text has an unknown token, or a number too long or beyond a double."""
+    """Raise ValueError if the statements `rest` have an unknown token, or a number too long or beyond a double."""
     if TOKENS.sub("", rest):
         number, kind, body = next(hit.groups() for hit in hits if TOKENS.sub("", hit[3]))
         atoms = (atom for atom in re.split(r"[(),]+", body) if TOKENS.sub("", f"({atom})"))

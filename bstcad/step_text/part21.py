@@ -1,10 +1,10 @@
 """Reader of the lens in a STEP file (ISO 10303-21), independent of OCC, for a second check of each written file.
 
 It reads the entities that the checks need: control nets, knots and multiplicities of the freeform faces, the product's
-name, the units, the number of solids, the uses of each edge, and the stated properties: area, volume, centroid,
-material and profile tolerances, by their names in "Recommended Practices for Geometric and Assembly Validation
-Properties" of the CAx Interoperability Forum.  Damage to these entities is refused in one sentence.  OCC reads the
-whole file, in a second process.
+name, the units, the number of solids, the uses of each edge, profile tolerances, and the stated area, volume, centroid
+and material, by their names in "Recommended Practices for Geometric and Assembly Validation Properties" of the CAx
+Interoperability Forum.  Damage to these entities is refused in one sentence.  OCC reads the whole file, in a second
+process.
 
 Matching takes a time proportional to the length of the text: a repeated group ends at a character that it cannot
 contain, and the text is split into statements before they are matched.
@@ -35,16 +35,16 @@ REALS = rf"{REAL}(?:,{REAL})*"
 COUNTS = r"\d{1,9}(?:,\d{1,9})*"
 FLAG = r"\.([TFU])\."
 REFERENCES = re.compile(rf"#{ENTITY}(?:,#{ENTITY})*")
-RULED = re.compile(r"\d+,1,")  # degrees in u and v of a ruled wall: 1 in v
+RULED = re.compile(r"\d+,1,")  # pattern of the degrees in u and v of a ruled wall, 1 in v
 SURFACE = re.compile(
     rf"(\d{{1,9}}),(\d{{1,9}}),\(\((.*?)\)\),\.\w+\.,{FLAG},{FLAG},{FLAG},"
     rf"\(({COUNTS})\),\(({COUNTS})\),\(({REALS})\),\(({REALS})\),\.\w+\.\)"
 )
-VALIDATION, MATERIAL = "geometric validation property", "material property"  # names of kinds of properties
+VALIDATION, MATERIAL = "geometric validation property", "material property"  # names of two kinds of properties
 PREFIXES = {"$": 1.0, ".MICRO.": 1e-6, ".MILLI.": 1e-3, ".CENTI.": 1e-2, ".DECI.": 1e-1, ".KILO.": 1e3}
 UNITS = {"METRE": 1e3, "GRAM": 1.0}  # SI units in mm and g
-PER_CM3 = 1e3  # density of 1 g/mm³ in g/cm³
-UNKNOWN_VALUE = math.nan  # value of a number that cannot be read or has an unknown unit: its check fails
+PER_CM3 = 1e3  # factor from g/mm³ to g/cm³
+UNKNOWN_VALUE = math.nan  # value of a number that cannot be read or has an unknown unit, so that its check fails
 NUMBER = r"[-+]?\d+(?:\.\d*(?:E[-+]?\d+)?)?"  # pattern of a number, with or without a decimal point
 UNREADABLE = (LookupError, AttributeError, TypeError, ArithmeticError)  # errors of a missing or malformed entity
 
@@ -79,7 +79,7 @@ class ProfileTolerance:
 
 @dataclass(frozen=True)
 class ValidationProperties:
-    """Properties of a part; each tuple contains one value per statement in the file."""
+    """Properties that the file states for a part; each tuple contains one value per statement."""
 
     areas: tuple[float, ...] = ()  # area of the whole surface (mm²)
     volumes: tuple[float, ...] = ()  # volume (mm³)
@@ -137,7 +137,7 @@ def read(path: str | Path) -> StepText:
 
 
 def read_lens(path: str | Path, any_unit: bool = False) -> StepText:
-    """Read a lens in millimetres (any_unit: in any unit of length) and radians, of one solid; ValueError otherwise."""
+    """Read a lens of one solid in mm (any_unit: in any unit of length) and radians; ValueError for any other file."""
     text, name = read(path), f"{Path(path).name}: read as text"
     if not any_unit and text.unit != "millimetre":
         raise ValueError(f"{name}: its lengths are in {text.unit}; export it in millimetres")
@@ -167,7 +167,7 @@ def _parse(text: bytes) -> StepText:
     data, entities = read_entities(text.decode("latin-1"))  # Part 21 is ASCII; latin-1 never fails
     lengths, angles = (_units(kind, entities) for kind in ("LENGTH", "PLANE_ANGLE"))
     if len(lengths) != 1:
-        raise ValueError(f"it states units of length: {', '.join(lengths) or 'none'}; export it in millimetres only")
+        raise ValueError(f"its units of length are {' and '.join(lengths) or 'not stated'}; export it in millimetres")
     ((unit, number),) = lengths.items()
     size = _unit_size(entities, number)  # mm
     if size is None or not 0 < size < math.inf:
@@ -199,14 +199,14 @@ def _schema(data: str, strings: Sequence[str]) -> str:
 
 
 def _product(entities: Entities) -> str:
-    """Return the name of the first PRODUCT, or its number if it has none."""
+    """Return the name of the first PRODUCT, or its part number (id) if it has no name."""
     for number in entities.of("PRODUCT"):
         return entities.string(number, 1) or entities.string(number, 0)
     raise ValueError("the file has no PRODUCT; export it with a product name")
 
 
 def _units(quantity: str, entities: Entities) -> dict[str, str]:
-    """Return the entity numbers, by name, of the units that the contexts of the shapes use for a quantity."""
+    """Return the entity numbers, by name, of the units of a quantity, such as LENGTH, that the shapes' contexts use."""
     used = set()
     for body in entities.of("COMPLEX").values():
         for context in re.findall(r"GLOBAL_UNIT_ASSIGNED_CONTEXT\(\(([#\d,]*)\)\)", body):
@@ -231,7 +231,7 @@ def _unit_name(body: str, entities: Entities) -> str:
 
 
 def _edge_uses(entities: Entities) -> dict[int, tuple[int, int]]:
-    """Return how often the loops of the faces use each EDGE_CURVE forwards and backwards."""
+    """Return how often (forwards, backwards) the loops of the faces use each EDGE_CURVE, by its number."""
     edges = {name: [0, 0] for name in entities.of("EDGE_CURVE")}
     oriented = _flagged_references("ORIENTED_EDGE", r"\('\d*',\*,\*,", entities)
     loops = _reference_lists("EDGE_LOOP", entities)
@@ -247,19 +247,19 @@ def _edge_uses(entities: Entities) -> dict[int, tuple[int, int]]:
 
 
 def _shell_faces(entities: Entities) -> list[list[str]]:
-    """Return the bounds of each face of the closed shells; a face listed twice counts twice."""
+    """Return the bounds of each face of the closed shells; a face that the shells list twice counts twice."""
     faces = _reference_lists("ADVANCED_FACE", entities)
     return [faces[name] for shell in _reference_lists("CLOSED_SHELL", entities).values() for name in shell]
 
 
 def _reference_lists(kind: str, entities: Entities) -> dict[str, list[str]]:
-    """Return the list of references at the beginning of each entity of a kind."""
+    """Return the list of references that follows the name of each entity of a kind, by its number."""
     lists = {name: required(re.match(r"\('\d*',\(([#\d,]*)\)", body)) for name, body in entities.of(kind).items()}
     return {name: re.findall(r"\d+", hit[1]) for name, hit in lists.items()}
 
 
 def _flagged_references(kind: str, before: str, entities: Entities) -> dict[str, tuple[str, str]]:
-    """Return reference and flag, T or F, at the end of each entity of a kind; before: pattern of what precedes them."""
+    """Return (reference, flag T or F) at the end of each entity of a kind; before: pattern of the text before them."""
     pattern = re.compile(before + r"#(\d+),\.([TF])\.\)")
     flagged = {name: required(pattern.fullmatch(body)) for name, body in entities.of(kind).items()}
     return {name: (hit[1], hit[2]) for name, hit in flagged.items()}
@@ -269,7 +269,7 @@ def _flagged_references(kind: str, before: str, entities: Entities) -> dict[str,
 
 
 def _freeform_surfaces(entities: Entities) -> list[FreeformSurface]:
-    """Return the back, and the front if it has a freeform net, in the file's unit and before placement."""
+    """Return the back, then the front if it is a net, in the file's unit, without the placement of the solid."""
     attributes = {n: body.partition("',")[2] for n, body in entities.of("B_SPLINE_SURFACE_WITH_KNOTS").items()}
     bodies = [(number, body) for number, body in attributes.items() if not RULED.match(body)]
     bodies.sort(key=lambda each: each[1].count("#"), reverse=True)
@@ -287,7 +287,7 @@ def _freeform_surfaces(entities: Entities) -> list[FreeformSurface]:
 
 
 def _middle_and_normal(surface: FreeformSurface) -> tuple[np.ndarray, np.ndarray]:
-    """Return the control point (3,) at the centre of a net, and the unit vector (3,) along u x v of its sides."""
+    """Return the control point (3,) at the centre of a net, and the unit normal (3,) along its sides' product u x v."""
     net = surface.control_points
     m, n, _ = net.shape
     normal = np.cross(net[-1, 0] - net[0, 0], net[0, -1] - net[0, 0])
@@ -295,7 +295,7 @@ def _middle_and_normal(surface: FreeformSurface) -> tuple[np.ndarray, np.ndarray
 
 
 def _in_millimetres(surface: FreeformSurface, placement: Placement, unit: float) -> FreeformSurface:
-    """Return a surface in mm, moved by a placement; unit: unit of length of the file (mm)."""
+    """Return a surface of the file in mm, moved by a placement; unit: the file's unit of length in mm."""
     net = surface.control_points if unit == 1 else unit * surface.control_points
     return replace(surface, control_points=placement(net) if placement.moves else net)
 
@@ -319,7 +319,7 @@ def _surface(entity: str, body: str, entities: Entities) -> FreeformSurface:
 
 
 def _net(text: str) -> np.ndarray:
-    """Return the entity numbers (m, n) of the points of a control net from its list of references."""
+    """Return the entity numbers (m, n) of the points of a control net; text: the rows of references to them."""
     lines = text.split("),(")
     if not all(REFERENCES.fullmatch(line) for line in lines):
         raise ValueError("the control net is damaged; write the file again")
@@ -330,7 +330,7 @@ def _net(text: str) -> np.ndarray:
 
 
 def _check_knots(counts: np.ndarray, knots: np.ndarray, points: int, degree: int) -> None:
-    """Raise ValueError unless knots of these multiplicities define a spline of this degree and number of points."""
+    """Raise ValueError unless knots with multiplicities `counts` define a spline of `points` control points."""
     if not 1 <= degree <= MAX_DEGREE:
         raise damaged(f"a spline has degree {degree}, but 1 to {MAX_DEGREE} are possible")
     rising = np.isfinite(knots).all() and (np.diff(knots) > 0).all()
@@ -344,7 +344,7 @@ def _check_knots(counts: np.ndarray, knots: np.ndarray, points: int, degree: int
 def _properties(entities: Entities, products: set[str], unit: float) -> ValidationProperties:
     """Return the properties that a file states; a number that cannot be read is UNKNOWN_VALUE.
 
-    unit: unit of length of the file (mm), in which centroids are stated; a measure states its unit.
+    unit: the file's unit of length in mm, in which centroids are stated; other measures state their unit.
     products: product definitions of the lens; if empty, properties of all products are read.  Other products, such
     as an assembly, have centroids in frames of their own.
     """
@@ -373,7 +373,7 @@ def _properties(entities: Entities, products: set[str], unit: float) -> Validati
 
 
 def _measure(entities: Entities, item: str, kind: str) -> float:
-    """Return the value of a measure, converted from its unit to powers of mm and g."""
+    """Return the value of a measure, converted from its unit to powers of mm and g; kind: pattern of its type."""
     value = re.search(rf"{kind}\(({NUMBER})\),#(\d+)", entities.bodies.get(item, ("", ""))[1])
     return float(value[1]) * _unit_scale(entities, value[2]) if value else UNKNOWN_VALUE
 
@@ -387,7 +387,7 @@ def _centroid(item: str, entities: Entities, unit: float) -> tuple[float, float,
 
 
 def _unit_scale(entities: Entities, unit: str) -> float:
-    """Return the size of a unit, in powers of mm and g."""
+    """Return the size of a unit (its number) in powers of mm and g; UNKNOWN_VALUE if it cannot be read."""
     if (size := _unit_size(entities, unit)) is not None:
         return size
     scale = 1.0
@@ -401,7 +401,7 @@ def _unit_scale(entities: Entities, unit: str) -> float:
 
 
 def _unit_size(entities: Entities, unit: str) -> float | None:
-    """Return the size of a named unit of length (mm) or mass (g); None if it is not derived from an SI_UNIT."""
+    """Return the size of a unit of length (in mm) or mass (in g); None if it is not derived from an SI_UNIT."""
     body, factor = entities.bodies[unit][1], 1.0
     if converted := re.search(r"CONVERSION_BASED_UNIT\('\d+',#(\d+)\)", body):  # such as an inch, defined in mm
         measure = re.search(rf"\(({NUMBER})\)?,#(\d+)\)", entities.bodies[converted[1]][1])
@@ -425,7 +425,7 @@ def _profiles(entities: Entities) -> Iterator[ProfileTolerance]:
 
 
 def _toleranced_face(entities: Entities, aspect: str) -> tuple[str, str]:
-    """Return (surface, name) of the face that an aspect of the shape denotes; ("", "") unless it is one face."""
+    """Return (number of the surface, name) of the face that a SHAPE_ASPECT denotes; ("", "") unless it is one face."""
     usages = map(entities.references, entities.of("GEOMETRIC_ITEM_SPECIFIC_USAGE"))
     faces = {names[-1] for names in usages if names[0] == aspect}
     if len(faces) != 1 or entities.bodies.get(face := faces.pop(), ("",))[0] != "ADVANCED_FACE":

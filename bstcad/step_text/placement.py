@@ -31,7 +31,7 @@ class Placement:
 
     @classmethod
     def of_axes(cls, origin: np.ndarray, axis: np.ndarray, reference: np.ndarray) -> Placement:
-        """Return the placement at `origin`, with z along `axis` and x along the part of `reference` normal to z.
+        """Return the placement at `origin`, with z along `axis` and x along the component of `reference` normal to z.
 
         Raises ValueError if the two directions are parallel or zero.
         """
@@ -85,7 +85,7 @@ class Placement:
         return f"rotated by {angle:.9g}° about {_axis_name(about)}"
 
     def facts(self) -> dict[str, Any]:
-        """Return the placement for JSON: in words, angle (degrees) and axis of its rotation, and shift (mm)."""
+        """Return entries for JSON: the placement in words, angle (degrees) and axis of its rotation, and shift (mm)."""
         angle, about = self.turn
         shift, turn = self.shift.tolist(), round(angle, DECIMALS)
         return {"words": self.words, "turn_deg": turn, "axis": about.tolist(), "shift_mm": shift}
@@ -97,7 +97,7 @@ def identity() -> Placement:
 
 
 def compose(placements: Sequence[Placement]) -> Placement:
-    """Return the composition of placements; the last one is applied first."""
+    """Return the placement that applies all of these, the last one first."""
     return functools.reduce(Placement.after, placements, identity())
 
 
@@ -147,7 +147,7 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def _axis_name(about: np.ndarray) -> str:
-    """Return the name of an axis, or its three components."""
+    """Return the name of an axis (unit vector), such as z or -x, or else its three components."""
     k = int(np.abs(about).argmax())
     if abs(abs(about[k]) - 1) < PARALLEL_SINE:
         return ("" if about[k] > 0 else "-") + "xyz"[k]

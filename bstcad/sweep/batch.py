@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from rich.console import Group
 
 REFUSED, BROKEN, STOPPED = "refused", "broken", "not done"  # statuses of a design without a lens
-STATUS_STYLES = {"passed": "green", "passed with remarks": "yellow", NO_LIMIT: "cyan"}  # colours; others: red
+STATUS_STYLES = {"passed": "green", "passed with remarks": "yellow", NO_LIMIT: "cyan"}  # colour of a status; else red
 KILLED_CODE = -9  # exit code of a process killed by a user, or by the system when memory ran out
 CORES_PER_DESIGN = 2  # number of cores that one design uses
 
@@ -69,7 +69,7 @@ class BatchEntry(StoredRecord):
         return self.status in VERDICTS
 
     def changed(self, **entries: Any) -> BatchEntry:
-        """Return the entry with some fields replaced."""
+        """Return the entry with these fields replaced."""
         return self.model_copy(update=entries)
 
 
@@ -98,7 +98,8 @@ class BatchScene:
 def design(contents: SceneFiles, folder: Path, variables: Mapping[str, str], tick: Tick = lambda: None) -> ExitStatus:
     """Design a scene into a folder, from a checkpoint of this design if there is one; return how the process ended.
 
-    variables: environment variables of the process.  A process that was killed is started a second time.
+    contents: the scene's files.  variables: additional environment variables of the process.  A process that was killed
+    is started a second time.
     """
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         scene = unpack_scene(contents, Path(place))
@@ -138,7 +139,7 @@ def batch(
     """Design each scene into folder/NAME; return an entry per scene, in the order of the scenes.
 
     workers: number of simultaneous designs on this machine; None: as many as its cores and memory allow.
-    cluster: machines that make the designs instead.  say: receives a sentence before the work begins.
+    cluster: machines that make the designs instead.  say: called with a sentence before the work begins.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with files.exclusive(folder / "batch.json"), contextlib.ExitStack() as stack:
@@ -266,7 +267,7 @@ def _hash_of_design(folder: Path) -> str:
 
 
 def read(folder: Path) -> tuple[BatchEntry, ...]:
-    """Read the designs of earlier batches in a folder; raise MachineError if batch.json is damaged."""
+    """Read the designs of earlier batches from batch.json in a folder; raise MachineError if it is damaged."""
     path = folder / "batch.json"
     return cold_run.read_record(Batch, path, "remove it, and all designs are repeated").designs if path.exists() else ()
 
@@ -291,7 +292,7 @@ def exit_code(rows: Sequence[BatchEntry]) -> int:
 
 
 def summary(rows: Sequence[BatchEntry], folder: Path, verbose: bool = False) -> Group:
-    """Return a line per design, with figures or the reason of a failure, then the failed checks (verbose: all)."""
+    """Return a line per design, with RRMSD and time or the reason of a failure, then failed checks (verbose: all)."""
     from rich.console import Group
     from rich.text import Text
 

@@ -142,7 +142,7 @@ DAMAGES = {
     "rational": (lambda t: t.replace("B_SPLINE_SURFACE_W", "RATIONAL_B_SPLINE_SURFACE_W"), "no B"),
     "no surface": (lambda t: t.replace(SIMPLE, ""), "no B_SPLINE_SURFACE_WITH_KNOTS"),
     "no product": (lambda t: t.replace(PRODUCT, ""), "no PRODUCT"),
-    "no unit": (lambda t: t.replace(UNITS, ""), "units of length: none"),
+    "no unit": (lambda t: t.replace(UNITS, ""), "units of length are not stated"),
     "no schema": (lambda t: t.replace("FILE_SCHEMA", "FILE"), "FILE_SCHEMA"),
 }
 
