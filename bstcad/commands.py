@@ -431,7 +431,6 @@ def _write_report(
 
 
 def _write_sheet(drawn: Pictures, folder: Path) -> None:
-    """Write datasheet.pdf if the data sheet was drawn."""
     if (sheet := drawn.data_sheet()) is not None:
         files.put(folder / SHEET, sheet)
 

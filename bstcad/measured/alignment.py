@@ -187,7 +187,10 @@ def _least_squares(face: BackFace, cloud: np.ndarray, pose: Pose) -> Pose:
 def gauss_newton_step(
     face: BackFace, points: np.ndarray, distances: np.ndarray, normals: np.ndarray, weight: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a Gauss-Newton step (6,) and orthonormal motions (6, k) that the points, with weights (n,), determine."""
+    """Return a Gauss-Newton step (6,) and an orthonormal basis (6, k) of the motions that the points determine.
+
+    The six components are those of BackFace.columns.  weight (n,): weights of the points; None: equal weights.
+    """
     columns = face.columns(points, normals)
     weight = np.full(len(points), 1 / len(points)) if weight is None else weight / weight.sum()
     weighted = columns * weight[:, None]
@@ -249,7 +252,7 @@ MIN_POINT_NOISE = 1e-6  # lower bound of the noise, mm: below any measurement, a
 def find_outliers(
     points: np.ndarray, distances: np.ndarray, candidates: np.ndarray, noise: float | None = None
 ) -> tuple[np.ndarray, float]:
-    """Return a mask (n,) of the outliers among points (n, 3) at distances (n,) from the face, and the noise; mm.
+    """Return a mask (n,) of the outliers among points (n, 3) at distances (n,) from the face, and the noise (mm).
 
     candidates: mask (n,) of the points to judge; the others are only neighbours.  noise (mm); None: estimated.
     """
@@ -378,7 +381,10 @@ def _heights(face: BackFace, sample: np.ndarray, decentre: np.ndarray) -> list[f
 
 
 def _refine_start(face: BackFace, sample: np.ndarray, pose: Pose, steps: int) -> tuple[Pose, float]:
-    """Return (refined pose, q): a quarter of the sample has |d| <= q (mm).  Weights are 1 / (1 + (d / (2 q))²)."""
+    """Return (pose after at most `steps` Gauss-Newton steps, q): a quarter of the sample has |d| <= q (mm).
+
+    Weights are 1 / (1 + (d / (2 q))²).  q is infinite if too few points lie inside the outline.
+    """
     distance = np.inf
     for _ in range(steps):
         points = pose.to_design(sample)

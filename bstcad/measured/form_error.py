@@ -199,7 +199,7 @@ def _posterior_mean(
     """Return the posterior mean (m, m) of the amplitudes c, by conjugate gradients.
 
     (1 + sqrt(S) Cᵀ G C sqrt(S) / σ²) c / sqrt(S) = sqrt(S) Cᵀ b / σ² is solved for c / sqrt(S), preconditioned as if
-    Cᵀ G C were `per_mode` (even points).  C: inverse cosine transform; G: `gram`; b: `right_side`; S: `variance`.
+    Cᵀ G C were `per_mode`.  C: inverse cosine transform; G: `gram`; b: `right_side`; S: `variance`; σ²: `noise2`.
     """
     m, even = len(variance), 1 + variance * per_mode / noise2
     root = np.sqrt(variance / even)

@@ -44,7 +44,7 @@ def channels_of(source: Emitter, index: Callable[[float], float], points: int, d
     """Return the channels of a source; index(nm) is the refractive index of the lens.
 
     points: number of sample points of an extended source, all lines together, but at least two per line.  draw: number
-    of the point set.  A point or a parallel beam of one wavelength gives one channel, whose source is `source` itself.
+    that selects the points.  A point or parallel beam of one wavelength gives one channel, with `source` itself.
     """
     extent = source.extent
     if extent is None:

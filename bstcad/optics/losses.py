@@ -197,5 +197,4 @@ def _amplitudes(n_in: float, n_out: float, cos_in: Tensor, cos_out: Tensor) -> t
 
 
 def _mean(s: Tensor, p: Tensor, polarisation: Polarisation) -> Tensor:
-    """Return the value of one polarisation, or the mean of s and p."""
     return s if polarisation == "s" else p if polarisation == "p" else (s + p) / 2

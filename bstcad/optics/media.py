@@ -217,7 +217,6 @@ METALS = (  # metals of mirrors, as opaque films
 
 
 def _by_name(media: tuple[Medium, ...]) -> dict[str, Medium]:
-    """Return the media by name, normalised by `normalise_name`."""
     return {normalise_name(name): medium for medium in media for name in medium.names}
 
 

@@ -36,7 +36,7 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
 
 @cache
 def _caches(chosen: str) -> Path:
-    """Return the folder of the caches in `chosen` (NUMBA_CACHE_DIR), else in __pycache__; there, delete older ones."""
+    """Return the folder of the caches, in `chosen` (NUMBA_CACHE_DIR) or in __pycache__, where old ones are deleted."""
     contents = sha256(b"".join(path.read_bytes() for path in sorted(FOLDER.glob("*.py"))))
     folder = Path(chosen or FOLDER / "__pycache__") / (PREFIX + contents.hexdigest()[:16])
     if not chosen and not folder.exists():

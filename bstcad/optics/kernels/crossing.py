@@ -39,7 +39,6 @@ ADJOINT_WORK = WORK + 11 * BLOCK  # length of `work` for the adjoint
 
 @njit(error_model="numpy")
 def _load(position, direction, status, first, count, work):
-    """Load rays first … first + count - 1 into `work`."""
     for r in range(count):
         at = first + r
         work[X + r], work[Y + r], work[Z + r] = position[0, at], position[1, at], position[2, at]
