@@ -121,8 +121,8 @@ def design(
 ) -> Made:
     """Design the lens of a scene: transport map, stage 1, and stage 2, or stage 3 for an extended source.
 
-    hooks: functions that are called during the design.  Once `hooks.interrupted` returns True, tailoring ends with the
-    best lens so far, or with KeyboardInterrupt if there is no lens yet.
+    device: see `device_for`.  hooks: functions that are called during the design.  Once `hooks.interrupted` returns
+    True, tailoring ends with the best lens so far, or with KeyboardInterrupt if there is no lens yet.
     began: time.perf_counter() when tailoring.max_time began (None: now); this time includes writing and verification.
     start: state that `hooks.save` received; the design continues from this state and has the same result.
     """

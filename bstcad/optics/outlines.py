@@ -68,7 +68,7 @@ class _Box(ABC):
         return x, y
 
     def inset_direction(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the shift (x, y) of rim points per mm of inset: the inward normal, (-x/a, -y/b) on a box 2a x 2b."""
+        """Return the shift (x, y) of rim points per mm of inset: inward normal, on a rectangle 2a x 2b (-x/a, -y/b)."""
         a, b, r2 = self.limits
         if r2 == 0:
             return -x / a, -y / b

@@ -167,7 +167,7 @@ def _points(face: BSplineSurface) -> int:
 
 
 def _smooth_parts(face: BSplineSurface, axis: int, parts: int) -> np.ndarray:
-    """Return breaks (mm) that divide x (axis 0) or y (1) of a net into at least `parts` parts, nearly polynomial."""
+    """Return breaks (mm) along x (axis 0) or y (1) of a net, at least `parts` parts of nearly polynomial heights."""
     (first, last), pitch = (face.x, face.y)[axis], face.pitch[axis]
     lines = np.concatenate([[first], first + pitch * (np.arange(1, face.shape[axis] - 2) + 0.5), [last]])
     ends = [np.linspace(low, high, END_PARTS + 1) for low, high in (lines[:2], lines[-2:])]
@@ -196,7 +196,7 @@ class MassProperties:
 
 
 def of_lens(lens: Lens) -> MassProperties:
-    """Return the properties of a bare lens to 1e-9 (relative); OpenCASCADE takes minutes, and errs by 1e-5."""
+    """Return the properties of a bare lens to 1e-9; for a large net OpenCASCADE takes minutes, and errs by 1e-5."""
     lens, total = lens.plain(), Sums()
     z_ref = lens.front.z  # origin of z in the sums: a near one limits rounding
     for face, sign in ((lens.back, 1), (lens.front, -1)):

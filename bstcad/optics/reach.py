@@ -31,7 +31,7 @@ MAX_SLOPE = math.tan(math.radians(70))  # largest slope: a steeper face cannot b
 
 
 def largest_deflection(index: float, grazing: float = MAX_EXIT_ANGLE) -> float:
-    """Return the deflection (rad), by a face of relative index `index`, of a ray that leaves at `grazing` (rad)."""
+    """Return the deflection (rad) of a ray that leaves a face of this relative index at `grazing` rad to its normal."""
     return grazing - math.asin(math.sin(grazing) / index)
 
 
@@ -122,10 +122,10 @@ def _at_angle(d: Tensor, towards: Tensor, along: Tensor, angle: float) -> Tensor
 
 
 def reach_margin(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing: float = MAX_EXIT_ANGLE) -> Tensor:
-    """Return the margin of each ray (a cosine) to the limits of the face; negative: the aim is out of reach.
+    """Return the margin of each ray to the limits of the face, without unit; negative: the aim is out of reach.
 
     Minimum of three: d · d' minus the cosine of the largest deflection (not for a mirror); n_z - |(n_x, n_y)| /
-    MAX_SLOPE of `normal_towards`; and the cosine between d' and the receiver's normal, which points away from the lens.
+    MAX_SLOPE, n by `normal_towards`; and d' · m, m the receiver's unit normal, which points away from the lens.
     """
     _, out, along = directions(at_face, aim, plane)
     normal = normal_towards(at_face, out, law)

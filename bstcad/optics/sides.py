@@ -46,7 +46,7 @@ def in_proportion(net: Sides, of: Sides, to: Sides) -> Sides:
 
 
 def coarser(net: Sides, longer: int) -> Sides:
-    """Return `net` coarsened in proportion to `longer` control points on its longer side, unchanged if it has fewer."""
+    """Return `net` coarsened in proportion to `longer` points on its longer side; unchanged if it has no more."""
     longest = max(as_pair(net))
     return net if longer >= longest else scaled(net, (longer - 1) / (longest - 1))
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bstcad.optics.outlines import STRICT, Circle, Outline
 
-MIN_COS2 = 1e-6  # 1 - (1 + k) c² r², for a sphere cos² of its slope angle, up to which a surface is too steep
+MIN_COS2 = 1e-6  # 1 - (1 + k) c² r² (for a sphere cos² of the slope angle) up to which a surface is too steep
 
 
 class Surface(ABC):

@@ -144,7 +144,7 @@ def points_table(lens: Lens, face: Surface, points: int) -> str:
 def turning_cloud(lens: Lens, points: int, face: Surface | None = None) -> str:
     """Return a CSV table for slow-tool diamond turning: radius (mm), angle (degrees), height above the vertex (mm).
 
-    face: None: the back.  Angles are from +x towards +y; heights are along +z, which for the front is into the glass.
+    face: the back if None.  Angles are from +x towards +y; heights are along +z, which is into the glass at the front.
 
     There are `points` rings of equal spacing from the axis to the farthest point of the outline.  All rings have the
     same angles; neighbours on the outermost ring are one ring spacing apart.  Points outside the outline are omitted.

@@ -63,7 +63,7 @@ PERCENT_LIT = "% of mean of lit pixels"  # label of a scale of differences
 COLUMNS = 4  # pictures of spectral lines per row
 PANEL_WIDTH, MAX_PANEL_HEIGHT = 2.4, 4.8  # size of the picture of a spectral line (inches)
 MANY_OUTLIERS = 300  # number of outliers from which on their dots are small
-FORM_UNITS = ((1e-3, 1e3, "µm"), (0.0, 1e6, "nm"))  # (smallest size in mm, factor, unit as written)
+FORM_UNITS = ((1e-3, 1e3, "µm"), (0.0, 1e6, "nm"))  # (smallest size in mm, factor from mm, unit as written)
 BINS = 60  # number of bins of the histogram of trials
 MAX_WORST_TRIALS = 3  # number of the worst trials that are drawn
 # CIE 1931 standard observer, sums of Gaussians with two widths: weight, centre, width below and above the centre (nm).
@@ -425,7 +425,7 @@ def balanced(pictures: Sequence[np.ndarray], wavelengths: Sequence[float], share
 
 
 def draw_judges(judges: Sequence[Comparison], view: View) -> dict[str, bytes]:
-    """Return a figure for each other program that did not decline, as PNG bytes by name."""
+    """Return a figure for each other program that can trace the light, as PNG bytes by name."""
     return {each.judge.figure: png(judged_picture(each, view)) for each in judges if not each.judge.declined}
 
 

@@ -55,7 +55,7 @@ EXACT_FACES = (  # sentence on a freeform back, and on two freeform faces
 )
 SHEET, PART, LENS = "datasheet.pdf", "part.step", "lens.step"
 DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # plane z = 0, by datum
-EDGE_TOLERANCE = 1e-3  # fraction of an outline's area, outside the back's edge, up to which the back fills the outline
+EDGE_TOLERANCE = 1e-3  # fraction of an outline's area that a back which counts as filling the outline may leave free
 
 Point = tuple[float, float, float]
 Measures = tuple[Point, Point, float | None]  # smallest and largest x, y, z (mm); volume (mm³), None: unknown

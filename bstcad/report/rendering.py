@@ -39,7 +39,7 @@ CLAY = "#d3d9e0"
 CLAY_LIGHTS = (((-1.0, 0.5, 0.7), 0.8), ((0.5, -1.0, 0.35), 0.5), ((0.1, -0.2, 1.0), 0.25))
 FINISH = {"ambient": 0.12, "diffuse": 0.9, "specular": 0.2, "specular_power": 30.0}  # reflection of light by the clay
 EYE = (0.75, -1.5, 1.7)  # position of the eye relative to the centre, in diagonals of the bounding box
-VIEW_ANGLE = 26.0  # vertical angle of view (degrees)
+VIEW_ANGLE = 26.0  # vertical angle of view of the lens in clay (degrees)
 
 # The lens with its rays, in two views: the lens close up, and the whole path.
 WINDOW = (1920, 1080)  # size of the window (pixels)
@@ -383,7 +383,7 @@ def _light(path: LightPath) -> dict[str, Any]:
 
     rays: at most MAX_MODEL_RAYS rays, each with its points from the source to the furthest screen.  flux: flux of each
     ray, 1 for the brightest.  screens: corners as in LightPath, and the picture as a data URL, row 0 at y max.
-    lamp: position of a point source, or empty.  aside: direction to the eye for the whole path, y up.
+    lamp, mirror: as in LightPath.  aside: direction to the eye for the whole path, y up.
     """
     every = math.ceil(len(path.rays) / MAX_MODEL_RAYS) | 1  # odd, since an even step would omit whole columns of rays
     rays, flux = path.rays[::every], path.flux[::every] / path.flux.max()
