@@ -293,7 +293,7 @@ class Design:
             return commands.tolerance(folder, settings, workers, scheduler).facts()
 
     def show(self, png: AnyPath | None = None) -> None:
-        """Draw the lens with rays and screen, in a PNG file or in a window; return once the window is closed."""
+        """Draw the lens with rays and screen in the file `png` or, if None, in a window; return once it is closed."""
         commands.show(self._own_folder(), None if png is None else Path(png).expanduser())
 
     def picture(self, png: AnyPath | None = None, *, target: int = 0) -> np.ndarray:

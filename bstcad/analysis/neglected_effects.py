@@ -133,7 +133,7 @@ class Reference:
         return np.stack([self._over_cells(p, np.where(arrives, self.flux, 0.0)) for p in shift]), share
 
     def _over_cells(self, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Return the smoothed, weighted mean of values (n, n) of the light that lands in each cell (rows, columns)."""
+        """Return the smoothed mean, with `weight`, of values (n, n) of the light in each cell of the target."""
         sums = [self._landing(weight * v) for v in (values, 1.0)]
         field, known = np.zeros(sums[0].shape), np.zeros(sums[0].shape, bool)
         for sigma in FIELD_SMOOTHING:
@@ -256,7 +256,7 @@ def blur_by_gaussian(picture: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def difference(changed: np.ndarray, before: np.ndarray) -> float:
-    """Return √(Σ |E' - E|² / Σ E²) with E' scaled to the sum of E; 1 if E' is dark."""
+    """Return √(Σ |E' - E|² / Σ E²), E being `before` and E' `changed`, scaled to the sum of E; 1 if E' is dark."""
     if not changed.sum() > 0:
         return 1.0
     scaled = changed * (before.sum() / changed.sum())

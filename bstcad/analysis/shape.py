@@ -52,7 +52,7 @@ def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
 
 
 def _face_figures(net: BSplineSurface, bends: Survey, points: tuple[np.ndarray, ...]) -> dict[str, Any]:
-    """Return the figures of one freeform face; points: x, y and z (mm) of points all over it."""
+    """Return the figures of one freeform face; bends: its extremes; points: x, y and z (mm) of points all over it."""
     concave, convex = (bend.largest if bend.largest < MAX_RADIUS else None for bend in (bends.concave, bends.convex))
     octaves, waves = slope_octaves(net), ripple(net)
     top = octaves[-1] / octaves.sum() if octaves.sum() > 0 else 0.0
@@ -254,7 +254,7 @@ def survey(lens: Lens, concave: float | None = None, convex: float | None = None
 def survey_front(
     lens: Lens, concave: float | None = None, convex: float | None = None, slope: float | None = None
 ) -> Survey:
-    """Find the extremes of a freeform front; seen from outside, from -z, a ridge of z is a valley."""
+    """Find the extremes of a freeform front as `survey` does; seen from outside, from -z, a ridge of z is a valley."""
     found = survey(replace(lens, back=lens.front), concave=convex, convex=concave, slope=slope)
     return Survey(concave=found.convex, convex=found.concave, slope=found.slope)
 
@@ -281,7 +281,7 @@ def _radius(bend: Extreme) -> Extreme:
 
 
 def _angle(lens: Lens, slope: Extreme) -> Extreme:
-    """Return the extreme as an angle in degrees, including the rim between the points of the grid."""
+    """Return the largest slope of the back as an angle in degrees, including the rim between the points of the grid."""
     x, y = sample_rim(lens.outline, GRID_POINTS)
     _, z_x, z_y = lens.back.sag_and_slope(x, y)
     steep = torch.hypot(z_x, z_y)

@@ -150,7 +150,7 @@ def impossible_choices(text: str, fault: Callable[[str], str | None]) -> dict[st
 
 
 def _refusal(text: str, key: str, choice: str, fault: Callable[[str], str | None]) -> str | None:
-    """Return the sentence that refuses a scene with another choice; None if the choice is possible."""
+    """Return the sentence that refuses a scene with another choice, or None.  fault: see `impossible_choices`."""
     try:
         value = typed(key, choice, tables(text))
         return fault(take_change(text, key, value, is_valid=lambda each: fault(each) is None)[0])

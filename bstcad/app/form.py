@@ -229,7 +229,7 @@ def _group(key: str, node: Node, table: Table, data: Table, removable: bool = Fa
 
 
 def _list(key: str, node: Node, value: Any, data: Table, maximum: int) -> Group:
-    """Return the group of a list of tables, or of the only table if it need not be in a list, such as a target."""
+    """Return the group of a list of tables, `value`, or of the only table if it need not be in a list, as a target."""
     tables = [part if isinstance(part, dict) else {} for part in (value if isinstance(value, list) else [value])]
     tables = tables if value else []
     behind = f"{key}[{len(tables)}]"
@@ -381,7 +381,7 @@ def html_id(key: str) -> str:
 
 
 def _owner(key: str, known: Iterable[str]) -> str:
-    """Return the key of the field or innermost group at which a sentence on `key` is shown; "": at the top."""
+    """Return the one of the `known` keys at whose field or group a sentence on `key` is shown; "": at the top."""
     alike = {other.replace("[0]", ""): other for other in known} | {other: other for other in known}
     while key:
         if found := alike.get(key) or alike.get(key.replace("[0]", "")):

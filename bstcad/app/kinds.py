@@ -124,7 +124,7 @@ def cast(node: Node, value: Any) -> Any:
 
 
 def _cast_table(union: list[Node], table: Any) -> dict[str, Any]:
-    """Cast the values of a table; invalid values stay unchanged, so that the check of the scene reports them."""
+    """Cast the values of a table as its record in `union` requires; invalid values stay, for the check of the scene."""
     if not isinstance(table, dict):
         raise ValueError
     nodes, taken = matching_records(union, table)[0]["properties"], dict(table)
@@ -160,7 +160,7 @@ def convert_table(key: str, tag: Mapping[str, str], data: Table) -> dict[str, An
 
 
 def _is_common(before: Node | None, after: Node | None, value: Any) -> bool:
-    """Return True if a key has the same meaning in two kinds of table and the second allows its value."""
+    """Return True if a key has the same meaning before and after a change of its table's kind and keeps its value."""
     if before is None or after is None or before["description"] != after["description"] or "const" in after:
         return False
     try:

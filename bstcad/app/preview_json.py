@@ -47,7 +47,7 @@ def figures(found: Preview) -> Rows:
 
 
 def of_plan(plan: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the simulated effects, a row for each effect left out, the chosen net, and the verdict."""
+    """Return the effects in `plan --json`: the simulated ones and a row for each left out; also net and verdict."""
     rows = [
         [" ".join(filter(None, (LEFT_OUT[entry.kind], entry.detail and f"({entry.detail})"))), *changes(entry), of]
         for goal in plan["goals"]
@@ -59,7 +59,7 @@ def of_plan(plan: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def of_predictions(plan: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the predicted seconds and RRMSD of each quality, or the reason why there is no prediction."""
+    """Return the predicted seconds and RRMSD of each quality in `plan --json`, or the reason why there are none."""
     if plan["predicted"] is None:
         none = {"not_predicted": plan["not_predicted"], "notes": [], "qualities": {}}
         return none | {"verdict": plan["verdict"] if plan["verdict"]["kind"] == "blurred" else None}
@@ -68,7 +68,7 @@ def of_predictions(plan: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def quality_words(seconds: Interval, rrmsd: Interval) -> dict[str, str]:
-    """Return the prediction of a quality in words, with the 90 % intervals."""
+    """Return the predicted seconds and RRMSD of a quality in words, with their 90 % intervals."""
     (least, likely, most), (low, error, high) = seconds, rrmsd
     span = f"{duration(least)} to {duration(most)}; RRMSD {number(low)} to {number(high)}"
     return {"seconds": duration(likely), "rrmsd": number(error), "range": f"nine of ten designs: {span}"}

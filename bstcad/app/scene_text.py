@@ -196,7 +196,7 @@ def _numbered(names: Sequence[str], counts: dict[KeyPath, int], listed: bool) ->
 
 
 def _after_comment(found: Sequence[Piece], k: int) -> int:
-    """Return the index after a piece and after the lines that continue its comment in the same column."""
+    """Return the index after piece `k` and after the lines that continue its comment in the same column."""
     column, k = found[k].column, k + 1
     while column and k < len(found) and found[k].role == "comment" and found[k].column == column:
         k += 1
@@ -233,7 +233,7 @@ def _update(found: list[Piece], path: KeyPath, before: Any, after: Any) -> list[
 def _update_table(
     found: list[Piece], path: KeyPath, before: Mapping[str, Any], after: Mapping[str, Any]
 ) -> list[Piece]:
-    """Change a table key by key; new keys are put in place of the first removed key, or else in the schema's order."""
+    """Change a table to `after`; new keys are put in place of the first removed key, or else in the schema's order."""
     gone = [name for name in before if name not in after]
     for name, value in after.items():
         if name in before:
@@ -246,7 +246,7 @@ def _update_table(
 
 
 def _update_list(found: list[Piece], path: KeyPath, before: Sequence[Any], after: Sequence[Any]) -> list[Piece]:
-    """Change a list of tables that have headers: tables change, one table is removed, or tables are appended."""
+    """Change a list of tables with headers to `after`: tables change, one table is removed, or tables are appended."""
     k = next(
         (k for k, (one, other) in enumerate(zip(before, after, strict=False)) if not is_same(one, other)), len(after)
     )
@@ -268,7 +268,7 @@ def _as_list_item(piece: Piece, path: KeyPath) -> Piece:
 
 
 def _set_value(piece: Piece, after: Any) -> Piece:
-    """Return a key with another value; an aligned comment stays in its column."""
+    """Return the piece of a key with the value `after`; an aligned comment stays in its column."""
     item, trivia = piece.item, piece.item.trivia
     old = item.as_string()
     head = piece.text[: -len(old + trivia.comment_ws + trivia.comment + trivia.trail)]
@@ -279,7 +279,7 @@ def _set_value(piece: Piece, after: Any) -> Piece:
 
 
 def _edit_value(item: Any, after: Any) -> Any:
-    """Return an item of tomlkit with another content; equal parts keep their style."""
+    """Return an item of tomlkit with the content `after`; equal parts keep their style."""
     before = item.unwrap() if isinstance(item, Item) else item
     if is_same(before, after):
         return item

@@ -399,7 +399,7 @@ class Workbench:
         return JSONResponse(self._news(self._run(request), _integer(request.query_params.get("since", 0))))
 
     def _news(self, run: Run, since: int = 10**9) -> dict[str, Any]:
-        """Return state and progress of a run, without the folders of this machine."""
+        """Return state and progress (from line `since` on) of a run, without the folders of this machine."""
         news = run.news(since)
         news["sentence"] = self.workspace.without_paths(news["sentence"])
         for line in news["lines"]:

@@ -235,7 +235,7 @@ class Workspace:
         return name
 
     def _commented(self, scene: Scene, paths: list[Path]) -> str | None:
-        """Return the text of the first file with this scene, with or without control_points; None if none has it."""
+        """Return the text of the first of `paths` with this scene, with or without control_points; else None."""
         alike = [scene, scene.changed({"lens.back.control_points": None})]
         for path in paths:
             with contextlib.suppress(SentenceError):

@@ -199,7 +199,7 @@ def with_parameters(lens: Lens, parameters: list[Any], free: tuple[str, ...] = (
 def tailor_to_irradiance(
     lens: Lens, bundles: Iterator[tuple[Rays, ...]], merit: TentMerit, steps: int, state: RaySearch | None = None
 ) -> Iterator[Iterate]:
-    """Minimise sqrt(`merit`), which is the RRMSD (Eq. 15) if overshoot is 0, with new random rays in each step."""
+    """Minimise sqrt(`merit`), the RRMSD (Eq. 15) if overshoot is 0, with new rays of `bundles` in each step."""
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaf = parameters[0].detach().clone().requires_grad_()

@@ -106,7 +106,7 @@ def nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _triangles(grid: np.ndarray, rising: np.ndarray) -> np.ndarray:
-    """Return the nodes of two triangles per cell, (2 n², 3), counterclockwise.  rising (n, n): see `_diagonals`."""
+    """Return the nodes of two triangles per cell of `grid`, (2 n², 3), counterclockwise.  rising: see `_diagonals`."""
     a, b, c, d = _cell_corners(grid)
     rising = rising[..., None]
     first = np.where(rising, np.stack([a, b, c], axis=-1), np.stack([a, b, d], axis=-1))
@@ -122,9 +122,9 @@ def _cell_corners(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 def _diagonals(outline: Outline, surface: Surface, points: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
     """Choose the diagonal of each cell that is nearer to the face: True (n, n) for the diagonal from the first corner.
 
-    A diagonal along a ridge has at most half the error of a diagonal across it, so that fewer triangles suffice.  On a
-    disc, cells on the grid's diagonals are divided towards the centre, because their outer corners lie on a circle and
-    the other diagonal would make degenerate triangles.
+    points: x, y and z of the nodes.  A diagonal along a ridge has at most half the error of a diagonal across it, so
+    that fewer triangles suffice.  On a disc, cells on the grid's diagonals are divided towards the centre, because
+    their outer corners lie on a circle and the other diagonal would make degenerate triangles.
     """
     k = np.arange(len(points[0]) - 1)
     inner = k < len(k) / 2

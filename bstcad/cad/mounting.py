@@ -311,7 +311,7 @@ def _bevelled(plate: cadquery.Solid, bevel: float, lean: float) -> cadquery.Soli
 
 
 def write_if_it_fits(lens: Lens, mount: Mount, path: str | Path, name: str, facts: Part) -> None:
-    """Write part.step with the data of [part]; write nothing if the part cannot be built (`part_of` says why)."""
+    """Write part.step with `facts`, the data of [part]; write nothing if the part cannot be built (see `part_of`)."""
     try:
         part = part_of(lens, mount)
     except ValueError:

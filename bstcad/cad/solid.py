@@ -139,7 +139,7 @@ def check_thickness(lens: Lens) -> None:
 
 
 def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[list[LoopPiece]]:
-    """Return the rim, counterclockwise, and the holes, clockwise; ValueError if the wires do not bound a lens."""
+    """Return rim (trim None: the outline), counterclockwise, and holes, clockwise; ValueError if they bound no lens."""
     loops = [wires.outline_loop(lens.outline) if trim is None else _wire_loop("trim", trim)]
     loops += [_hole_loop(f"hole {k}", hole) for k, hole in enumerate(holes, start=1)]
     shape = wires.polygon(*loops)
@@ -185,7 +185,7 @@ def _hole_loop(name: str, hole: cadquery.Wire | Sequence[float]) -> list[LoopPie
 
 
 def cap(patch: Patch, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
-    """Return the back (along: True) or front (False) inside the first rail and outside the others."""
+    """Return the face on a patch, back (along: True) or front (False), inside the first rail and outside the others."""
     loops = [rail.along() if along else rail.against() for rail in rails]
     face = face_inside(patch.surface, patch.outward, *loops)
     for rail in rails if patch.uv is not None else ():
@@ -239,7 +239,7 @@ def image(patch: Patch, curve: RailCurve) -> Geom2d_Curve:
 
 
 def _outer_walls(lens: Lens, loops: Sequence[list[LoopPiece]], top: Rail, draft: Draft) -> tuple[list[NamedFace], Rail]:
-    """Return the walls over the rim (the first loop) from the back's edge to the front, and the rail on the front."""
+    """Return the walls over the rim (the first loop) from `top` on the back to the front, and the rail on the front."""
     if not draft.angle:
         return walls.leaning_walls(lens.front.around, loops, top, above=lens.back, draft=draft)
     plane = Plane(_parting(lens, loops[0]))

@@ -279,7 +279,7 @@ def _front_face(rest: Sequence[OccFace]) -> OccFace:
 
 
 def _front_outline(front: Sphere | Conic, face: TopoDS_Face, others: Sequence[OccFace]) -> Circle | None:
-    """Return the outline of a curved front with a plane z = const around it; None if the front ends at walls."""
+    """Return the outline of a curved front with a plane z = const, one of `others`, around it; None: there is none."""
     edge = _bounding_outline(outer_edge(face))
     if front.level or not isinstance(edge, Circle):
         return None

@@ -241,7 +241,7 @@ def _ruled_surface(low: RailCurve, high: RailCurve) -> WallSurface:
 
 
 def _faces_between(surfaces: Sequence[WallSurface], low: Rail, high: Rail, outward: bool = True) -> list[TopoDS_Face]:
-    """Return the walls from one rail up to another; outward: their normals point away from the lens."""
+    """Return the walls with these surfaces from one rail up to another; outward: normals point away from the lens."""
     builder, walls = BRep_Builder(), []
     rising = [_straight(start, end) for start, end in zip(low.corners, high.corners, strict=True)]
     for k, own in enumerate(surfaces):
@@ -333,7 +333,7 @@ class LeaningPiece:
         return upper, np.column_stack([upper[:, :2] + depth[:, None] * m, upper[:, 2] - depth])
 
     def _depth(self, start: np.ndarray, inwards: np.ndarray, tangent: float, z: np.ndarray) -> np.ndarray:
-        """Return the depth (n,) (mm) below z where lines of inward slope `tangent` meet the front (Newton's method)."""
+        """Return the depth (n,) (mm) below z where lines from `start` with inward slope `tangent` meet the front."""
         depth, smallest = np.zeros(len(start)), np.ones(len(start))
         for _ in range(MAX_NEWTON_STEPS):
             height, *slopes = sampled(self.front, *(start + tangent * depth[:, None] * inwards).T)

@@ -91,7 +91,7 @@ def wire_loop(given: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list
 
 
 def shape_in(given: Any) -> tuple[Any, str]:
-    """Return (shape, name of its type) for a shape or a Workplane of one object; else (None, words on its objects)."""
+    """Return (shape, its type's name), also for a Workplane of one object; for others (None, their size in words)."""
     values = given.vals() if hasattr(given, "vals") else [given]
     if len(values) != 1:
         return None, f"a Workplane of {len(values)} objects"
