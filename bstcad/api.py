@@ -186,7 +186,7 @@ class Design:
         return path
 
     def _named_solid(self, trim: Any, holes: Sequence[Any], body: Any, walls: tuple[float, float]) -> Any:
-        """Return the solid of these arguments with the names of its faces; walls: (draft, bevel)."""
+        """Return the result of `solid` with the names of its faces; walls: (draft, bevel)."""
         from bstcad.cad import mounting
         from bstcad.cad.solid import named_solid
         from bstcad.cad.walls import Draft

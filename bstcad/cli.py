@@ -174,7 +174,7 @@ def note_on_stderr(line: str) -> None:
 
 @contextlib.contextmanager
 def slow_progress() -> Iterator[progress.ProgressFunction]:
-    """Show a sweep's progress: new text at once, repeated text after TERMINAL_INTERVAL, or FILE_INTERVAL in a file."""
+    """Show a sweep's progress: new text at once, repeated text after TERMINAL_INTERVAL or, in a file, FILE_INTERVAL."""
     terminal = Console(stderr=True)
     with progress.watch(terminal) as watched:
         yield progress.Throttled(watched, TERMINAL_INTERVAL if terminal.is_terminal else FILE_INTERVAL)

@@ -143,7 +143,7 @@ class Reference:
         return np.where(known, field, field[known].mean() if known.any() else values.mean())
 
     def _landing(self, amount: np.ndarray, pixel: np.ndarray | None = None) -> np.ndarray:
-        """Sum `amount` (n, n) of the light that lands at `pixel` (None: `self.pixel`), by cells (rows, columns)."""
+        """Sum `amount` (n, n) of the light that lands at `pixel` (None: `self.pixel`), by cells of the target."""
         shape, cells = self.screen.shape, tuple(min(FIELD_CELLS, side) for side in self.screen.shape)
         pixel = self.pixel if pixel is None else pixel
         row, column = (np.floor(p / side * count) for p, side, count in zip(pixel[::-1], shape, cells, strict=True))

@@ -157,7 +157,7 @@ class Run:
         return str(self.folder) in command_of(process)
 
     def news(self, since: int) -> dict[str, Any]:
-        """Return state, and lines of progress from line `since`: [seconds since 1970, stage, done, total, text]."""
+        """Return the state, and the progress from line `since` on: [seconds since 1970, stage, done, total, text]."""
         state = self.state
         lines = self.read(PROGRESS).decode("utf-8", "replace").split("\n")[:-1]
         progress = [found for line in lines[max(since, 0) :] if (found := _read(line)) is not None]
@@ -212,7 +212,7 @@ def all_runs(designs: Path) -> list[Run]:
 
 
 def end(runs: list[Run]) -> list[Run]:
-    """Signal each run that is running to end with a checkpoint; return these runs."""
+    """Tell all running runs to end with a checkpoint; return these runs."""
     running = [run for run in runs if run.state.state == "running"]
     for run in running:
         run.signal(signal.SIGTERM)

@@ -160,7 +160,7 @@ def convert_table(key: str, tag: Mapping[str, str], data: Table) -> dict[str, An
 
 
 def _is_common(before: Node | None, after: Node | None, value: Any) -> bool:
-    """Return True if a key has the same meaning before and after a change of its table's kind and keeps its value."""
+    """Return True if a key means the same before and after a change of its table's kind and may keep its value."""
     if before is None or after is None or before["description"] != after["description"] or "const" in after:
         return False
     try:

@@ -349,7 +349,7 @@ class Workbench:
         return self._answered(asking, 0)
 
     def answer(self, request: Request) -> Response:
-        """Answer with a stage of a request (?page, number, stage); {}: not finished; {replaced: true}: outdated."""
+        """Answer with the result of a stage (?page, number, stage); {}: not finished; {replaced: true}: outdated."""
         query = request.query_params
         number, stage = _integer(_required(query, "number")), _integer(_required(query, "stage"))
         body = self.desk.last(_required(query, "page"))
@@ -520,7 +520,7 @@ def _json_handler(work: Callable[[str, Body], dict[str, Any]]) -> Callable[[Requ
         except (ValueError, RecursionError):
             body = None
         if not isinstance(body, dict):
-            raise SceneError("the request: is not a JSON object; reload the page")
+            raise SceneError("the request is not a JSON object; reload the page")
         return JSONResponse(await run_in_threadpool(work, request.path_params.get("name", ""), body))
 
     return answer

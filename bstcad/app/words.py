@@ -41,8 +41,8 @@ def typed(key: str, words: str, data: Mapping[str, Any]) -> Any:
     """Return the value of the words that a person typed for a key; None, which removes the key, for empty words.
 
     A number has a decimal point or a decimal comma: 0.5 and 0,5.  A single point or comma is decimal: 1,000 is 1.  If
-    both occur, the last is decimal and the others separate thousands, as spaces do: 1.000,5, 1,000.5 and 1 000,5.  If
-    one is repeated, or the key takes integers, it separates thousands: 1.000 pixels are 1000.  A unit may follow.
+    both occur, the last is decimal and the others separate thousands, as spaces do: "1.000,5", "1,000.5" and "1 000,5".
+    If one is repeated, or the key takes integers, it separates thousands: 1.000 pixels are 1000.  A unit may follow.
 
     Items of a list are separated by ";", else by commas with a space, else by spaces: "1,5; 2,5" and "1.5, 2.5" and
     "1,5 2,5"; if none of these occurs, by commas: "1.5,2.5", and "1,000" is the list [1, 0] if the key takes lists of

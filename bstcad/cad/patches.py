@@ -32,7 +32,7 @@ from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Conic, Sphere
 
 PATCH_MARGIN = 1.02  # ratio of a conic patch's width to the rim's, so that the rim does not touch the patch's boundary
-PARABOLA_TOLERANCE = 1e-10  # deviation (mm) of a sphere from a parabola, below which the parabola is written
+PARABOLA_TOLERANCE = 1e-10  # deviation (mm) of a sphere from a parabola, below which the parabola is written instead
 
 ParameterMap = Callable[[np.ndarray, np.ndarray], np.ndarray]  # map from (x, y) in mm to (u, v) of a patch, (…, 2)
 
@@ -73,7 +73,7 @@ def _check_round(surface: BSplineSurface, radius: float) -> None:
     (x0, x1), (y0, y1) = surface.x, surface.y
     dx, dy = surface.pitch
     if abs(dx - dy) > 1e-12 * dx:
-        raise ValueError(f"lens: the net's pitch is {dx:g} mm in x, {dy:g} mm in y; give a round lens a square net")
+        raise ValueError(f"lens: the net's pitch is {dx:g} mm in x, {dy:g} mm in y; give a round lens equal pitches")
     reach = min(-x0, x1, -y0, y1) - 1.5 * dx  # the end spans, where x(u) is quadratic, are 1.5 pitches wide
     if radius > reach + 1e-9 * dx:
         raise ValueError(

@@ -165,7 +165,7 @@ def _border(net: BSplineSurface, piece: LoopPiece) -> RailCurve | None:
 
 
 def _is_level_on(surface: Surface, piece: LoopPiece) -> bool:
-    """True if the edge over a piece on a surface is a level line or arc: on a plane, or a circle about the axis."""
+    """True if the edge over a piece on a surface has one height: on a level plane, or on a circle about the axis."""
     if piece.centre is not None and not surface.is_net and math.hypot(*piece.centre) < SHAPE_TOLERANCE:
         return True
     return surface.level and piece.is_line_or_arc

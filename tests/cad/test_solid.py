@@ -215,7 +215,7 @@ def test_a_lens_that_cannot_be_is_refused_in_one_sentence(make_lens):
         (make_lens(Plane(19.0)), "move the front down"),
         (make_lens(Sphere(0.0, -0.08)), "ends inside the rim"),
         (lens_of(net(half=12.0), Plane(8.0), Circle(12.0)), "two spacings beyond the rim"),
-        (lens_of(net(half=(20.0, 24.0)), Plane(8.0), Circle(12.0)), "square net"),
+        (lens_of(net(half=(20.0, 24.0)), Plane(8.0), Circle(12.0)), "equal pitches"),
     ):
         with pytest.raises(ValueError, match=words):
             lens_solid(lens)
