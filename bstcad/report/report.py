@@ -62,7 +62,7 @@ def explanation(report: Contents) -> str:
 
 
 def doubts(report: Contents | Examined) -> list[Remark]:
-    """Return remarks on the verdict: the scene sets no limit on light or RRMSD, or the RRMSD is not resolved."""
+    """Return remarks on the verdict: the light or the RRMSD has no limit in the scene; the RRMSD is not resolved."""
     if isinstance(report, Examined):
         return []
     return written("verdict.txt.j2", "doubts", report=report)
@@ -282,7 +282,7 @@ def plan_predictions(plan: Mapping[str, Any]) -> Group:
 
 
 def _table(first: str, *others: str) -> Table:
-    """Return an empty table with these headings; left-justified: the first column, and those marked with a "<"."""
+    """Return an empty table; its first column, and others whose heading begins with "<", are left-justified."""
     from rich import box
     from rich.table import Table
 

@@ -210,7 +210,7 @@ def of_folder(folder: Path, optic: str) -> str:
 
 
 def put_into(page: Path, section: str) -> bytes | None:
-    """Return a report.html with `section` between BEGIN and END; None if it lacks them or cannot be read."""
+    """Return the report.html `page` with `section` between BEGIN and END; None if it lacks these or is unreadable."""
     try:
         text = files.contents(page, MAX_PAGE_BYTES).decode("utf-8")
     except (OSError, ValueError):

@@ -22,7 +22,7 @@ LIBRARIES = ["torch", "numpy", "scipy", "numba", "cadquery", "cadquery-ocp", "tr
 
 
 def circumstances(device: str) -> dict[str, Any]:
-    """Return the entries version, machine and versions of report.json; device: "cpu" or "cuda", which tailors."""
+    """Return the entries version, machine and versions of report.json; device: "cpu" or "cuda", where tailoring ran."""
     return {
         "version": bstcad.__version__,
         "machine": {

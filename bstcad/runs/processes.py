@@ -112,7 +112,7 @@ def submit(work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> Fut
 
 
 def _submit_to(process: Executor, work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> Future[R]:
-    """Submit a call, which this thread pickles if `process` is one: loky would pickle it later, in another thread."""
+    """Submit a call to a thread, or to a process, for which it is pickled here: loky would do so in another thread."""
     if isinstance(process, ThreadPoolExecutor):
         return process.submit(work, *arguments, **options)
     from loky.backend import reduction

@@ -39,7 +39,7 @@ MIN_RECESS_GAP = 1e-2  # mm; smallest distance between the outlines of the front
 CONIC_CONSTANTS = (-1e3, 1e3)  # range of conic constants
 CURVATURES = (-1e3, 1e3)  # range of curvatures, 1/mm
 INDICES = (1.01, 5.0)  # range of the refractive index
-BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # keys of lens, optional: bounds on faces
+BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # optional keys of lens that bound its faces
 
 NET_FILE = "front.npz"  # file in a design's folder with the net that was read from lens.front.file
 NET_REMEDY = "give the folder of a design, its design.npz or its lens.step"
@@ -583,7 +583,7 @@ class LensBlank(Record):
         return None if fixed is None else simplified(fixed.shape)
 
     def _tailored_front_net(self, net: Sides) -> Sides:
-        """Return the control points per side of a tailored front: `net` (the back) times their ratio in the scene."""
+        """Return the control points per side of a tailored front for a back with `net`, in the ratio of the scene."""
         own = self.front.file.shape if self.front.file else self.front.control_points
         if own is None:
             return net

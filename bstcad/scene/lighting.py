@@ -14,7 +14,7 @@ IRRADIANCE_SAMPLES = 200  # points per side of the lens at which the irradiance 
 
 
 def complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
-    """Yield complaints about the keys of the source: its profile, its spectrum, and those that its kind checks."""
+    """Yield complaints about the profile and the spectrum of the source, and those of its kind (source.complaints)."""
     width = source.widths.get(source.profile)
     if width and source.profile != source.unbounded and getattr(source, width) is None:
         unit = "mm" if width == "radius_1e2" else "degrees"
@@ -50,7 +50,7 @@ def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:
 
 
 def order_complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
-    """Yield complaints: the source is not before the lens or above the mirror; keys for a mirror's unlit front."""
+    """Yield complaints about a source not before the lens (or not above the mirror), and keys of an unlit front."""
     front, back = lens.front.z + lens.front_sags[0], lens.back.z
     key, start = f"source.{source.start_key}", source.nearest_z(upwards=lens.passes.sense > 0)
     if lens.passes.sense > 0:

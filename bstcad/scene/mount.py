@@ -231,7 +231,7 @@ def as_cut(lens: Lens, mount: Mount | None) -> Lens:
 
 
 def parting(back: Surface, front: Surface, x: np.ndarray, y: np.ndarray) -> float:
-    """Return z (mm) of the plane, just below the back's rim, where draft begins without a flange; x, y: rim (mm)."""
+    """Return z (mm) of the plane below the back's rim where draft begins without a flange; x, y: points of the rim."""
     low, high = sag(back, x, y).min(), sag(front, x, y).max()
     return float(low - min(LAND, LAND * (low - high)))
 
@@ -292,7 +292,7 @@ def _depth(shape: Round | Box, x: float, y: float) -> float:
 
 
 def _steepest_descent(front: Surface, rim: Outline) -> float:
-    """Return the steepest descent (mm per mm) of a front at the rim in the direction inwards; < 0 if all rises."""
+    """Return the steepest descent (mm per mm) of a front at the rim in the direction inwards; negative: it rises."""
     x, y = rim.rim_points()
     m_x, m_y = rim.inset_direction(x, y)
     _, z_x, z_y = sampled(front, x, y)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from bstcad.scene.scene import Scene
 
 SIZE = 80.0  # default size of a plate, mm
-WIDTH_TO_THICKNESS = 10.0  # ratio of the width of a plate to its thickness
+WIDTH_TO_THICKNESS = 10.0  # ratio of the longer side of a plate to its thickness
 MIN_THICKNESS = 3.0  # mm; smallest thickness of a plate
 RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # ranges of the options --size and --distance, mm
 BLUR_MARGIN = 1.1  # accept.rrmsd divided by the RRMSD of the blurred picture; standard designs stay below this limit
@@ -30,7 +30,7 @@ LIKE_THE_PHOTO = re.compile(r"(?:([^xX×]+)[xX×])?photo")  # size with the phot
 
 TEMPLATE = Path(__file__).with_name("plate.toml.j2")
 COMMENT_COLUMN = 32  # column at which comments begin after short lines
-COMMENT_WIDTH = 118  # characters in a line of comment
+COMMENT_WIDTH = 118  # largest number of characters in a line of comment
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Plate:
         return 2 * distance * math.tan(math.radians(self.light.size / 2))
 
     def detail(self, distance: float) -> float:
-        """Return the width (mm) of the finest detail on a wall at this distance (mm): optics.measure.detail_width."""
+        """Return the width (mm) of the finest detail on a wall at this distance; see optics.measure.detail_width."""
         from bstcad.optics.measure import detail_width  # loads torch, which a list of the templates does not need
 
         as_a_disc = math.sqrt(4 / 3) if self.light.square else 1.0
@@ -215,7 +215,7 @@ def new_scene(
 
 
 def in_proportions(side: float, shown: tuple[int, int]) -> str:
-    """Return the size of a plate, such as "80x53.3", with this longer side (mm) and the proportions of `shown`."""
+    """Return the size of a plate, such as "80x53.3", with this longer side (mm) and width / height as in `shown`."""
     width, height = (max(side * each / max(shown), RANGES["size"][0]) for each in shown)
     return f"{width:.4g}x{height:.4g}"
 

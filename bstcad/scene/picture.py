@@ -357,7 +357,7 @@ def photo_size(given: Picture | str) -> tuple[int, int]:
 
 
 def _white(image: Image.Image) -> float:
-    """Return the pixel value of white: 1 for floats, 65535 for 32-bit integers, or if larger the largest value."""
+    """Return the pixel value of white: 1 for floats, 65535 for 32-bit integers, but at least the largest value."""
     if image.mode not in ("I", "F"):
         return 1.0
     usual, (_, largest) = 65535.0 if image.mode == "I" else 1.0, image.getextrema()

@@ -181,7 +181,7 @@ def _lit_pixels(at: np.ndarray, reach: float) -> tuple[np.ndarray, slice]:
 
 
 def _nodes(at: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes (pixels, nodes) and weights (nodes,) for means over pixels; at: their edges; cells up to `width`."""
+    """Return nodes (pixels, nodes), weights (nodes,) for means over pixels with edges `at`, in cells up to `width`."""
     pitch = abs(float(at[1] - at[0]))
     node, weight = np.polynomial.legendre.leggauss(FEWER_NODES if 4 * pitch < width else NODES)
     cells = max(math.ceil(pitch / width), 1)

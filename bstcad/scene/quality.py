@@ -33,7 +33,7 @@ VERIFICATION_DRAW = 1 << 12  # number of the set of these points; each further s
 
 
 class Tailoring(Record):
-    """The effort of tailoring; a setting that is None has the value in PRESETS[quality], if there (see `resolved`)."""
+    """The effort of tailoring; a setting that is None has the value of PRESETS[quality], if any (see `resolved`)."""
 
     quality: Annotated[Literal["draft", "standard", "fine", "paper"], Key("Effort; fine has the smallest error.")] = (
         "standard"

@@ -384,7 +384,7 @@ class Scene(Record):
         return made
 
     def toml(self) -> str:
-        """Return the text of a file from which an equal scene is loaded; an image is named as its copy."""
+        """Return the text of a file from which an equal scene is loaded; images have the file names of their copies."""
         unused = set() if self.source.extent else {"source_points"}
         optic = f"refractive index {self.index:.6g}" if self.lens.passes.enters else f"a {self.optic}"
         comment = f"# {optic}; quality {self.tailoring.quality}"

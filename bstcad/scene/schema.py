@@ -79,9 +79,9 @@ def contents(value: Any, key: str = "") -> Iterator[tuple[str, FileContent]]:
 def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], example: str) -> tuple[Any, ...]:
     """Return the annotations of a field of type `kind` that is written as a path and contains the content of the file.
 
-    read: reads the file at a path.  example: such a key, for messages.  A path is relative to the scene file, or to the
-    user's home with ~.  `bounds` in the context of a validation are folders: a path into one of them must not lead out
-    of them by symbolic links.
+    read: reads the file at a path.  example: the key with a path, for messages.  A path is relative to the scene file,
+    or to the user's home with ~.  `bounds` in the context of a validation are folders: a path into one of them must not
+    lead out of them by symbolic links.
     """
 
     def content(given: Any, info: ValidationInfo) -> Any:

@@ -264,7 +264,7 @@ class Target(Record):
 
 
 def is_faced(plane: PlaneReceiver, vertex: Vector) -> bool:
-    """Return True if the line from `vertex` (mm) to the plane's middle meets its front at over a degree (EDGE_ON)."""
+    """Return True if the line from `vertex` (mm) to the plane's middle meets its front at more than 1° (EDGE_ON)."""
     return -plane.height(vertex) > EDGE_ON * math.dist(plane.middle, vertex)
 
 
@@ -355,7 +355,7 @@ IRRELEVANT = {"z": 0.0, "tilt": None, "weight": 1.0, "outline": None, "seen_from
 
 
 def drawing(target: Target) -> Drawing:
-    """Return the irradiance of a target's picture per pixel, before its outline, and remarks on it."""
+    """Return the irradiance of a target's picture in each pixel, not yet cut to its outline, and remarks on it."""
     return _drawing(target.model_copy(update=IRRELEVANT))
 
 

@@ -142,7 +142,7 @@ def _shapes(entities: Entities) -> dict[str, set[str]]:
 
 
 def _transformation(name: str, first: list[str], second: list[str], entities: Entities) -> Placement:
-    """Return the placement, by transformation `name`, of a first representation in a second; first, second: items."""
+    """Return the placement, by transformation `name`, of a representation of items `first` in one of `second`."""
     if entities.bodies[name][0] != "ITEM_DEFINED_TRANSFORMATION":
         return _frame(name, entities)
     origin, target = _pair(name, entities)
