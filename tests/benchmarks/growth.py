@@ -234,7 +234,7 @@ NETS, PICTURES = (257, 513, 1025, 2049), (64, 128, 256, 512, 1024)
 SERIES = (
     Series("transport", "cells", PICTURES, _transport, (0.7, 1.15), 1.5),
     Series("slope fit", "control points", NETS, _slope_fit, (0.75, 1.3), 2.5),
-    Series(EVALUATION, "ray tubes", (128, 256, 512, 1024, 2048), lambda n: _evaluation(n=n), (0.55, 1.1), 1.5),
+    Series(EVALUATION, "flux tubes", (128, 256, 512, 1024, 2048), lambda n: _evaluation(n=n), (0.55, 1.1), 1.5),
     Series(EVALUATION, "control points", NETS, lambda m: _evaluation(m=m), (0.1, 0.6), 1.2),
     Series(EVALUATION, "pixels", PICTURES, lambda p: _evaluation(pixels=p), (0.0, 0.4), 0.8),
     Series(

@@ -48,7 +48,7 @@ def test_seconds_grow_as_the_algorithm_says_and_memory_no_faster_than_what_grows
 
 def test_many_channels_cost_hardly_more_than_one_of_as_many_tubes():
     """64 sheets of 256² tubes and one of 2048²; the former has fewer tubes a pixel, and so cuts more of each."""
-    many, one = (costs(f"evaluation of stage 2, {what}")[-1].cpu_seconds for what in ("channels", "ray tubes"))
+    many, one = (costs(f"evaluation of stage 2, {what}")[-1].cpu_seconds for what in ("channels", "flux tubes"))
     print(f"\n64 channels over one of as many tubes: {many / one:.2f}", end="")
     assert many < 3 * one
 

@@ -167,4 +167,5 @@ def test_the_surface_is_not_evaluated_for_20_164_rays_because_of_one(way, dtype,
             asked.append(0)
             through_back(each, lens, Z)
     assert asked[0] >= 4 * rays.flux.numel()  # it is Newton's method that was counted
-    holds("surface evaluations for 20 164 rays with one miss, relative to no miss", asked[1] / asked[0], 1.01)
+    figure = "surface evaluations for 20 164 rays of which one misses, divided by those without a miss"
+    holds(figure, asked[1] / asked[0], 1.01)

@@ -63,7 +63,7 @@ def test_flag_and_direction(offset, dtype, holds):
     holds(f"length of the direction minus 1, {NAMES[dtype]}", error, 4 * eps(dtype))
     if after.alive[0]:
         height = float(after.direction[2].detach())  # cos θ'; its square is off by some units
-        figure = f"error of cos² θ', θ' the angle of refraction, against 60 digits, {NAMES[dtype]}"
+        figure = f"error of cos² θ' (θ': angle of refraction), compared with 60 digits, {NAMES[dtype]}"
         holds(figure, abs(height**2 - float(truth)), 4 * eps(dtype))
     assert torch.equal(after.flux, rays.flux)
 

@@ -91,7 +91,7 @@ def test_the_solid_is_valid_and_its_face_is_the_designed_one(holds, written):
     found = {check.id: check for check in step_checks.check(written.path, lens, 1e-9, 1 << 14)}
     assert all(check.passed for check in found.values()), found
     holds("deviation of the back of the solid as read again", found["form"].value, 1e-9, "mm")
-    holds("deviation of its normals", found["normals"].value, 1e-9, "rad")
+    holds("deviation of the normals of this back", found["normals"].value, 1e-9, "rad")
     holds("largest gap at an edge", found["gaps"].value, 5e-7, "mm")
 
 
