@@ -1,8 +1,8 @@
 """Run designs in new processes (cold runs), measure their time and error, calibrate this machine, and store records.
 
 A run designs a base scene with changed settings.  Its time is the time of the whole command: imports, picture,
-tailoring, writing and verification.  The reference by which the RRMSD of every lens is measured is stratified rays on
-the pixels of the base scene.  The calibration kernel is a fixed computation whose time shows a machine's speed.
+tailoring, writing and verification.  The RRMSD of every lens is measured with stratified rays on the pixels of the base
+scene (the reference).  The calibration kernel is a fixed computation whose time shows a machine's speed.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ def calibration_kernel(tubes: int = KERNEL_TUBES) -> Callable[[], Any]:
 # --- runs -------------------------------------------------------------------------------------------------------------
 
 Value = int | float | str | tuple[int, int]
-Settings = tuple[tuple[str, Value], ...]  # (dotted key of the scene, value), sorted by key; (): the base scene
+Settings = tuple[tuple[str, Value], ...]  # pairs (dotted key of a scene, value), sorted by key; (): the base scene
 
 DONE, FAILED, NOT_RUN = "done", "failed", "not run: budget"  # statuses of a run
 REFERENCE_EFFORT = Effort(witness=False)  # effort of the reference: no flux tubes, only rays that tailoring did not use

@@ -92,7 +92,7 @@ DEFAULT_DIVERGENCE = 0.1  # assumed divergence of parallel light, degrees
 DEFAULT_SIZES = {"diameter": (DEFAULT_DIAMETER, "disc", "mm"), "divergence": (DEFAULT_DIVERGENCE, "cone", "degrees")}
 LINE_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # band: points (offset / half width, weight)
 DISC_POINTS = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # points (x, y, weight) in the unit disc
-FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"  # scene lines
+FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"  # lines of scenes
 
 
 def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ...]:
@@ -165,7 +165,7 @@ def _dispersion(scene: Scene, reference: Reference) -> LeftOut:
 
 
 def band(scene: Scene) -> tuple[float, float]:
-    """Return the ends (nm) of the band that one wavelength represents: VISIBLE_BAND in sunlight, else of LINE_WIDTH."""
+    """Return the band (low, high) in nm of a single wavelength: VISIBLE_BAND for sunlight, else LINE_WIDTH wide."""
     source = scene.source
     if isinstance(source, Collimated):
         divergence = source.divergence or source.real_divergence or 0.0

@@ -42,7 +42,7 @@ MEMORY_FRACTION = 0.8  # fraction of the machine's memory that a design may use
 DENSITY_TUBES = 256  # flux tubes per side for the flux density at the back
 # Coefficients of the error bound (ControlCells.floor) of the net, and of a net with half as many cells per side.
 FLOOR_FACTOR, HALVED_FACTOR = 0.68, 0.43
-# (factor, offset) by quality: RRMSD due to the net = factor · RMS of both bounds + offset.
+# (factor, offset) by quality: RRMSD due to the net = factor · (both error bounds combined) + offset.
 QUALITY_TERMS = {"draft": (1.5, 0.012), "standard": (1.0, 0.002), "fine": (0.7, 0.004)}
 MIN_SEAM_SHIFT = 7.0  # seam shift (pixels) below which cells are too fine for the tool
 # Cells per pixel above which finer nets reduce the RRMSD further by at most a factor, and this factor.

@@ -439,7 +439,7 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
 
 
 def _judged_on(scene: Scene) -> str:
-    """Return the pixels of the reference in words, such as "64 x 48"."""
+    """Return, in words, the target pixels on which RRMSDs are measured, such as "64 x 48"."""
     sizes = " and ".join("{} x {}".format(*target.columns_rows) for target in scene.targets)
     return f"the target with the largest RRMSD, of {sizes}" if len(scene.targets) > 1 else sizes
 

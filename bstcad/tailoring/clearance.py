@@ -4,9 +4,9 @@ If the front is tailored, a lens that is too thin cannot be corrected by a shift
 the light, and a shift changes where the light from the front meets the back.  So the penalty changes both faces.
 
 In a cell of a grid no coarser than either net, each face depends on at most 4 x 4 control points, and lies between
-the lowest and the highest of them.  This bound often shows for whole tiles of cells that the thickness is nowhere near
-a limit; if not, it excludes single cells.  In the remaining cells the thickness is computed at points a quarter of a
-cell apart.  (The bound is computed by numpy in one thread: the work is too small for several threads.)
+the lowest and the highest of them.  These extremes often show for whole tiles of cells that the thickness is nowhere
+near a bound; if not, they exclude single cells.  In the remaining cells the thickness is computed at points a quarter
+of a cell apart.  (The extremes are computed by numpy in one thread: the work is too small for several threads.)
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from bstcad.optics.outlines import inside
 from bstcad.optics.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 
-PENALTY_MARGIN = 0.01  # distance from a bound at which the penalty begins / bound (for thickness: / unit of its excess)
+PENALTY_MARGIN = 0.01  # relative distance from a bound where the penalty begins (thickness: distance / unit of excess)
 QUARTER_RIM_POINTS = 1025  # number of points along a quarter of the rim
 CELL_POINTS = 4  # control points per axis on which a cell may depend: it lies in at most two knot spans
 TILE_CELLS = 16  # number of cells per axis in a tile

@@ -35,7 +35,7 @@ from bstcad.tailoring.minimise import lbfgs, minimise
 
 THICKNESS_POINTS = 513  # points per side at which the thickness is computed
 RELIEF_RESERVE = 0.02  # additional thickness for the changes of stage 2, relative to the sag range (PV) of the back
-BOUNDS_STAGE = "bounds on the back"  # name in the record of the stage that enforces the bounds
+BOUNDS_STAGE = "bounds on the back"  # name, in the record of a design, of the stage that enforces the bounds
 BOUND_RESERVE = 1e-3  # distance kept from a bound, relative like PENALTY_MARGIN: files are rounded, grids miss extremes
 # Weights of the mean squared relative excess, relative to RRMSD²: by round, from the last one of a stage backwards,
 # and for a stage of one round.  (A large weight from the start keeps the search near its start: a small lens that

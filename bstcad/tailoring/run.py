@@ -75,7 +75,7 @@ class RatedLens:
 
 
 SIGNIFICANT_RATIO = 1.05  # smallest ratio of two figures that is significant: STAGE_EFFORT has errors of 5 %
-BEST_LENS_STAGE = "back to the best lens before"  # name in the record of the return to an earlier lens
+BEST_LENS_STAGE = "back to the best lens before"  # name, in the record of a design, of the return to an earlier lens
 WAVEFRONT_TUBES = 256  # flux tubes per side that measure the wavefront error of a lens between the stages
 TUBES_PER_SECOND = 4.7e6  # tubes traced per second, with the gradient of the merit, on a machine of pace 1
 RRMSD_SECONDS = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1

@@ -79,7 +79,7 @@ class FaceGrid:
         return m, n
 
     def thinned(self, samples: int) -> FaceGrid:
-        """Return the grid with every k-th cell along each axis, about `samples` cells per axis."""
+        """Return the grid with every k-th cell along each axis; at least `samples` cells, or all, are left on each."""
         thin = tuple(slice(step // 2, None, step) for step in (max(1, n // samples) for n in self.shape))
         position, direction = (v[:, *thin] for v in (self.at_face.position, self.at_face.direction))
         return FaceGrid(self.window, replace(self.at_face, position=position, direction=direction), self.density[thin])

@@ -9,8 +9,8 @@ even for a rough face.  So with the picture E_0 of the centre
 which needs one sheet of flux tubes instead of a sheet for each of many source points.  K is interpolated between nodes
 t_n over the screen by hat functions a_n, K(t', ·) = Σ_n a_n(t') K_n.  Then E = B E_0 = Σ_n K_n * (a_n E_0), where
 the convolution * needs a few Fourier transforms.  K_n is the image of the source through the point of the back whose
-light lands nearest to t_n.  There δ and the flux are interpolated biquadratically in s from 3 x 3 points of the source,
-at 2 IMAGE_PAIRS points.
+light lands nearest to t_n.  There δ and the flux are interpolated biquadratically in s from 3 x 3 points of the source
+to 2 · IMAGE_PAIRS points.
 
 The error of this model is small and varies slowly during tailoring.  It is measured with rays from points of the source
 at the start of a round, smoothed, and added as a constant picture: E = B E_0 + (E_rays - B E_0)_start.

@@ -314,7 +314,7 @@ def _curvature_of_sag(h: float, r: float, k: float) -> float:
 def _conic_constants(lens: Lens, rim_sags: Range) -> Range:
     """Return the range of conic constants k that `best_front` allows with the front's curvature c.
 
-    tan² of the slope angle at r is c² r² / (1 - (1 + k) c² r²); the sag at r is h where 1 + k = (2 h - c r²) / (c h²).
+    tan² of the slope angle at r is c² r² / (1 - (1 + k) c² r²); a sag h at r needs 1 + k = (2 h - c r²) / (c h²).
     """
     k_min, k_max = CONIC_CONSTANTS
     c, rim = float(lens.front.curvature), _rim_radius(lens)

@@ -1,10 +1,9 @@
 """Stage 1 of a lens with two freeform faces: the front sends each ray to a prescribed point of the back.
 
-The back deflects the ray into its prescribed direction.
-
-The rays behind the lens are known (light_behind.py): the ray through a point t of a target, traced backwards, meets the
-back at b(t).  The front has to send the light of t to b(t).  This is a transport problem in slope coordinates as in
-slope_map.py, from points q of the front to the slopes p(q, b) that follow from Snell's law,
+The back deflects the ray into its prescribed direction.  These rays behind the lens are known (light_behind.py): the
+ray through a point t of a target, traced backwards, meets the back at b(t).  The front has to send the light of t to
+b(t).  This is a transport problem in slope coordinates as in slope_map.py, from points q of the front to the slopes
+p(q, b) that follow from Snell's law,
 
     y = -(p(q, b) - ∇g(q)),    ∇g(q) ≈ p(q, r(q)) - r(q) ∂p/∂b,
 

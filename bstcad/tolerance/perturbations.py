@@ -173,7 +173,7 @@ def perturb(setup: Setup, perturbations: Sequence[Perturbation], amounts: Sequen
 
 # --- the kinds with one amount ----------------------------------------------------------------------------------------
 
-INDEX_MARGIN = 20.0  # distance (nm) from a spectral line within which the index of the material must be known
+INDEX_MARGIN = 20.0  # distance (nm) from a spectral line within which the index must be known for a wavelength error
 # Thermal expansion (1/K) and dn/dT (1/K) at room temperature.
 # PMMA: Baeumer, Handbook of Plastic Optics (2nd ed. 2010), table 5.1.
 # N-BK7: Schott's data sheet (α from -30 to 70 °C; Δn_rel/ΔT at 546 nm, 20 to 40 °C).
@@ -318,7 +318,7 @@ def _decentre_front(axis: int, setup: Setup, by: float) -> Setup:
 
 
 def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
-    """Rotate the back by `by` degrees about an axis (0: x, 1: y) through its vertex v; front, rim and the rest stay.
+    """Rotate the back by `by` degrees about an axis (0: x, 1: y) through its vertex v; all other parts stay fixed.
 
     A point p = v + (x, y, ζ) of the rotated face was at v + q before, with q = Rᵀ (p - v).  In place of the
     unrotated face of height h, its tangent plane at (x, y) is used: q_z = h - h(v) + ∇h · ((q_x, q_y) - (x, y)), linear
@@ -342,7 +342,7 @@ def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
 FRONT_SEED_OFFSET = 100  # offset of the seeds for the form of the front, so that its fields differ from the back's
 FACE_NET = 513  # control points per side of the net that replaces a plane or a conic with a form error
 FACE_MARGIN = 6  # number of control points of the FACE_NET net outside a round outline, on each side
-FACE_REACH = 1.03  # radius / rim radius up to which the FACE_NET net follows the face: its end must not affect the rim
+FACE_REACH = 1.03  # radius / rim radius up to which the net follows the face: its level part must not affect the rim
 CELLS_PER_PERIOD = 4.0  # minimum number of control cells in a correlation length or a period
 
 

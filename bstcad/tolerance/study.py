@@ -368,7 +368,7 @@ def _unbiased(rrmsds: np.ndarray, bias: float) -> np.ndarray:
 
 
 def _sensitivities(superposed: Model, perturbations: Sequence[Perturbation], bias: float) -> tuple[Sensitivity, ...]:
-    """Return the effect of one standard deviation of each error, as a mean of both signs, the largest first."""
+    """Return the effect on the RRMSD of one standard deviation of each error, mean of both signs, the largest first."""
     n = len(perturbations)
     sigmas = np.diag(superposed.sigmas[:n])
     mean_rrmsds = (_unbiased(superposed.rrmsds(sigmas), bias) + _unbiased(superposed.rrmsds(-sigmas), bias)) / 2

@@ -83,10 +83,11 @@ def corners(phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def newton_on_grids(
     grids: Grids, phi: np.ndarray, *, steps: int, tolerance: float, progress: Listener = None, blur: float = BLUR
 ) -> tuple[np.ndarray, list[float], str]:
-    """Apply up to `steps` Newton steps on each grid, MAX_STEPS_FACTOR times as many on a rough map.
+    """Apply up to `steps` Newton steps (on a rough map MAX_STEPS_FACTOR times as many) on each grid.
 
-    phi: start on the first grid (cell units).  blur: standard deviation (cells) of the blur of phi before each grid.
-    Returns phi (cell units), the mass errors on the last grid, and the reason why the solve stopped there.
+    phi: start on the first grid (cell units).  tolerance: mass error at which the steps end.  blur: standard deviation
+    (cells) of the blur of phi before each grid.  Returns phi (cell units), the mass errors on the last grid, and the
+    reason why the solve stopped there.
     """
     for k, (source, target) in enumerate(grids):
         if k:

@@ -166,7 +166,7 @@ def part_checks(text: StepText, part: Part, name: str = SOURCE) -> Iterator[Chec
 
 
 def _worst_value(values: Sequence[Numbers], own: Numbers, who: str, unit: str) -> tuple[float, str]:
-    """Return the largest error of stated values (infinite: unreadable), and a sentence; who: its words before `own`."""
+    """Return the largest error of values from `own` (infinite: unreadable), and a sentence; who: words before `own`."""
     off = [math.dist(each, own) for each in values]
     worst, stated = max((math.inf if math.isnan(by) else by, each) for by, each in zip(off, values, strict=True))
     return worst, f"the file states {_words(stated, unit)}, but {who} {_words(own, unit)}"
