@@ -122,7 +122,7 @@ class LocalPool:
         self._threads.shutdown(cancel_futures=True)
 
     def start(self, key: Any, work: Callable[..., Any], *arguments: Any) -> None:
-        """Start work(*arguments, tick) in a thread; `work` must call `tick` regularly.  `next` returns the answer."""
+        """Start work(*arguments, tick) in a thread; `work` must call `tick` regularly.  key: stated in the answer."""
         self._keys[self._threads.submit(work, *arguments, self._tick)] = key
 
     def next(self, tick: Tick) -> Answer:

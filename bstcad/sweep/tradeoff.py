@@ -59,7 +59,7 @@ class Knob:
 
 
 def other_seed(scene: Scene, point: Settings) -> Settings:
-    """Return the settings with the seed of the scene plus one."""
+    """Return the settings `point`, but with the seed of the scene plus one."""
     return sorted_settings({**dict(point), "tailoring.seed": scene.tailoring.seed + 1})
 
 

@@ -157,7 +157,7 @@ class CellGrid:
 
 
 def _tile_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: np.ufunc) -> np.ndarray:
-    """Return the lowest or highest control point (mm) of each tile; begins: see `_first_points`."""
+    """Return the `extreme` (np.minimum or np.maximum) of the heights (mm) in each tile; begins: see `_first_points`."""
     for axis, begin in enumerate(begins):
         tiles = np.split(begin, range(TILE_CELLS, len(begin), TILE_CELLS))
         windows = [slice(tile[0], tile[-1] + CELL_POINTS) for tile in tiles]
@@ -167,7 +167,7 @@ def _tile_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: n
 
 
 def _cell_extremes(heights: np.ndarray, begins: Sequence[np.ndarray], extreme: np.ufunc) -> np.ndarray:
-    """Return the lowest or highest control point (mm) of each cell; begins: see `_first_points`."""
+    """Return the `extreme` (np.minimum or np.maximum) of the heights (mm) in each cell; begins: see `_first_points`."""
     for axis, begin in enumerate(begins):
         heights = np.moveaxis(heights, axis, 0)
         for step in (1, 2):  # extremes of two neighbouring control points, then of four

@@ -365,7 +365,7 @@ def _excess_leverage(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, on_sc
     """Return the leverage relative to MIN_LEVERAGE times its median (m, n), at least 1; None if it is 1 everywhere.
 
     The leverage is the largest singular value of ∂t/∂p, the inverse of the smallest one of ∂p/∂t; p(b, t) are the
-    slopes that send light from b to the target point t.
+    slopes that send light from b (`at_net`) to the target point t (`aim`).  on_screen: mask (m, n) of counted points.
     """
     for some in (slice(None, None, LEVERAGE_STRIDE), slice(None)):
         rays = replace(at_net, **{key: getattr(at_net, key)[..., some, some] for key in ("position", "direction")})

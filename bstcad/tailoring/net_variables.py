@@ -130,7 +130,7 @@ def _smoothed(at: np.ndarray) -> np.ndarray:
 
 
 def _interpolation(row: np.ndarray, column: np.ndarray, sides: tuple[int, int]) -> csr_array:
-    """Return the matrix (points, control points) that interpolates a net at fractional rows and columns."""
+    """Return the matrix (points, control points) that interpolates a net of `sides` at fractional rows and columns."""
     (i, a), (j, b) = (_cubic_weights(p.reshape(-1), m) for p, m in zip((row, column), sides, strict=True))
     values, columns = a[:, :, None] * b[:, None, :], i[:, :, None] * sides[1] + j[:, None, :]
     starts = np.arange(0, values.size + 1, INTERPOLATION_POINTS**2)

@@ -92,7 +92,7 @@ def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
 def reach_from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver, law: Law, grazing: float) -> Tensor:
     """Return `optics.reach.reach_margin` from every FACE_STRIDE-th lit point of the face to each aim, (points, …).
 
-    aims: x and y of the aims, in the receiver's unit, of one shape (…).
+    aims: x and y of the aims, in the receiver's unit, of one shape (…).  grazing: see `reachable`.
     """
     t, some = torch.from_numpy(np.stack(aims)), grid.density[::FACE_STRIDE, ::FACE_STRIDE] > 0
     position, direction = (

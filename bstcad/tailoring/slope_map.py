@@ -294,7 +294,7 @@ def resample_picture(picture: np.ndarray, corners: Points, n: int) -> tuple[Dens
 
 
 def light_density(values: np.ndarray, side: float) -> Density:
-    """Return the density of light in the cells of a square of `side` mm; SceneError if no sample has light."""
+    """Return the density of light from `values` (n, n) on a square of `side` mm; SceneError if all of them are zero."""
     if not values.any():
         raise SceneError(
             f"source: its light at the lens is a strip narrower than a cell ({side / len(values):.3g} mm) of the "

@@ -214,7 +214,7 @@ def _hats(side: int, border: int) -> np.ndarray:
 def blur_error(by_images: Tensor, draw: Draw, lens: Lens, screen: Screen, *, border: int, seed: int) -> Tensor:
     """Return the error E_rays - B E_0 of a picture, (rows, columns), by two sets of rays; 0 if noise hides it.
 
-    by_images: the picture B E_0, divided by the transmitted flux.  border: border of B (pixels).
+    by_images: picture B E_0, divided by the transmitted flux.  draw: samples the source.  border: border of B (pixels).
 
     The smoothed differences d_i of E_i and B E_0 in the two sets have an equal error and independent noise.  Their mean
     is therefore scaled by d_1 · d_2 / |(d_1 + d_2) / 2|².

@@ -38,7 +38,7 @@ def tolerance(folder: Path, settings: StudySettings) -> Tolerances:
         scene, nominal = read_nominal(folder)
         if scene.ghost is not None:
             raise SceneError(
-                "[[effects]] ghost: tolerances do not include stray light yet; remove this table from scene.toml"
+                "[[effects]] ghost: tolerances do not include ghosts yet; remove this table from scene.toml"
             )
         pictures, limit = _pictures(scene, nominal, settings), scene.accept.rrmsd or DEFAULT_RRMSD_LIMIT
         goals: list[tuple[str, TracedGoal, float, float]]  # key of the limit, goal, limit, figure of the design

@@ -290,7 +290,7 @@ def _half_step(a, b, rho, nu, *, poisson, sigma, dual):
 
 @njit(cache=True, nogil=True, fastmath={"reassoc"})
 def _dual(u, v, rho, nu):
-    """Return J = ∫ psi drho + ∫ phi dnu in cell units."""
+    """Return J = ∫ psi drho + ∫ phi dnu in cell units; u, v: see `_ascend`."""
     n = u.shape[0]
     total = 0.0
     for i in range(n):  # sum each row first, for accuracy

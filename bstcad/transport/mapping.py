@@ -198,7 +198,7 @@ def _residual(sx, sy, x, y, p, q):
 
 @njit(cache=True, nogil=True)
 def solve_point(sx, sy, x, y, p, q):
-    """Return (p, q) with S(p, q) = (x, y), and True if found outside a fold; Levenberg-Marquardt from given (p, q)."""
+    """Return (p, q) where S = (sx, sy) is (x, y), and True if found outside a fold; Levenberg-Marquardt from (p, q)."""
     rows, columns = sx.shape[0] - 1.0, sx.shape[1] - 1.0
     rx, ry, a, b, c, d = _residual(sx, sy, x, y, p, q)
     residual2 = rx * rx + ry * ry

@@ -198,7 +198,7 @@ def _check_solids(path: Path, nominal: Nominal, part: Part, points: int, submit:
 
 
 def _read_text(path: Path, read: Future[Lens]) -> StepText:
-    """Read the text of lens.step, with more precise errors than OCC's.  read: OCC's job, ended after an error."""
+    """Read the text of lens.step, with more precise errors than OCC's; after an error, stop OCC's job `read`."""
     try:
         return part21.read_lens(path)
     except ValueError:

@@ -144,7 +144,7 @@ def examine(path: Path) -> ExaminedFile:
 
 
 def _placement_checks(reread: StepLens, tolerance: float) -> Iterator[Check]:
-    """Check the placement of the lens in the file of its design, if it is not the identity."""
+    """Check the placement of the lens in the file of its design, if it is not the identity; tolerance: mm."""
     if reread.placement.moves:
         net, words = reread.control_points, reread.placement.words
         off = float(np.abs(reread.placement(net) - net).max())
@@ -172,7 +172,7 @@ def _edge_checks(reread: StepLens, lens: Lens, bare: bool = True) -> Iterator[Ch
 def _form_checks(
     reread: StepLens, face: BSplineSurface, tolerance: float, count: int, *, of: str = "back"
 ) -> Iterator[Check]:
-    """Check a face, evaluated by OCC at `count` Sobol points, against the design: coordinates (mm) and normals."""
+    """Check a face, evaluated by OCC at `count` Sobol points: coordinates, within `tolerance` (mm), and normals."""
     form = f"form: deviation of the {of} in the file from the designed one"
     if of == "front" and not reread.front.is_net:
         yield Check.true(form, False, "the file's front is not a net", id="form")
