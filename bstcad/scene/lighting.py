@@ -28,7 +28,7 @@ def complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
 
 
 def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:
-    """Yield complaints about lines without weight, one index for several lines, or an unknown or impossible index."""
+    """Yield complaints: a spectral line without weight, one index for several lines, an unknown or impossible index."""
     listed = source.wavelength if isinstance(source.wavelength, tuple) else ((source.wavelength, 1.0),)
     if not listed:
         yield "source.wavelength: the list is empty; give one wavelength in nm, or lines such as [[587.6, 1.0]]"
@@ -50,7 +50,7 @@ def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:
 
 
 def order_complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
-    """Yield complaints about a source not before the lens (or not above the mirror), and keys of an unlit front."""
+    """Yield complaints: a source not before the lens (or not above the mirror); keys of a front without light."""
     front, back = lens.front.z + lens.front_sags[0], lens.back.z
     key, start = f"source.{source.start_key}", source.nearest_z(upwards=lens.passes.sense > 0)
     if lens.passes.sense > 0:

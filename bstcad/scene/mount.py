@@ -292,7 +292,7 @@ def _depth(shape: Round | Box, x: float, y: float) -> float:
 
 
 def _steepest_descent(front: Surface, rim: Outline) -> float:
-    """Return the steepest descent (mm per mm) of a front at the rim in the direction inwards; negative: it rises."""
+    """Return the steepest descent (mm per mm) of a front at the rim in the direction inwards; negative if it rises."""
     x, y = rim.rim_points()
     m_x, m_y = rim.inset_direction(x, y)
     _, z_x, z_y = sampled(front, x, y)
@@ -307,7 +307,7 @@ def _corner_complaints(key: str, shape: Round | Box, taken: float) -> Iterator[s
 
 
 def _flange_complaints(flange: Flange, lens: LensBlank, rim: Round | Box) -> Iterator[str]:
-    """Yield complaints about a flange without walls, not around the lens's wall, or with holes that do not fit."""
+    """Yield complaints: a flange too thin for its bevels or beside the wall of the lens; holes that do not fit."""
     key, upper = "mount.flange", flange.z + flange.thickness
     taken = flange.bevel + flange.thickness * math.tan(math.radians(flange.draft))
     if not 2 * flange.bevel < flange.thickness:

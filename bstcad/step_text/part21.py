@@ -35,7 +35,7 @@ REALS = rf"{REAL}(?:,{REAL})*"
 COUNTS = r"\d{1,9}(?:,\d{1,9})*"
 FLAG = r"\.([TFU])\."
 REFERENCES = re.compile(rf"#{ENTITY}(?:,#{ENTITY})*")
-RULED = re.compile(r"\d+,1,")  # pattern of the degrees in u and v of a ruled wall, 1 in v
+RULED = re.compile(r"\d+,1,")  # pattern of the degrees in u and v of a ruled wall, whose degree in v is 1
 SURFACE = re.compile(
     rf"(\d{{1,9}}),(\d{{1,9}}),\(\((.*?)\)\),\.\w+\.,{FLAG},{FLAG},{FLAG},"
     rf"\(({COUNTS})\),\(({COUNTS})\),\(({REALS})\),\(({REALS})\),\.\w+\.\)"
