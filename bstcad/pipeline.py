@@ -182,7 +182,7 @@ def within_reach(scene: Scene, progress: Progress) -> tuple[tuple[Goal, ...], Ed
 
 
 def task_of(scene: Scene, goals: Sequence[Goal], knobs: ResolvedTailoring, edge: Edge | None) -> Task:
-    """Return the task of a scene; goals, edge: results of `within_reach`."""
+    """Return the task of a scene; goals, edge: results of `within_reach`; knobs: [tailoring] with all defaults."""
     light = scene.with_source_scaled(0.0).channels()
     sizes = stage2.SOURCE_SIZES if scene.source.extent and knobs.method != "integration" else ()
     scaled = [scene.with_source_scaled(share) for share, _ in sizes]
@@ -214,7 +214,7 @@ def with_solution(scene: Scene, task: Task) -> Task:
 
 
 def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tuple[str, Steps]:
-    """Return (name, steps) of the stage after stage 1: stage 2, or stage 3 for a source of finite size."""
+    """Return (name, steps) of the stage after stage 1, from `state` on: stage 2, or 3 for a source of finite size."""
     *_, stage = PROCEDURES[task.knobs.method]
     if not task.sampled_sources:
         return "stage 2", stage(task, lens, state)
@@ -251,7 +251,7 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
 
 
 def unreachable(scene: Scene, part: np.ndarray, picture: np.ndarray) -> str:
-    """Return a sentence, without full stop, on the unreachable part of a target and the reason."""
+    """Return a sentence, without full stop, on the pixels of a target outside its reachable `part`, and the reason."""
     found = unreached(picture, part, scene.lens.passes.largest_deflection(scene.index))
     area, light = (f"{100 * (found[key] or 0.0):.2g} %" for key in ("area", "light"))
     why = "no slope up to 70 degrees sends light there"
@@ -354,7 +354,7 @@ def _stage1(
 def _stage2(
     task: Task, driver: Driver, lens: Lens, followed: Stage1Result, *, state: Stage2State | None, best: RatedLens | None
 ) -> tuple[Lens, str]:
-    """Run stage 2, or stage 3 for an extended source, from the result of stage 1 or from a state.
+    """Run stage 2, or stage 3 for an extended source, from the result of stage 1, or from a state and the best lens.
 
     Return (lens, stopped): the last lens of the stage, or a better earlier one, and the reason why the stage ended.
     """

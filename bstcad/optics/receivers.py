@@ -74,11 +74,11 @@ class Receiver(ABC):
 
     @abstractmethod
     def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Return the points in space (mm) of coordinates on the receiver."""
+        """Return the points in space (mm) at the coordinates x, y of the receiver."""
 
     @abstractmethod
     def normal(self, aim: Tensor) -> Sequence[Tensor | float]:
-        """Return the unit normals at coordinates (2, …), directed away from the incident light."""
+        """Return the unit normals at the coordinates `aim` (2, …), directed away from the incident light."""
 
     def moved(self, motion: Motion) -> Receiver:
         """Return the receiver after a rigid motion; its coordinates move with it."""
@@ -101,7 +101,7 @@ class Receiver(ABC):
         return replace(rays, position=rays.position + path * rays.direction, status=status)
 
     def vector_to(self, rays: Rays, aim: Tensor) -> Tensor:
-        """Return the vectors (3, …) from the rays' positions to coordinates (2, …) of the receiver (mm)."""
+        """Return the vectors (3, …) (mm) from the rays' positions to the coordinates `aim` (2, …) of the receiver."""
         x, y, z = self.point(*aim)
         return torch.stack([x - rays.position[0], y - rays.position[1], z - rays.above(0.0)])
 
@@ -172,12 +172,12 @@ class MovedReceiver(Receiver):
         return self.rest.coordinates(self._back(rays))
 
     def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Return the points in space (mm) of coordinates on the receiver."""
+        """Return the points in space (mm) at the coordinates x, y of the receiver."""
         shift = self.motion.point((0.0, 0.0, 0.0))
         return tuple(t + p for t, p in zip(shift, _rotate(self.motion, self.rest.point(x, y)), strict=True))
 
     def normal(self, aim: Tensor) -> Sequence[Tensor | float]:
-        """Return the unit normals at coordinates (2, …), directed away from the incident light."""
+        """Return the unit normals at the coordinates `aim` (2, …), directed away from the incident light."""
         return _rotate(self.motion, self.rest.normal(aim))
 
     def moved(self, motion: Motion) -> Receiver:
@@ -215,7 +215,7 @@ class PlaneReceiver(Receiver):
         return -self.height((0.0, 0.0, z)) - outline.reach(*self.frame[2][:2])
 
     def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Return the points in space (mm) of coordinates on the plane."""
+        """Return the points in space (mm) at the coordinates x, y of the plane."""
         (e_x, e_y, _), (o_x, o_y) = self.frame, self.origin
         return tuple(c + (x - o_x) * a + (y - o_y) * b for c, a, b in zip(self.middle, e_x, e_y, strict=True))
 
@@ -244,7 +244,7 @@ class PlaneReceiver(Receiver):
         return torch.where(lands, -above / rise, torch.zeros_like(rise)), status
 
     def normal(self, aim: Tensor) -> Vector:
-        """Return the unit normal of the plane."""
+        """Return the unit normal of the plane, the same for every aim."""
         return self.frame[2]
 
 
@@ -270,11 +270,11 @@ class LevelPlane(PlaneReceiver):
         return rays.position[0], rays.position[1]
 
     def point(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Return the points in space (mm) of coordinates on the plane."""
+        """Return the points in space (mm) at the coordinates x, y of the plane."""
         return x, y, 0.0 * x + self.z
 
     def vector_to(self, rays: Rays, aim: Tensor) -> Tensor:
-        """Return the vectors (3, …) from the rays' positions to coordinates (2, …) of the plane (mm)."""
+        """Return the vectors (3, …) (mm) from the rays' positions to the coordinates `aim` (2, …) of the plane."""
         return torch.stack([aim[0] - rays.position[0], aim[1] - rays.position[1], -rays.above(self.z)])
 
 
@@ -310,7 +310,7 @@ class TiltedPlane(PlaneReceiver):
         return c_x + dot(e_x, offset), c_y + dot(e_y, offset)
 
     def vector_to(self, rays: Rays, aim: Tensor) -> Tensor:
-        """Return the vectors (3, …) from the rays' positions to coordinates (2, …) of the plane (mm)."""
+        """Return the vectors (3, …) (mm) from the rays' positions to the coordinates `aim` (2, …) of the plane."""
         (e_x, e_y, _), offset = self.axes, self._from_centre(rays)
         x, y = aim[0] - self.centre[0], aim[1] - self.centre[1]
         return torch.stack([x * a + y * b - o for a, b, o in zip(e_x, e_y, offset, strict=True)])

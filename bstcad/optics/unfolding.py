@@ -90,15 +90,15 @@ class BehindGlass(Receiver):
         return self.rest.coordinates(rays)
 
     def point(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the points in space (mm) of coordinates on the receiver."""
+        """Return the points in space (mm) at the coordinates x, y of the receiver."""
         return self.rest.point(x, y)
 
     def normal(self, aim: Tensor) -> Sequence[Tensor | float]:
-        """Return the unit normals of the receiver at coordinates (2, …)."""
+        """Return the unit normals of the receiver at the coordinates `aim` (2, …)."""
         return self.rest.normal(aim)
 
     def vector_to(self, rays: Rays, aim: Tensor) -> Tensor:
-        """Return the unit vectors (3, …) along which rays in the glass reach coordinates (2, …) of the receiver.
+        """Return the unit vectors (3, …) along which rays in the glass reach the coordinates `aim` (2, …).
 
         From a point of the face the light goes along the unit vector s over the distance d to the receiver.  By Snell's
         law it comes along i, (i_x, i_y) = (s_x, s_y) / η, through glass of thickness t; the ray along i meets the face

@@ -55,7 +55,7 @@ class ExitPupil:
 
 @torch.no_grad()
 def exit_pupil(source: Emitter, lens: Lens, z: float, n: int = RAYS_PER_SIDE) -> ExitPupil:
-    """Return the light of a point or parallel source that passes the lens, on the plane z (mm)."""
+    """Return the light of a point or parallel source that passes the lens, on the plane z (mm), by n x n rays."""
     if source.extent is not None:
         raise ValueError("an extended source has no single wavefront; pass source.central or source.element(x, y)")
     lens, source = lens.plain(), source.central
@@ -217,7 +217,7 @@ class _Fit:
 
 
 def _least_squares(x: Tensor, y: Tensor, opd: Tensor, share: Tensor) -> _Fit:
-    """Return the flux-weighted plane fit about the mean position, where piston and slopes decouple."""
+    """Return the plane fit of `opd`, weighted by `share`, about the mean position, where piston and slopes decouple."""
     mean_x, mean_y = (float(total(share * p)) for p in (x, y))
     typical = float(opd[0])  # subtracted first, since paths are long and their differences short
     piston = typical + float(total(share * (opd - typical)))

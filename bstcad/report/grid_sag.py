@@ -143,7 +143,7 @@ Shapes = tuple[tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]], ...]
 
 
 def _in_cell(at: Tensor, nodes: np.ndarray, step: float) -> tuple[Tensor, Shapes]:
-    """Return the cell of each coordinate `at`, and H and K of Patches there, [H or K][corner]: (value, d/ds)."""
+    """Return the cell of each `at` between `nodes`, and H and K of Patches there, [H or K][corner]: (value, d/ds)."""
     place = ((at - float(nodes[0])) / step).clamp(0.0, len(nodes) - 1.0)
     cell = place.detach().nan_to_num(0.0).floor().clamp(0, len(nodes) - 2)
     s = place - cell
@@ -300,7 +300,7 @@ class GridSag:
 
 
 def table_note(lens: Lens, face: Surface, name: str, *, points: int, light: GridLight) -> str:
-    """Return a sentence on the shift of the light by a bicubic spline through the heights of a table of sags."""
+    """Return a sentence on the shift of the light by a bicubic spline through a face's heights in the table `name`."""
     by = shift_by_patches(lens, face, Patches.through(face, *axes(lens.outline, points)), light)
     if by is None:
         return f"{name}: no light reaches the target."

@@ -91,7 +91,7 @@ class View:
 
     @classmethod
     def of(cls, scene: Scene, number: int = 0) -> View:
-        """Return the view of a target of the scene."""
+        """Return the view of the target `number` of the scene."""
         target = scene.targets[number]
         side: dict[str, Any] = {"optic": scene.optic, "folded": scene.folded}
         return cls(target.x, target.y, target.seen_from, receiver=target.screen.plane, number=number, **side)
@@ -159,7 +159,7 @@ def brightest(target: np.ndarray, irradiance: np.ndarray) -> float:
 
 
 def tones(irradiance: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return irradiance as grey levels in sRGB (rows, columns), uint8; the end of the scale is white."""
+    """Return irradiance as grey levels in sRGB (rows, columns), uint8; white is `brightest` of both arguments."""
     light = to_srgb(np.clip(irradiance / brightest(target, irradiance), 0.0, 1.0))
     return np.rint(255 * np.clip(light, 0.0, 1.0)).astype(np.uint8)
 
@@ -488,7 +488,8 @@ def made_part(made: MadePart, designed: np.ndarray, view: View) -> Figure:
 def histogram(design: float, limit: float, linear: np.ndarray, full: np.ndarray, adjusted: np.ndarray) -> Figure:
     """Draw histograms of the RRMSD of trials, in percent of the trials of each kind.
 
-    linear: by superposed pictures; full: by full traces; adjusted: by superposed pictures, with the screen adjusted.
+    design, limit: RRMSD as designed, and its limit; linear: trials by superposed pictures; full: by full traces;
+    adjusted: by superposed pictures, with the screen adjusted.
     """
     figure = new_figure(7.6, 3.1)
     axes = figure.subplots()

@@ -554,7 +554,7 @@ def wall_words(walls: Mount | Flange) -> str:
 
 
 def _frame(paper: Paper, at: Point, names: tuple[str, str], size: float) -> None:
-    """Draw the coordinate frame of the file with its origin at `at`: arrows to the right and up, with their names."""
+    """Draw the coordinate frame of the file with its origin at `at`: named arrows, `size` mm long, right and up."""
     for towards, name, off in ((RIGHT, names[0], (GAP, 0.6)), (UP, names[1], (0.8, -0.6))):
         tip = at + size * towards
         paper.line([at, tip - towards], 0.35, color=VERMILION, zorder=6)
