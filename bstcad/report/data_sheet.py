@@ -227,7 +227,7 @@ def _reduced(picture: np.ndarray) -> np.ndarray:
 
 
 def _write_rows(paper: Paper, rows: Rows, y: float, pitch: float) -> float:
-    """Write rows, lines `pitch` mm apart, beside the drawing, from y down as far as there is room; return the next y."""
+    """Write rows, lines `pitch` mm apart, beside the drawing from y down as far as there is room; return the next y."""
     start, end = LIGHT_LEFT + 2.4, FRAME[2] - 2.4
     for name, value in rows:
         lines = wrapped(value, NOTES, end - start - 17.0, 3)
