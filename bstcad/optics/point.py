@@ -43,17 +43,22 @@ class Point(Emitter):
     profile: Annotated[Literal["gaussian", "lambertian", "uniform"], Key("Radiant intensity by angle.")] = "lambertian"
     half_angle_1e2: Annotated[
         float | None,
-        Key("Angle from the axis where a gaussian's irradiance on planes is 1/e² of its peak.", "degrees", 1e-3, 89.0),
+        Key(
+            "Angle from the axis at which a gaussian profile's irradiance on a plane is 1/e² of its peak.",
+            "degrees",
+            1e-3,
+            89.0,
+        ),
     ] = None
     half_angle: Annotated[
         float | None, Key("Angle from the axis at which a uniform or lambertian profile ends.", "degrees", 1e-3, 90.0)
     ] = None
     diameter: Annotated[float | None, Key("Diameter of an emitting disc, simulated.", "mm", 0.0, 1e6)] = None
     width: Annotated[
-        float | None, Key("Width of an emitting rectangle, along its x axis.", "mm", 0.0, 1e6, example=1.0)
+        float | None, Key("Width of an emitting rectangle along its x axis, simulated.", "mm", 0.0, 1e6, example=1.0)
     ] = None
     height: Annotated[
-        float | None, Key("Height of an emitting rectangle, along its y axis.", "mm", 0.0, 1e6, example=1.0)
+        float | None, Key("Height of an emitting rectangle along its y axis, simulated.", "mm", 0.0, 1e6, example=1.0)
     ] = None
     tilt: TiltKey = None
     real_diameter: Annotated[float | None, Key("Diameter of the real lamp, for estimates only.", "mm", 0.0, 1e6)] = None

@@ -37,7 +37,9 @@ class Window(Record):
     kind: Annotated[Literal["window"], Key("A plate that transmits light.")]
     z: Annotated[float, Key("Position of the face with the lower z.", "mm", *COORDINATES, example=40.0)]
     thickness: Annotated[float, Key("Thickness on the axis.", "mm", *LENGTHS, example=3.0)]
-    material: Annotated[str | None, Key("Name on refractiveindex.info; or give the index.", example="N-BK7")] = None
+    material: Annotated[
+        str | None, Key("Name of the material on refractiveindex.info; or give the index instead.", example="N-BK7")
+    ] = None
     index: Annotated[float | None, Key("Refractive index.", "", *INDICES, example=1.5168)] = None
     outline: Annotated[Outlined, RIM]
     curvature: Annotated[

@@ -59,16 +59,27 @@ class Accept(Record):
     """Limits of the checks in the report; with None the check only states its value."""
 
     rrmsd: Annotated[float | None, Key("Maximum RRMSD of light on a target.", "", 1e-6, 10.0, of_light=True)] = None
-    form: Annotated[float, Key("Maximum distance of lens.step from the tailored surface.", "mm", 1e-12, 1.0)] = 1e-6
+    form: Annotated[
+        float, Key("Maximum deviation of the faces in lens.step from the tailored faces.", "mm", 1e-12, 1.0)
+    ] = 1e-6
     efficiency: Annotated[
         float | None,
-        Key("Minimum fraction of flux behind the lens that hits the target.", "", 0.0, 1.0, example=0.9, of_light=True),
+        Key(
+            "Minimum flux on the target, as a fraction of the flux behind the lens.",
+            "",
+            0.0,
+            1.0,
+            example=0.9,
+            of_light=True,
+        ),
     ] = None
     light_on_target: Annotated[
-        float | None, Key("Minimum fraction of flux at the lens that hits the target.", "", 0.0, 1.0, of_light=True)
+        float | None,
+        Key("Minimum flux on the target, as a fraction of the flux that meets the lens.", "", 0.0, 1.0, of_light=True),
     ] = None
     leak: Annotated[
-        float | None, Key("Maximum fraction of flux on the target that hits dark pixels.", "", 0.0, 1.0, of_light=True)
+        float | None,
+        Key("Maximum flux on dark pixels, as a fraction of the flux on the target.", "", 0.0, 1.0, of_light=True),
     ] = None
     decentre: Annotated[float | None, Key("Maximum decentre of a measured part.", "mm", 1e-6, 1e3)] = None
     wavefront: Annotated[

@@ -71,22 +71,44 @@ class Target(Record):
         Profile | None, Key("Irradiance of this shape instead of a picture.", example={"shape": "disc", "radius": 6.0})
     ] = None
     gamma: Annotated[
-        float | None, Key("Irradiance = (pixel value)^gamma; if absent, as in the file.", "", 0.1, 10.0, example=1.0)
+        float | None,
+        Key(
+            "Irradiance = (pixel value)^gamma; if absent, the file's profile or sRGB applies.",
+            "",
+            0.1,
+            10.0,
+            example=1.0,
+        ),
     ] = None
     invert: Annotated[bool, Key("Negative of the picture.", example=True)] = False
-    seen_from: Annotated[Literal["lens", "behind"], Key("Side from which the picture is not mirrored.")] = "lens"
+    seen_from: Annotated[
+        Literal["lens", "behind"], Key("Side from which a viewer sees the picture as it is in its file, not mirrored.")
+    ] = "lens"
     rotate: Annotated[Literal[0, 90, 180, 270], Key("Rotation of the picture, counterclockwise.", "degrees")] = 0
     mirror: Annotated[bool, Key("Exchange left and right, after the rotation.")] = False
     fit: Annotated[
-        Literal["crop", "pad", "stretch"], Key("Fit of a picture with other proportions.", example="pad")
+        Literal["crop", "pad", "stretch"],
+        Key("What to do with a picture whose proportions differ from the target's.", example="pad"),
     ] = "crop"
     crop: Annotated[
         Crop | None,
-        Key("Part to show: [left, top, right, bottom] as fractions.", "", 0.0, 1.0, example=[0.1, 0.0, 0.9, 1.0]),
+        Key(
+            "Part of the picture to use: [left, top, right, bottom], as fractions of its sides.",
+            "",
+            0.0,
+            1.0,
+            example=[0.1, 0.0, 0.9, 1.0],
+        ),
     ] = None
-    outline: Annotated[Outlined | None, Key("Outline of the picture, centred; dark outside.")] = None
-    unreachable: Annotated[Literal["dark", "refuse"], Key("Unreachable parts: dark, or refuse the scene.")] = "dark"
-    weight: Annotated[float, Key("Weight of the target's squared error.", "", 1e-6, 1e6, example=2.0)] = 1.0
+    outline: Annotated[
+        Outlined | None, Key("Outline around the centre of the target, outside which the picture is dark.")
+    ] = None
+    unreachable: Annotated[
+        Literal["dark", "refuse"], Key("Parts that light cannot reach: leave them dark, or refuse the scene.")
+    ] = "dark"
+    weight: Annotated[
+        float, Key("Weight of this target's squared error among several targets.", "", 1e-6, 1e6, example=2.0)
+    ] = 1.0
 
     written = leaving_out(weight=1.0)
 

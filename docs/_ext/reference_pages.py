@@ -53,9 +53,14 @@ def scene_keys() -> str:
     page = [
         "# Keys of a scene",
         "",
-        "A scene is a TOML file: lengths in mm, angles in degrees, wavelengths in nm. The rows are those of",
-        "`bstcad keys` and come from the schema that checks a scene. `[]` marks a list of tables, such as",
-        "`[[effects]]`. A kind before a meaning says which kind of table has the key.",
+        "A scene is a TOML file that describes a lens, its light and its picture. Lengths are in mm, angles in",
+        "degrees, wavelengths in nm. The rows are those of `bstcad keys` and come from the schema that checks a scene.",
+        "",
+        "Where the default is empty, the key may be absent; for most keys of `[tailoring]` its value then depends on",
+        "`tailoring.quality`. The range applies to each number of a list. `[]` marks a list of tables, such as",
+        "`[[effects]]` for `effects[]`.",
+        "A meaning that begins with words such as `point:` holds for tables of that `kind` or `shape` only; if a key",
+        "has several rows, each kind has its own. A key that is `required` is required only if its table is stated.",
         "",
     ]
     for table, keys in tables.items():
@@ -96,7 +101,8 @@ def examples_of_keys() -> dict[tuple[str, tuple[str, ...]], Any]:
             examples.setdefault((key, (kind,)), value)
     for row in rows():
         if row.example is not None:
-            examples.setdefault((row.key.replace("[]", ""), ()), row.example)
+            for kinds in {(), row.kinds}:
+                examples.setdefault((row.key.replace("[]", ""), kinds), row.example)
     return examples
 
 
