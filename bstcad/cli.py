@@ -223,7 +223,9 @@ SceneFile = argument(Path, "SCENE", "Scene file (TOML); see templates/.", parser
 Folder = argument(Path, "DIR", "Folder of a design.", parser=design_folder)
 Output = path_option("DIR", "Folder for the files (default: a folder in outputs/).", "--output", "-o")
 Settings = option(list[str] | None, "KEY=VALUE", "Replace one value of the scene: --set target.pixels=128.", "--set")
-Quality = option(str | None, "Q", "draft, standard or fine (from fast to accurate), or paper (Wang et al. 2023).")
+Quality = option(
+    str | None, "Q", "Effort: draft, standard or fine (from fast to accurate), or paper (Wang et al. 2023)."
+)
 Verbose = option(bool, None, "List every check with its value and limit.", "--verbose")
 Workers = option(int | None, "N", "Distribute the work over N processes on this machine.")
 Scheduler = option(str | None, "URL", "Distribute the work over the workers of the dask scheduler at this address.")
@@ -233,8 +235,12 @@ AsJson = option(bool, None, "Print the result as JSON, for programs.", "--json")
 Name = argument(str | None, "NAME", "Name of the scene; NAME.toml is written.")
 Picture = option(Path | None, "FILE", "Picture that the plate projects on a wall.")
 Light = option(str | None, "L", "Light source of the plate: sun, laser, lamp or led (default: laser).")
-Size = option(str | None, "MM", "Plate: 80 (default), 80x60 (width x height) or 120xphoto (the photo's proportions).")
-Distance = option(str | None, "MM", "Distance from plate to wall (default: 5 times the longer side; for the sun 2.5).")
+Size = option(
+    str | None, "MM", "Size of the plate: 80 (default), 80x60 (width x height) or 120xphoto (proportions of the photo)."
+)
+Distance = option(
+    str | None, "MM", "Distance from plate to wall (default: 5 times the plate's longer side, for the sun 2.5 times)."
+)
 Template = option(str | None, "T", "Copy this template instead; see --list.")
 Listed = option(bool, None, "List the templates.", "--list")
 Opened = argument(Path | None, "SCENE|DIR", "Scene, design, or folder of scenes and designs.", parser=user_path)
@@ -251,8 +257,10 @@ Yield = option(float | None, "P", "Find the loosest tolerances with this yield (
 Seed = option(int, "N", "Seed of the random trials.", min=0)
 Trial = option(int | None, "N", "Write only the lens of this trial, as trial-N.step.", min=0)
 Kinds = option(str | None, "NAMES", f"Kinds of files, separated by commas: {EXPORT_NAMES}.", "--as")
-Points = option(int | None, "N", "Points along the longer side (default: number of control points; zemax: at knots).")
-Png = path_option("FILE", "PNG file to write.", "--png", "-o")
+Points = option(
+    int | None, "N", "Points along the longer side (default: number of control points; zemax: through all knots)."
+)
+Png = path_option("FILE", "PNG file to write (default: a window is opened).", "--png", "-o")
 ReachPng = path_option("FILE", "PNG of the target and of the area that light can reach (target[1]: FILE_2).", "--png")
 Budget = option(
     float,
@@ -344,7 +352,7 @@ def new(
     name: Name = None, picture: Picture = None, light: Light = None, size: Size = None, distance: Distance = None,
     template: Template = None, listed: Listed = False,
 ) -> int:  # fmt: skip
-    """Write a new scene file with comments."""
+    """Write a new scene file with comments: a plate that projects a picture on a wall, or a copy of a template."""
     user_path(Path())
     with loading():
         from bstcad.scene import new_scene

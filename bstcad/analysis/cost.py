@@ -40,7 +40,7 @@ class ConvergenceEnd:
     """
 
     rrmsd: float  # final RRMSD: median of the last twentieth of the evaluations
-    last_tenth_seconds: float  # time since the RRMSD was last above LAST_TENTH_RATIO times its final value
+    last_tenth_seconds: float  # time (s) since the RRMSD was last above 1.1 times its final value
     last_tenth: float  # `last_tenth_seconds` divided by the time from the start to the end of the curve
     power: float | None  # exponent p, zero if the curve does not fall; None: too few points
     fit: float | None  # R² of the fit in logarithms; None: too few points

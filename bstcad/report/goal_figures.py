@@ -58,7 +58,7 @@ class WavefrontFigures:
     """Error of the wavefront behind the lens; 1 wave is `wavelength`."""
 
     z: float  # plane on which the wavefronts are compared (mm)
-    wavelength: Size  # nm
+    wavelength: Size  # vacuum wavelength (nm)
     rms: Size  # RMS error, weighted by flux (waves)
     pv: Size  # peak to valley over all rays (waves)
     rms_with_tilt: Size  # RMS error with only piston removed (waves)

@@ -178,9 +178,9 @@ class Order:
     sha256: str  # SHA-256 of that file, hexadecimal
     low: Point  # smallest x, y and z of the part
     high: Point  # largest x, y and z of the part
-    volume: float | None  # mm³; None: some faces cannot be integrated
+    volume: float | None  # volume (mm³); None: some faces cannot be integrated
     material: str | None  # name of the material in words
-    density: float | None  # g/cm³
+    density: float | None  # density (g/cm³)
     datum: str  # position of z = 0, in words
     origin: float  # z of the file's origin in the scene's frame
     freeform: tuple[str, ...]  # names of the freeform faces
@@ -189,11 +189,11 @@ class Order:
     back_profile: float | None  # profile tolerance of the back (ISO 1101)
     front_profile: float | None  # profile tolerance of the front (ISO 1101)
     thickness_tolerance: float | None  # tolerance of the centre thickness (±)
-    roughness: float | None  # largest Ra of the optical faces (nm)
+    roughness: float | None  # largest allowed roughness Ra of the optical faces (nm)
     coating: str | None  # coating of the optical faces
     unbuilt: bool  # True if the scene has a mount, but part.step could not be built
     size: Point  # outer sizes along x, y and z
-    mass: float | None  # g
+    mass: float | None  # mass (g)
 
 
 def order_of(scene: Scene, lens: Lens, shape: Mapping[str, Any], folder: Path, found: Measures | None = None) -> Order:

@@ -93,7 +93,7 @@ class CurvePoint:
 
 
 class PrecisionTest(TypedDict):
-    """Comparison of tailoring in float32 and in float64; see tailoring.stage2.PrecisionComparison."""
+    """Comparison of a short run of tailoring in float32 and in float64; see tailoring.stage2.PrecisionComparison."""
 
     control_points: int  # number of control points along the longer side
     merit: Size  # relative difference of the merit before the first step
@@ -108,8 +108,8 @@ class PrecisionTest(TypedDict):
 class LineFigures:
     """Figures of the light of one spectral line alone."""
 
-    wavelength: Size  # nm
-    share: Fraction  # fraction of all light
+    wavelength: Size  # vacuum wavelength (nm)
+    share: Fraction  # fraction of all light that is in this line
     rrmsd: Rrmsd  # RRMSD of the line's picture against the target
 
 
@@ -168,7 +168,7 @@ class Contents:
     rrmsd_noise: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd
     light_on_target: Fraction  # fraction of the source's flux on the target
     efficiency: Fraction  # flux on the target, as a fraction of the flux that leaves the last face
-    flux: Mapping[str, Fraction]  # flux ledger: fractions of the source's flux, with sum 1
+    flux: Mapping[str, Fraction]  # flux ledger: fractions of the source's flux by where it goes, with sum 1
     prescription: Mapping[str, Any]  # every surface as it was designed
     seconds_total: Seconds  # time from the command to the verified lens and the pictures of its report
     stages: Annotated[tuple[StageRecord, ...], Field(max_length=100), FailFast()]  # stages in their order
@@ -187,15 +187,19 @@ class Contents:
     contrast: Size | None = None  # mean irradiance of lit divided by dark pixels; None: no dark pixels, or no leak
     optic: Literal["lens", "mirror"] = "lens"  # kind of the design
     quality: str | None = None  # tailoring.quality of the scene
-    # grid (cells per side), iterations, mass_error and stopped (reason) of the transport; steep_share, steepest_deg
+    # transport map: grid (cells per side), iterations, mass_error, stopped (reason of its end), steep_share (fraction
+    # of the light that would need a slope above 70°), steepest_deg (steepest slope it would need).  None: no map
     transport: Mapping[str, Scalar] | None = None
-    skipped_steps: Annotated[int, Field(ge=0)] | None = None  # steps skipped: merit or gradient not finite
-    stopped: str | None = None  # reason why tailoring ended
+    # number of steps that tailoring skipped, since merit or gradient was not finite; None: unknown
+    skipped_steps: Annotated[int, Field(ge=0)] | None = None
+    # reason why tailoring ended: evaluations (all used), plateau, accuracy, time, interrupt, or by hand (changed lens)
+    stopped: str | None = None
     twins: PrecisionTest | None = None  # comparison of float32 with float64; None: not made
     rrmsd_asked: Size | None = None  # accept.rrmsd of the scene; None: no limit
     rays_traced: int | None = None  # number of rays that measured the light on the target with the largest RRMSD
-    shape: Mapping[str, float | None] | None = None  # dimensions (analysis.shape.describe) and volume (mm³)
-    # tir_margin_deg, newton_slope_min (smallest divisor in Newton's method), curvature_max (1/mm), non_finite (number)
+    shape: Mapping[str, float | None] | None = None  # dimensions (keys: see analysis.shape.describe) and volume (mm³)
+    # tir_margin_deg (margin to total internal reflection), newton_slope_min (smallest divisor in Newton's method),
+    # curvature_max (1/mm), non_finite (number of values that are not finite)
     stability: Mapping[str, float | int | None] | None = None
     blur: Blur | None = None  # blur by the source's size; None: a point source or parallel light
     finest_detail: FinestDetail | None = None  # finest detail on the target; None: no size of the source
@@ -203,8 +207,8 @@ class Contents:
     picture: tuple[str, ...] = ()  # sentences on how a file was read: first of its pictures, transparency, tones, fit
     given_up: tuple[str, ...] = ()  # text of the remarks
     remarks: tuple[str, ...] = ()  # ids of the remarks, in the order of given_up
-    estimates: tuple[LeftOut, ...] = ()  # changes by effects that are not simulated, the largest first
-    # end of the curve: rrmsd, last_tenth_seconds, last_tenth, power, fit, halving (ConvergenceEnd); None: no curve
+    estimates: tuple[LeftOut, ...] = ()  # estimates of effects that are not simulated, the largest first
+    # end of the convergence curve: entries of ConvergenceEnd; None: there is no curve
     convergence: Mapping[str, Size | None] | None = None
     # distribution of the remaining error: parts [{name, error, pixels}] (fractions of the squared error and of the
     # pixels), octaves [{frequency (cycles per pixel), period (in the target's unit), error}], outside (fraction of the
@@ -217,9 +221,9 @@ class Contents:
     judges: tuple[Judge, ...] = ()  # results of other programs (--against)
     # made part, from its point cloud; keys of measured.made_part, such as points, pv, rms, rrmsd_predicted, passed
     measured: Mapping[str, Any] | None = None
-    order: Order | None = None  # order for a machine shop
+    order: Order | None = None  # data with which a machine shop makes the part
     flat_tops: tuple[FlatTop, ...] = ()  # figures of the targets with a flat profile
-    wavefront: WavefrontFigures | None = None  # None: no requested wave, or no light on its plane
+    wavefront: WavefrontFigures | None = None  # wavefront error; None: no requested wave, or no light on its plane
 
     @property
     def worst(self) -> GoalFigures:

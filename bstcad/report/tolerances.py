@@ -72,7 +72,7 @@ class Sensitivity:
 class Trial:
     """A fully traced trial."""
 
-    number: Annotated[int, Field(ge=0)]  # number of the trial for --trial
+    number: Annotated[int, Field(ge=0)]  # number of the trial, as in bstcad tolerance --trial
     rrmsd: Size  # RRMSD of the lens of the trial
     amounts: Mapping[str, float]  # amount of each error, in its unit
 
@@ -95,12 +95,14 @@ class TargetStudy:
     rrmsd: Rrmsd  # RRMSD of the design on this target
     passed: Annotated[Yield, Field(alias="yield")]  # yield on this target alone, by superposed pictures
     passed_full: Annotated[Yield, Field(alias="yield_full")]  # yield of the trials traced in full
-    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of the full trials by rrmsd_adjusted
+    # yield of the same trials with the screen at its best position, see rrmsd_adjusted
+    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]
     rrmsd_trials: Spread  # RRMSD of the trials by superposed pictures
     rrmsd_full: Spread  # RRMSD of the trials traced in full
-    rrmsd_adjusted: Spread  # RRMSD of the full trials by superposed pictures, this screen at its best position
+    rrmsd_adjusted: Spread  # RRMSD of these trials by superposed pictures, this screen at its best position
     model_off: Disagreement  # disagreement of superposed pictures with full traces
-    sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # the worst first
+    # sensitivities to the errors on this target, the largest change of the RRMSD first
+    sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]
 
 
 @dataclass(frozen=True)
@@ -133,21 +135,24 @@ class Tolerances:
     tubes: Count  # flux tubes per side, for each channel
     limit: Rrmsd  # largest RRMSD of a lens that passes
     rrmsd: Rrmsd  # RRMSD of the design; here and below each RRMSD of a lens is the largest over the targets
-    trials: Count  # number of trials by superposed pictures
-    full_trials: Count  # number of trials by full traces
+    trials: Count  # number of trials by superposed pictures: sums of the changes that single errors cause
+    full_trials: Count  # number of trials that are traced in full, with all errors together
     # yield by superposed pictures: lenses within `limit` on all targets and within the limit of the wavefront
     passed: Annotated[Yield, Field(alias="yield")]
     passed_full: Annotated[Yield, Field(alias="yield_full")]  # yield of the trials traced in full
-    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]  # yield of the full trials by rrmsd_adjusted
+    # yield of the same trials with the screen at its best position, see rrmsd_adjusted
+    passed_adjusted: Annotated[Yield, Field(alias="yield_adjusted")]
     rrmsd_trials: Spread  # RRMSD of the trials by superposed pictures
     rrmsd_full: Spread  # RRMSD of the trials traced in full
-    rrmsd_adjusted: Spread  # RRMSD of the full trials by superposed pictures, the screen at its best position
+    rrmsd_adjusted: Spread  # RRMSD of the fully traced trials by superposed pictures, the screen at its best position
     model_off: Disagreement  # disagreement of superposed pictures with full traces
-    sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]  # largest change of the RRMSD first
+    # sensitivities to the errors, the largest change of the RRMSD first
+    sensitivities: Annotated[tuple[Sensitivity, ...], Field(max_length=1000)]
     worst: Annotated[tuple[Trial, ...], Field(max_length=100)]  # worst of the fully traced trials
-    inverse: Inverse | None = None  # None: no yield was requested
-    targets: Annotated[tuple[TargetStudy, ...], Field(max_length=100)] | None = None  # None: there is one target
-    wavefront: WavefrontStudy | None = None  # None: the scene has no wave
+    inverse: Inverse | None = None  # loosest tolerances for a requested yield; None: no yield was requested
+    # results on each target; None: there is one target
+    targets: Annotated[tuple[TargetStudy, ...], Field(max_length=100)] | None = None
+    wavefront: WavefrontStudy | None = None  # results on the wavefront; None: the scene has no [wavefront]
 
     def facts(self) -> dict[str, Any]:
         """Return the entries of tolerance.json as plain values, in their order."""

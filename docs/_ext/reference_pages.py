@@ -20,6 +20,7 @@ RECORDS = {  # JSON file: (module, names of its records), with the record of the
         ("report/record.py", ["Contents", "StageRecord", "CurvePoint", "PrecisionTest", "LineFigures", "LeftOut"]),
         ("report/goal_figures.py", ["GoalFigures", "WavefrontFigures"]),
         ("analysis/top_hat.py", ["FlatTop"]),
+        ("analysis/cost.py", ["ConvergenceEnd"]),
         ("verify/verdict.py", ["Check"]),
         ("analysis/light.py", ["Blur", "FinestDetail"]),
         ("judges/comparison.py", ["Judge"]),
@@ -134,10 +135,12 @@ def command_line() -> str:
     page = get_docs_for_click(obj=group, ctx=click.Context(group, info_name="bstcad"), name="bstcad")
     page = page.replace("# `bstcad`", "# Command line", 1).replace("```console", "```text")
     exits = (
-        "Exit codes: 0, no check failed; 1, a check failed, an error ended a design of `batch`, or no run of\n"
-        "`tradeoff` has a lens; 2, wrong input, or the machine cannot do the work (such as a full disk); 70, a\n"
-        "fault of bstcad; 129, 130, 143, ended by SIGHUP, Ctrl-C, SIGTERM. `bstcad tolerance` exits with 0 at any\n"
-        "yield, also below the yield that `--yield` requests.\n\n"
+        "Exit codes:\n\n"
+        "- 0: no check failed. `bstcad tolerance` exits with 0 at any yield, also below that of `--yield`.\n"
+        "- 1: a check failed, an error ended a design of `batch`, or no run of `tradeoff` has a lens.\n"
+        "- 2: the input is wrong, or the machine cannot do the work (for example, its disk is full).\n"
+        "- 70: a fault of bstcad.\n"
+        "- 129, 130, 143: the command was ended by SIGHUP, Ctrl-C or SIGTERM.\n\n"
     )
     return page.replace("## `bstcad generate`", exits + "## `bstcad generate`", 1)
 
@@ -150,11 +153,16 @@ def json_files() -> str:
     page = [
         "# JSON files",
         "",
-        "Programs read these files; each is written from, and read back into, the records below. `None` is `null`.",
+        "Programs read these files. Each file is written from, and read back into, the records below. The first record",
+        "of a section is the whole file; the others are the types of its entries. `None` is `null` in a file.",
         "Lengths are in mm, angles in degrees and times in s, unless the meaning names another unit. `Count`, `Rrmsd`,",
         "`Seconds`, `Size` and `Width` are numbers, a `Fraction` is a number from 0 to 1, and a `Point` is [x, y, z].",
-        "`Yield`: lower bound, estimate and upper bound (95 % interval). `Spread`: values by the percentiles 5 %, 50 %",
-        "and 95 %. `Disagreement`: median and 95th percentile of the relative error. `StoredSettings`: values by key.",
+        "RRMSD is the RMS difference between light and target, divided by the RMS of the target.",
+        "",
+        "- `Yield`: list of lower bound, estimate and upper bound of a yield (95 % interval).",
+        "- `Spread`: values by the percentiles 5 %, 50 % and 95 %.",
+        "- `Disagreement`: median and 95th percentile of the relative error.",
+        "- `StoredSettings`: values by key of the scene.",
     ]
     for name, files in RECORDS.items():
         page += ["", f"## {name}", ""]
@@ -197,8 +205,10 @@ def readable(kind: str) -> str:
 
 
 def cell(text: str) -> str:
-    """Text of a table's cell, in which markdown marks nothing."""
-    return re.sub(r"([|\\*_<>\[\]`])", r"\\\1", text)
+    """Text of a table's cell, in which markdown marks nothing except code."""
+    parts = re.split(r"(`[^`|]+`)", text)
+    parts[::2] = [re.sub(r"([|\\*_<>\[\]`])", r"\\\1", part) for part in parts[::2]]
+    return "".join(parts)
 
 
 def write(page: str, text: str) -> None:
