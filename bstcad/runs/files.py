@@ -140,7 +140,7 @@ def arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], largest: int) -> d
     """Return arrays as float64, by name, from an .npz archive of at most `largest` bytes; shapes: their shapes by name.
 
     An archive may unpack to a million times its size, and an array's header may claim any size: both are checked
-    against the shape before memory is allocated.  Raises ValueError, or for a damaged archive errors of zipfile.
+    against the shape before memory is allocated.  Raises ValueError, or errors of zipfile, zlib or numpy.
     """
     with zipfile.ZipFile(io.BytesIO(contents(path, largest))) as archive:
         return {name: _array(archive, name, shape) for name, shape in shapes.items()}
