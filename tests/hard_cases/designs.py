@@ -242,7 +242,8 @@ def main() -> None:
             rows.append(cells)
             words.append(f"- {name}: {said}")
             print(markdown.row(cells), flush=True)
-    content = [markdown.table(HEAD, rows), "", "Remarks of their reports, or the message of a refusal:", "", *words]
+    below = "Remarks in the report of each design, or the message with which it was refused:"
+    content = [markdown.table(HEAD, rows), "", below, "", *words]
     markdown.write(wanted.page, "<!-- figures: designs -->", "\n".join(content))
 
 
