@@ -4,6 +4,7 @@ Net, pixels, flux tubes and transport cells of a pilot are those of the scene di
 has as many control cells and tubes as in the scene, and the search makes as many evaluations.  The pilot includes all
 faces, goals, losses, wavelengths and bounds of the scene.  How the time of each stage scales with its sizes is known
 from the method.  A pilot has no detail finer than its pixels; the error of this detail is estimated from the picture.
+The constants ending in _SECONDS (s) and _GB (GB) are for the sizes UNIT_…, on two cores of pace 1 (`pace`).
 
 tests/benchmarks/test_prediction.py compares predictions with designs of the templates and of the gallery.
 """
@@ -187,8 +188,8 @@ def predicted_seconds(scene: Scene, pilot: Pilot) -> float:
 # Sizes (per side, or iterations) for which the following times (s) and memory (GB) are stated, on two cores of pace 1.
 UNIT_TUBES, UNIT_POINTS, UNIT_PIXELS, UNIT_GRID, UNIT_ITERATIONS = 1024, 513, 512, 256, 40
 KERNEL_SECONDS = 0.115  # time of an evaluation of cold_run.calibration_kernel; defines pace 1
-ROUND_SECONDS, TRANSPORT_SECONDS, FIT_SECONDS = 0.06, 0.2, 0.6  # time of a round, transport, slope fit in stage 1
-TWO_FACE_TRANSPORT_SECONDS = 2.4  # time of a transport behind two freeform faces, between which light is traced
+ROUND_SECONDS, TRANSPORT_SECONDS, FIT_SECONDS = 0.06, 0.2, 0.6  # stage 1: rest of a round, transport, slope fit
+TWO_FACE_TRANSPORT_SECONDS = 2.4  # time of a transport for two freeform faces, with the trace between them
 TWO_FACE_SECONDS = 3.0  # additional time in stage 1 for two freeform faces of any size
 AIMING_SECONDS = 1.0  # time to find the rays from a point source through UNIT_TUBES² points of a face
 FRONT_SECONDS = 1.7  # time of the search for the free parameters of a front
@@ -197,7 +198,7 @@ CALL_SECONDS = 0.01  # time in an evaluation that is independent of sizes
 IMAGE_SECONDS = 0.7  # time in a round for the images of an extended source
 ADAM_SECONDS = 0.1  # time of a step of the paper's procedure
 START_SECONDS = 2.8  # time of the imports and of the end of the process
-WRITE_SECONDS, NET_SECONDS, PICTURE_SECONDS = 1.5, 2.4, 1.1  # time of writing: constant part, net, pixels
+WRITE_SECONDS, NET_SECONDS, PICTURE_SECONDS = 1.5, 2.4, 1.1  # time of the proof: constant part, net, pixels
 MOUNT_SECONDS = 2.5  # time of cutting and verifying the mounted part
 RAY_SECONDS, DRAFT_RAY_SECONDS = 1.6, 1.0  # time of parallel rays, per target and spectral line; twice for other light
 WITNESS_SECONDS, DRAFT_WITNESS_SECONDS = 6.0, 2.5  # time to verify a lens of two nets with flux tubes, per target

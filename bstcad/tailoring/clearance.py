@@ -69,7 +69,7 @@ def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], flo
 
 
 def _points_near_bounds(lens: Lens, bounds: Bounds, margin: float) -> Iterator[tuple[Tensor, Tensor, float, float]]:
-    """Yield (x, y, weight of a point, minimum thickness) for points of a thickness near a bound, and some others.
+    """Yield (x, y, weight of each point, minimum thickness): all points whose thickness is near a bound, and others.
 
     Near: within `margin` (mm).  The points along the rim come last; their weights sum to 1.
     """

@@ -1,7 +1,7 @@
 """The task of a design, the steps that its stages yield, and the driver that runs the stages.
 
 A stage is an iterator of steps, and does not read the clock.  The driver runs the steps, measures time, saves states,
-reports progress, and stops when there is a reason to end.
+reports progress, and stops when there is a reason to end.  A machine of pace 2 takes twice the time of one of pace 1.
 """
 
 from __future__ import annotations

@@ -291,7 +291,7 @@ class Study:
         return np.abs(self.linear[: len(self.full)] / self.full - 1)
 
     def change_of(self, error: str) -> float:
-        """Return the change of the RRMSD for one standard deviation of an error."""
+        """Return the change of the RRMSD by one standard deviation of the error with this name."""
         return next(s.rrmsd_change for s in self.sensitivities if s.name == error)
 
     @property
