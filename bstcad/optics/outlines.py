@@ -68,7 +68,7 @@ class _Box(ABC):
         return x, y
 
     def inset_direction(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the shift (x, y) of rim points per mm of inset: inward normal, on a rectangle 2a x 2b (-x/a, -y/b)."""
+        """Return the shift (x, y) of rim points per mm of inset: inward normal; (-x/a, -y/b) on a rectangle 2a x 2b."""
         a, b, r2 = self.limits
         if r2 == 0:
             return -x / a, -y / b
@@ -88,7 +88,7 @@ class Rectangle(_Box):
 
     @property
     def half_extent(self) -> tuple[float, float]:
-        """Half the bounding box in x and in y (mm)."""
+        """Half the width and half the height of the bounding box (mm)."""
         return self.width / 2, self.height / 2
 
     @property
@@ -174,7 +174,7 @@ class Circle(_Box):
 
     @property
     def half_extent(self) -> tuple[float, float]:
-        """Half the bounding box in x and in y (mm)."""
+        """Half the width and half the height of the bounding box (mm)."""
         return self.radius, self.radius
 
     @property

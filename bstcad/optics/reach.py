@@ -138,7 +138,7 @@ def reach_margin(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing:
 
 
 def unreached(picture: np.ndarray, part: np.ndarray, angle: float | None) -> dict[str, float | None]:
-    """Return the fractions of area and light of a picture that lie outside its reachable `part` (True: reachable).
+    """Return {area, light, angle}: fractions of area and light of a picture outside its `part` (True: reachable).
 
     angle: largest deflection (degrees) of the face (Passes.largest_deflection), copied to the result.
     """

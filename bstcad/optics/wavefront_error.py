@@ -34,7 +34,7 @@ from bstcad.optics.receivers import LevelPlane, dot
 from bstcad.optics.trace import behind, clear_window
 from bstcad.optics.wavefront import MM_PER_NM, Wave, length
 
-RAYS_PER_SIDE = 512  # rays per side of the grid before the lens
+RAYS_PER_SIDE = 512  # rays per side of the square grid that is launched
 MAX_MAP_CELLS = 256  # largest number of cells per side of the map
 RAYS_PER_BAND = 1 << 17  # rays traced at a time: a megabyte for each quantity
 ROUNDINGS_PER_SEGMENT = 4  # number of roundings of a path segment: two ends, length and sum

@@ -128,7 +128,7 @@ def _files(
 
 
 def sag_table(lens: Lens, points: int) -> str:
-    """Return a CSV table of x, y and z of front and back on a grid, `points` along its wider side, in the outline."""
+    """Return a CSV table of x, y, front z and back z (mm) on a grid, `points` along its wider side, in the outline."""
     x, y = _inside(lens, points)
     return _csv(x_mm=x, y_mm=y, front_z_mm=sag(lens.front, x, y), back_z_mm=sag(lens.back, x, y))
 

@@ -55,7 +55,7 @@ EXACT_FACES = (  # sentence on a freeform back, and on two freeform faces
 )
 SHEET, PART, LENS = "datasheet.pdf", "part.step", "lens.step"
 DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # plane z = 0, by datum
-EDGE_TOLERANCE = 1e-3  # fraction of an outline's area that a back which counts as filling the outline may leave free
+EDGE_TOLERANCE = 1e-3  # free fraction of an outline's area up to which a back counts as filling the outline
 
 Point = tuple[float, float, float]
 Measures = tuple[Point, Point, float | None]  # smallest and largest x, y, z (mm); volume (mm³), None: unknown
