@@ -44,7 +44,7 @@ class ConvergenceEnd:
     last_tenth: float  # `last_tenth_seconds` divided by the time from the start to the end of the curve
     power: float | None  # exponent p, zero if the curve does not fall; None: too few points
     fit: float | None  # R² of the fit in logarithms; None: too few points
-    halving: float | None  # factor 2^(1/p) of the time; None: no or a poor fit, or the factor exceeds MAX_HALVING
+    halving: float | None  # factor 2^(1/p) of the time; None: no or a poor fit, or a factor above 10
 
 
 def ending(history: History, stages: StageResults, since: float = 0.0) -> ConvergenceEnd | None:

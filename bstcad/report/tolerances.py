@@ -64,7 +64,7 @@ class Sensitivity:
     cost: Width  # relative cost of the limit (default 1)
     sigma: Width  # standard deviation, in `unit`
     rrmsd_change: float  # change of RRMSD by one sigma; with several targets, on the target that changes most
-    share: Fraction  # fraction of the mean square change that all errors cause in all pictures
+    share: Fraction  # part of this error in the mean square change that all errors cause in all pictures
     wavefront_change: float | None = None  # change of the RMS wavefront error by one sigma (waves); None: no wave
 
 
