@@ -534,8 +534,17 @@ class LensBlank(Record):
     )
     index: Annotated[float | None, Key("Refractive index, in place of material.", "", *INDICES, example=1.49)] = None
     outline: Annotated[Outlined, Key("Rim of the lens.", example={"shape": "rectangle", "width": 24.0, "height": 24.0})]
-    front: Annotated[Front, Key("The face that light enters.", example={"kind": "plane", "z": 8.0})]
-    back: Annotated[Back, Key("The tailored face.", example={"kind": "bspline", "z": 20.0, "control_points": 257})]
+    front: Annotated[
+        Front,
+        Key("The face with the smaller z, through which light enters a lens.", example={"kind": "plane", "z": 8.0}),
+    ]
+    back: Annotated[
+        Back,
+        Key(
+            "The face with the larger z; tailored unless optimise = false.",
+            example={"kind": "bspline", "z": 20.0, "control_points": 257},
+        ),
+    ]
     tool_radius: Annotated[
         float | None,
         Key("Radius of the tool: minimum radius of the valleys of tailored faces.", "mm", 1e-6, 1e9),
