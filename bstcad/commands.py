@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 # In a run with a time limit: time reserved for the report, and smallest time for the rays of the verification (s).
 REPORT_TIME, MIN_RAY_TIME = 2.0, 0.5
 
-Drawing = Callable[..., Pictures]  # class that draws figures, from (scene, processes.submit)
+Drawing = Callable[..., Pictures]  # class that draws figures; called with (scene, processes.submit)
 # Functions of a script that add to a report: checks, from (proof, folder of the files), or a section (heading, HTML).
 OwnCheck = Callable[[Proof, Path], Iterable[Check]]
 OwnSection = Callable[[Contents], tuple[str, str]]
@@ -92,11 +92,11 @@ def generate(
 ) -> Report:  # fmt: skip
     """Design a lens, write it to `folder` and verify the written files.
 
-    hooks: functions that are called during the design; this command replaces `save` and `interrupted`.
+    hooks: functions that are called during the design; `save` and `interrupted` are replaced by this command's own.
     device: "auto", "cpu" or "cuda".  began: value of time.perf_counter() from which the times in the report and
     tailoring.max_time count (None: now).
     During the design a checkpoint is written beside `folder` at intervals; with `resume` the design continues from
-    this checkpoint.  After a Ctrl-C the best lens so far is written to `output_folder`.
+    this checkpoint.  After a Ctrl-C the best lens so far is written to the folder that `output_folder` returns.
     """
     scene = with_default_net(scene, lambda line: hooks.progress("control points", 1, 1, line))
     path, say = files.beside(folder, "checkpoint"), lambda text: hooks.progress("checkpoint", 0, 0, text)
@@ -147,8 +147,8 @@ def output_folder(folder: Path, stopped: str) -> Path:
 def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), progress: Progress = no_progress) -> Report:
     """Write a design to `folder`, replacing an earlier design, and verify the written files.
 
-    If the design cannot be written or verified, design.npz and the scene are kept in a folder beside `folder`, which a
-    note on the error names.
+    If the design cannot be written or verified, design.npz and the scene are kept in another folder, which a note on
+    the error names.
     """
     processes.begin()
     with (
@@ -189,7 +189,7 @@ def prove(made: Made, options: ProofOptions = ProofOptions(), progress: Progress
 def _write_and_prove(
     made: Made, folder: Path, drawn: Pictures, options: ProofOptions, progress: Progress
 ) -> tuple[Made, Proof]:
-    """Write the geometry to `folder` and verify it; return the design with the times of both stages, and its proof."""
+    """Write the geometry to `folder` and verify it; return (design with the times of both stages, its proof)."""
     made = replace(made.with_report_data(), stored=None)  # design.npz is written again
     processes.return_freed()  # the second process needs the memory for the solid
     began = time.perf_counter()
@@ -287,7 +287,7 @@ def verify(
     against = comparison.choose_judges(against)
     if path.is_file():
         if against or measured:
-            raise SceneError(f"{path}: a STEP file states no light, so it has no picture; give the design's folder")
+            raise SceneError(f"{path}: a STEP file is no design, which --against and --measured need; give its folder")
         return examine(path)
     if place is not None and measured is None:
         raise SceneError(f"{place}: only a made part's report can go there; give the part's points with --measured")
@@ -478,7 +478,7 @@ def _sheet_again(made: Made, folder: Path) -> DataSheet:
     with scene_errors():
         known = record.read(folder / "report.json")
     if known.shape is None or not (folder / "lens.step").is_file():
-        raise SceneError(f"{folder}: lens.step, or the shape in report.json, is missing; run bstcad verify or generate")
+        raise SceneError(f"{folder}: no lens.step, or no shape in report.json; run bstcad verify, or else generate")
     irradiances, order = folders.read_irradiances(folder, made.scene), _order(made, known.shape, folder)
     return _sheet(made, known, known.goals, irradiances[0], order=order)
 

@@ -88,11 +88,11 @@ def same_front(one: Surface, other: Surface) -> bool:
 
 LARGE_STEP = 100e6  # smallest estimated size of lens.step (bytes) that is printed before a design
 BYTES_PER_POINT = 83  # bytes of a point's STEP statement and of one reference to it (#N), without the digits of N
-OTHER_BYTES = 103_000, 1600  # bytes of other statements: per file, and for each net per control point of a side
+OTHER_BYTES = 103_000, 1600  # bytes of other statements: per file; for each net, per control point along its mean side
 
 
 def step_size(scene: scenes.Scene, net: Sides | None = None) -> float:
-    """Return the size of lens.step in bytes, to a few per cent, from one statement and one reference per control point.
+    """Estimate the size of lens.step in bytes, to a few per cent: one statement and one reference per control point.
 
     net: control points per side, or along x and along y; None: as in the scene.
     """
@@ -233,7 +233,7 @@ def write_geometry(design: Made, folder: Path, submit: Submit = run_here) -> Cal
     """Write lens.step, lens.stl, part.step if there is a mount, and the scene with the files that it names.
 
     Return the function that writes lens.3mf.  The verification does not read lens.3mf, so a thread can write it later.
-    submit: runs the writing of STEP; with bstcad.runs.processes.submit in a second process, beside that of the meshes.
+    submit: calls the functions that write STEP; bstcad.runs.processes.submit calls them in a second process.
     """
     scene, lens = design.scene, design.lens
     stated = scene.name, scene.part.of(scene.lens)
@@ -319,7 +319,7 @@ def kept_if_unwritten(design: Made, folder: Path) -> Iterator[None]:
 
 
 def _keep(design: Made, folder: Path) -> Path:
-    """Write a design to a folder beside `folder`, or else to the system's temporary folder; return its path."""
+    """Write a design to a folder beside `folder`, or else in the system's temporary folder; return its path."""
 
     def write_to(path: Path) -> Path:
         with replacing(path) as building:
@@ -427,7 +427,7 @@ def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
 
 
 def _surface(net: np.ndarray, z: float) -> BSplineSurface:
-    """Return the surface of a control net (m, n, 3) in mm, to the last bit; its z is 0 if `z` would cause rounding."""
+    """Return the surface of a control net (m, n, 3) in mm, to the last bit; its z is 0 if `z` causes rounding."""
     if not np.array_equal(z + (net[..., 2] - z), net[..., 2]):  # heights relative to z would be rounded
         z = 0.0
     return BSplineSurface.from_control_points(net, z)

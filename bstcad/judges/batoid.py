@@ -28,7 +28,7 @@ from bstcad.optics.rays import Rays, axes
 from bstcad.optics.tilted import TiltedSurface
 from bstcad.optics.trace import launch_strips
 
-GRID_MARGIN = 0.125  # margin of a Bicubic beyond each edge of the net / width of the net; searches for hits use it
+GRID_MARGIN = 0.125  # margin of a Bicubic beyond each edge of the net, for searches for hits / width of the net
 POLYGON_CORNERS = 4096  # number of corners of the polygon that represents an outline with round corners
 COMPARISON_POINTS = 100_000  # largest number of points at which batoid's faces are compared with the lens's
 
@@ -86,7 +86,7 @@ def vector(rays: Rays) -> Any:
 
 
 def land(rays: Any, screen: Screen, sense: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Move rays of batoid to a screen; return x, y (mm), and a mask of hits.  sense: 1 for light along +z, or -1."""
+    """Move batoid's rays to a screen; return x, y on it (mm) and mask of hits.  sense: 1 for light along +z, or -1."""
     x, y, _ = screen.middle
     batoid.intersect(batoid.Plane(), rays, _frame(screen.middle, np.column_stack(axes(screen.tilt or (0.0, 0.0)))))
     arrived = ~rays.failed & ~rays.vignetted & np.isfinite(rays.x) & np.isfinite(rays.y) & (sense * rays.vz > 0)
@@ -139,7 +139,7 @@ def trace(lens: Lens, channels: Sequence[Channel], screen: Screen, rays: int, se
 
 
 def bin_flux(x: np.ndarray, y: np.ndarray, flux: np.ndarray, screen: Screen) -> np.ndarray:
-    """Return the flux in each pixel (rows, columns) by numpy's histogram; row 0 = y max."""
+    """Return the flux of rays at (x, y) in each pixel (rows, columns), by numpy's histogram; row 0 = y max."""
     image, _, _ = np.histogram2d(y, x, bins=screen.shape, range=(screen.y, screen.x), weights=flux)
     return image[::-1]
 

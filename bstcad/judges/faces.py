@@ -24,7 +24,7 @@ from bstcad.optics.unfolding import per_radian
 
 PARAMETER_STEPS = 6  # steps of Newton's method for t at a given x; the first guess has an error of at most half a span
 GRID_CELLS = 512  # number of cells per side of the coarsest grid over a curved face without knots
-PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # ring radii / rim radius; many: slim triangles leak light
+PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # ring radii / rim radius; many, as slim triangles leak
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Freeform:
         return (x0, x1), (y0, y1)
 
     def lines(self, parts: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return x and y (mm) of grid lines, 2 * parts per pitch, through all knots (at 1.5, 2.5, … pitches)."""
+        """Return x and y (mm) of grid lines, 2 * parts per pitch; each knot (at 1.5, 2.5, … pitches) has one."""
         x, y = (
             np.linspace(*ends, 2 * parts * (m - 1) + 1) for ends, m in zip(self._ends, self.net.shape, strict=False)
         )
@@ -94,7 +94,7 @@ class Freeform:
         return Shape(grid_x, grid_y, z, z_x=z_x + z_xy * off_y, z_y=z_y + z_xy * off_x, z_xy=z_xy)
 
     def _parameter(self, x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return x clipped to the net, and t and dt/dx for x(t) = Σ B_i(t) x_i, found with Newton's method."""
+        """Return x (axis 1: y) clipped to the net, and t and dt/dx for x(t) = Σ B_i(t) x_i, by Newton's method."""
         ends, m = self._ends[axis], self.net.shape[axis]
         x = np.clip(x, *ends)
         along = BSpline(self.knots[axis], np.linspace(*ends, m), 2)
@@ -267,7 +267,7 @@ def wall(front: Face, back: Face, apertures: tuple[Outline, Outline]) -> Trimesh
 
 
 def plate(front: Face, outline: Outline) -> Trimesh:
-    """Return the mesh of a plate around the front, from its rim outwards at the height of the rim."""
+    """Return the mesh of a plate around the front: from the front's rim outwards, at the height of this rim."""
     hole = front.at(*rim(outline).T).points
     return _strips([hole * (ring, ring, 1.0) for ring in PLATE_RINGS], np.tile([0.0, 0.0, 1.0], (len(hole), 1)))
 

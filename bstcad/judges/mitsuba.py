@@ -264,7 +264,6 @@ def _projector(source: Point, weight: float, lens: Lens, half: float) -> Entry:
 
 
 def _largest_slope(source: Point, lens: Lens) -> float:
-    """Return the largest slope of a ray from a point source to the lens."""
     field, (x, y, z) = window(source, lens), source.position
     return max(field.width / 2 + abs(x), field.height / 2 + abs(y)) / abs(lens.entrance.z - z)
 

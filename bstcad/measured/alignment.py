@@ -36,10 +36,10 @@ MAX_OUTLIER_ROUNDS = 6  # maximum number of rounds of outlier rejection
 STEP_TOLERANCE = 1e-10  # largest component (mm at the rim) of a step that ends the iteration
 FOOT_ITERATIONS = 3  # iterations for the foot of a perpendicular; each multiplies the error by distance x curvature
 INDEPENDENT_PATCHES = 100  # assumed number of patches of a face with independent form errors
-SCALE_PATCHES = 16  # assumed number of independent patches of form errors that resemble a scale error, as power does
+SCALE_PATCHES = 16  # assumed number of independent patches of form errors that resemble a scale error: errors of power
 MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty of a motion due to form errors / BackFace.reach, above which it stays zero
 MIN_SENSITIVITY = 1e-7  # smallest RMS change of the distances per motion (mm/mm); smaller ones are rounding errors
-RIM_MARGIN = 2e-3  # width, in half widths, of the rim that is ignored: points there may lie on the edge
+RIM_MARGIN = 2e-3  # width of the ignored strip along the rim, whose points may lie on the edge / half width of the face
 FACE_DISTANCE_FRACTION = 0.25  # largest distance along z of a point from the face / smallest thickness of the lens
 MOTION_NAMES = ("shift in x", "shift in y", "shift in z", "rotation about x", "rotation about y", "rotation about z")
 
@@ -149,7 +149,8 @@ class Alignment:
 def align(face: BackFace, cloud: np.ndarray, start: Pose) -> Alignment:
     """Align a cloud (n, 3) in mm with a face by least squares, with equal weights and without outliers.
 
-    start: a pose near the solution.  Outliers are sought there, and again among points that come onto the face later.
+    start: a pose near the solution, at which outliers are sought.  After each alignment, they are sought again: among
+    all points if there were any, else among points that have come onto the face.
     """
     pose, noise = start, None
     judged, out = np.zeros((2, len(cloud)), dtype=bool)
@@ -203,7 +204,7 @@ def gauss_newton_step(
 
 
 def _face_points(face: BackFace, cloud: np.ndarray, pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the points of the face, and masks of the cloud's points that are inside the outline, and near the face."""
+    """Return (points (n, 3) of the face; masks of the cloud's points: inside the outline; near the face)."""
     points = pose.to_design(cloud)
     inside, near = face.contains(points), np.abs(face.height(points)) <= face.max_distance
     chosen = points[inside & near]
@@ -224,7 +225,7 @@ def _undetermined(motions: np.ndarray) -> tuple[str, ...]:
 
 
 def scale(face: BackFace, alignment: Alignment) -> tuple[float, float]:
-    """Return the scale of the cloud relative to the design, fitted as a seventh parameter, and its uncertainty."""
+    """Return (scale of the cloud relative to the design, fitted as a seventh parameter; its standard uncertainty)."""
     growth = np.einsum("ij,ij->i", alignment.points - face.pivot, alignment.normals)
     columns = face.columns(alignment.points, alignment.normals) @ alignment.motions
     both = np.stack([growth, alignment.distances], axis=1)

@@ -27,16 +27,16 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import sag, sampled
 
 POLYNOMIAL_DEGREE = 2  # degree of the polynomial in x and y
-NET_MARGIN = 0.2  # margin of the field's net around the lens's / side of the lens's: cosines end with zero slope
+NET_MARGIN = 0.2  # margin (at each end) of the field's net / side of the lens's net; there cosines end with zero slope
 POINTS_PER_NET_CELL = 6.0  # mean number of measured points in a cell of the field's net
 FIELD_NET_LIMITS = (9, 513)  # limits of the field's control points per side, before they are rounded up for the FFT
-MAX_REFINEMENT = 4  # refinement factor per side of a lens's net to which a finer field is added; nets are not nested
+MAX_REFINEMENT = 4  # refinement per side of a lens's net to which a finer field is added: the two nets are not nested
 BANDS_PER_OCTAVE = 4  # number of bands of the spectrum per octave of frequency
 SPECTRUM_ROUNDS = 8  # number of alternating estimates of field and spectrum
 FIRST_MOTION_ROUND = 3  # round, from 0, in which the motion is fitted; the spectrum is then good enough to weight it
 MAX_FIELD_STEPS, FIELD_TOLERANCE = 30, 1e-4  # maximum steps of conjugate gradients, and their relative tolerance
 DETECTION_SIGMAS = 3.0  # excess over noise, in standard deviations, at which a band of frequencies contains form
-UNDETECTED_VARIANCE = 1e-4  # variance of the form in a band without detected form, relative to the noise
+UNDETECTED_VARIANCE = 1e-4  # variance of the form / variance of the noise, in a band without detected form
 MAX_RELIEF_UNCERTAINTY = 0.001  # uncertainty of a motion fitted to fine relief / BackFace.reach, above which it is zero
 EXTRAPOLATION_BANDS = 6  # number of bands from which the spectrum is extrapolated below the noise
 MIN_NOISE_RATIO = 1e-3  # lower bound of the noise relative to the RMS deviation
@@ -232,7 +232,7 @@ def _gram_symbol(m: int) -> np.ndarray:
 
 
 def _bands(frequency: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return the band (a quarter octave) of each cosine, and the number of bands that are not empty."""
+    """Return the number, from 0, of each cosine's band (a quarter octave), and how many bands are not empty."""
     least = frequency[frequency > 0].min()
     quarters = np.floor(BANDS_PER_OCTAVE * np.log2(np.maximum(frequency, least) / least)).astype(int)
     _, packed = np.unique(quarters, return_inverse=True)

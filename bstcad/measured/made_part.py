@@ -23,7 +23,7 @@ from bstcad.verify.verdict import Check
 
 MAX_RMS_DISTANCE = 3e-3  # RMS distance after alignment / BackFace.reach, above which a part is of another design
 MIN_RELIEF = 0.5  # fine relief, as a fraction of the design's, below which a part is of another design
-COARSE_DEGREE = 4  # degree of the polynomial removed from relief, which is similar in lenses of equal power
+COARSE_DEGREE = 4  # degree of the polynomial removed from relief, as lenses of equal power have similar polynomials
 MIN_DESIGN_RELIEF = 3e-5  # RMS fine relief of a design / BackFace.reach, below which a part is not judged by relief
 SCALE_TOLERANCE = 2e-4  # relative tolerance of the scale, about the size of a thermal expansion
 SCALE_SIGMAS = 3.0  # tolerance of the scale, in standard uncertainties, if larger than SCALE_TOLERANCE
@@ -82,7 +82,7 @@ def _cloud_checks(
 ) -> Iterator[Check]:
     """Check that a cloud is in mm and has the design's axes, and that it is of this face, complete, clean and in place.
 
-    axes: exchange of axes that the cloud needs, in words; scale: scale and its uncertainty; decentre: limit (mm).
+    axes: exchange of axes that the cloud needs, in words; scale: (scale, uncertainty); decentre: accept.decentre (mm).
     """
     extent = f"its extent fits the lens if its unit is {cloud.unit}"
     yield Check.true("made part: the cloud is in mm", cloud.unit == "mm", extent, id="made-unit")
@@ -93,7 +93,7 @@ def _cloud_checks(
     name, where = "made part: fraction of outliers among the points of the face", "clean the part and measure it again"
     yield Check.at_most(name, alignment.outlier_fraction, MAX_OUTLIER_FRACTION, where=where, id="made-outliers")
     (factor, uncertainty), name = scale, "made part: error of the scale of the cloud"
-    limit, where = max(SCALE_TOLERANCE, SCALE_SIGMAS * uncertainty), f"the cloud is {factor:.5f} times the design"
+    limit, where = max(SCALE_TOLERANCE, SCALE_SIGMAS * uncertainty), f"size of cloud / design: {factor:.5f}"
     yield Check.at_most(name, abs(factor - 1), limit, where=where, id="made-scale")
     x, y, _ = alignment.pose.shift
     name, where = "made part: decentre in the frame of the cloud", f"x {x:+.4g} mm, y {y:+.4g} mm"
@@ -101,7 +101,7 @@ def _cloud_checks(
 
 
 def _light_checks(nominal: Nominal, lights: Sequence[tuple[Light, float]]) -> Iterator[Check]:
-    """Check the RRMSD on each target; lights: light, and RRMSD with the uncertainty of the form."""
+    """Check the RRMSD on each target; lights: light on it, and RRMSD with the uncertainty of the form."""
     for goal, (light, high) in zip(nominal.goals, lights, strict=True):
         name = f"made part: RRMSD predicted{goal.suffix}"
         yield Check.at_most(name, light.rrmsd, nominal.scene.accept.rrmsd, id="made-rrmsd")
@@ -153,7 +153,7 @@ def _identity_checks(face: BackFace, alignment: Alignment) -> tuple[Check, Check
 
 
 def _relief(face: BackFace, points: np.ndarray) -> float | None:
-    """Return the fine relief of the made face relative to the design, by regression; None if the design has none."""
+    """Return the ratio of fine relief, made face to design, by regression; None if the design has none."""
     points = points[np.random.default_rng(0).permutation(len(points))[:RELIEF_POINTS]]
     x, y = (points[:, :2] / face.reach).T
     columns = np.stack([x**i * y**j for i in range(COARSE_DEGREE + 1) for j in range(COARSE_DEGREE + 1 - i)], axis=1)

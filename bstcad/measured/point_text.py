@@ -43,7 +43,7 @@ NO_DATA = (
 NON_NUMERIC = re.compile(r"[a-df-zA-DF-Z#*]|-(?![\d.])")  # character that no plain number contains
 NO_DATA_FIELD = re.compile(rf"(?<![^\s,;\"])(?:{NO_DATA})(?![^\s,;\"])", re.IGNORECASE)
 NUMBER_WITH_COMMA = r"[+-]?\d*,\d+(?:[eEdD][+-]?\d+)?"
-EMPTY_FIELD = re.compile(r';[ ]*[;\n]|"[ ]*"|^[ ]*(?=;)', re.MULTILINE)  # empty field or quotes
+EMPTY_FIELD = re.compile(r';[ ]*[;\n]|"[ ]*"|^[ ]*(?=;)', re.MULTILINE)  # empty field, or empty quotes
 FORTRAN_EXPONENT = re.compile(r"(?<=[\d.])[dD](?=[+-]?\d)")  # exponent letter of 1.0D-03
 QUOTED_COMMA = re.compile(r'"\s*([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)\s*"')
 
@@ -58,7 +58,7 @@ class MeasuredPoints:
 
 
 def make_points(positions: np.ndarray, where: Sequence[int] | None = None, columns: str = "") -> MeasuredPoints:
-    """Return the points with data; ValueError for a coordinate above MAX_POSITION; where: line number of each point."""
+    """Return the points without NaN; ValueError for a coordinate above MAX_POSITION; where: their line numbers."""
     missing = np.isnan(positions).any(axis=1)
     excessive = ~(np.abs(positions) <= MAX_POSITION) & ~np.isnan(positions)
     if excessive.any():
@@ -207,7 +207,7 @@ def _table(lines: list[tuple[int, str]], layout: _Layout, columns: Sequence[int]
             if layout.separator is not None:
                 fields += ["nan"] * (line.count(layout.separator) + 1 - len(fields))
             if len(fields) <= max(columns) or any(_number(fields[column]) is None for column in columns):
-                raise ValueError(f"line {number} is not three numbers ({line[:40]!r}); {INPUT_HINT}") from None
+                raise ValueError(f"line {number} lacks a number for x, y or z ({line[:40]!r}); {INPUT_HINT}") from None
         raise ValueError(f"is not a table of numbers from line {lines[0][0]} on; {INPUT_HINT}") from None
 
 

@@ -53,7 +53,7 @@ def parameter(u: Tensor, m: int) -> Tensor:
 
 
 def span(u: Tensor, m: int) -> tuple[Tensor, Tensor]:
-    """Return (k, s) with t(u) = k + s: number k of the span, and position s in it, which has more digits than t."""
+    """Return (k, s) with t(u) = k + s: number k of the span, and position s in it, more accurate than t(u) - k."""
     first, last = u < 1.5, u > m - 2.5
     end = torch.where(first, u, m - 1 - u)  # distance from the nearer end
     root = torch.sqrt(4.0 - 2.0 * torch.where(first | last, end, torch.ones_like(u)))  # guarded before the root

@@ -69,7 +69,7 @@ EVEN_POINT_PAIRS = 2048  # number of pairs of points that represent a uniformly 
 class Effort:
     """Limits of the work of a measurement; the default is the effort of a verification."""
 
-    rays: int = 2896  # maximum rays per side of the window, in each of SETS sets of a pass: 67 million per line
+    rays: int = 2896  # maximum rays per side in each of SETS sets that are traced together: 67 million rays per line
     seed: int = 0  # seed of the rays
     places: int = 1025  # points per side of the lens at which a verification evaluates the thickness
     points: int = 1 << 17  # points per face at which the written file is compared with the design
@@ -116,7 +116,7 @@ class Light:
 
     @property
     def used(self) -> float:
-        """Return the flux on the target as a fraction of the flux that meets the lens, but not its underside."""
+        """Return the flux on the target as a fraction of the flux that meets the lens without its underside."""
         enters = 1 - self.flux["missed the lens"] - self.flux.get(UNDERSIDE, 0.0)
         return self.flux["on target"] / enters if enters > 0 else 0.0
 
@@ -310,7 +310,7 @@ def _smoothed(pictures: Sequence[Tensor], target: Tensor) -> tuple[Tensor, float
 
 
 def _sample(setup: _Setup, effort: Effort, max_noise: float = math.inf) -> _Rays:
-    """Trace rays, at most `effort.rays` per side, until the standard error is `effort.accuracy` times the RRMSD.
+    """Trace passes of up to `effort.rays` rays per side until the standard error is `effort.accuracy` times the RRMSD.
 
     The noise of the mean picture, which falls as n^-3/2 with n rays per side, must also be below `max_noise` times
     RRMSD.  The standard error falls as n^-3 where products of noise dominate (the variance of a pixel of n² stratified
@@ -343,7 +343,7 @@ def _sample(setup: _Setup, effort: Effort, max_noise: float = math.inf) -> _Rays
 
 
 def _sample_source(setup: _Setup, effort: Effort, max_noise: float) -> _Rays:
-    """Trace rays to the limits of `_sample`, in each set from new points of an extended source.
+    """Trace rays to the accuracy of `_sample`, at most `effort.rays`² per set and line, with new source points per set.
 
     Each pixel gets few rays from each of many points: with n rays per side its variance falls as n^-2, as for random
     rays.  The error of the RRMSD falls as n^-2, or faster where more rays come from more points (measured: n^-2.6).
@@ -563,7 +563,7 @@ def detail_width(source_image: float, pixel: float) -> float:
 
 @torch.no_grad()
 def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMAGE_POINTS_PER_SIDE) -> ImageSamples:
-    """Return the source's images in the first spectral line through the lit cells of an n x n grid on the back."""
+    """Return the source's images, in light of the first line, through the lit cells of an n x n grid on the back."""
     first = channels[0]
     channels = [c for c in channels if (c.source.wavelength, c.index) == (first.source.wavelength, first.index)]
     pixel, flux = landing_pixels(channels, lens, screen, n)

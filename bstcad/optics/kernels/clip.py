@@ -143,7 +143,7 @@ def _add_piece(sums, i, j, share, middle):
 
 @inlined
 def add_edge(sums, a, b, density):
-    """Add ∫ clip(j + 1 - y, 0, 1) dx along an edge, times a density, to sums (columns, rows + 1)."""
+    """Add an edge's density · ∫ clip(j + 1 - y, 0, 1) dx to sums (columns, rows + 1), as differences down the rows."""
     if density == 0.0:
         return
     if a[4] | b[4] == ON:
