@@ -1,8 +1,8 @@
 """Run designs in new processes (cold runs), measure their time and error, calibrate this machine, and store records.
 
 A run designs a base scene with changed settings.  Its time is the time of the whole command: imports, picture,
-tailoring, writing and verification.  The RRMSD of every lens is measured with stratified rays on the pixels of the base
-scene (the reference).  The calibration kernel is a fixed computation whose time shows a machine's speed.
+tailoring, writing and verification.  The reference is a measurement of the RRMSD of every lens with stratified rays, on
+the pixels of the base scene.  The calibration kernel is a fixed computation whose time shows a machine's speed.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ Record = TypeVar("Record", bound=StoredRecord)
 
 
 def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
-    """Read a record of class `kind`; raise MachineError, which ends with `remedy`, if the file is not such a record."""
+    """Read a record of class `kind`; if the file is no such record, raise MachineError, which ends with `remedy`."""
     try:
         return kind.model_validate_json(files.contents(path, MAX_RECORD_SIZE))
     except ValueError:  # pydantic's errors are ValueErrors
@@ -122,7 +122,7 @@ class LocalPool:
         self._threads.shutdown(cancel_futures=True)
 
     def start(self, key: Any, work: Callable[..., Any], *arguments: Any) -> None:
-        """Start work(*arguments, tick) in a thread; `work` must call `tick` regularly.  key: stated in the answer."""
+        """Start work(*arguments, tick) in a thread; `work` must call `tick` regularly.  key: returned in the answer."""
         self._keys[self._threads.submit(work, *arguments, self._tick)] = key
 
     def next(self, tick: Tick) -> Answer:
@@ -213,7 +213,7 @@ class HistoryPoint(TypedDict):
 
 
 class ColdRun(StoredRecord):
-    """Result of one run; times are in seconds on the machine of the run, and null if it was not run."""
+    """Result of one run; times are in seconds on the machine of the run, and null if the run was not done."""
 
     settings: StoredSettings  # changes relative to the base scene
     status: str  # "done", "failed" or "not run: budget"
@@ -245,7 +245,7 @@ class ColdRun(StoredRecord):
 
     @property
     def done(self) -> bool:
-        """True if the run gave a lens."""
+        """True if the run gave a lens that lights every target."""
         return self.status == DONE
 
     @property
@@ -263,7 +263,7 @@ class ColdRun(StoredRecord):
 def run_and_judge(
     contents: SceneFiles, point: Settings, limit: float, effort: Effort, tick: Tick = lambda: None
 ) -> ColdRun:
-    """Design a scene (`contents`) with settings `point` in at most `limit` s; measure time, and RRMSD with `effort`."""
+    """Design the scene `contents` with settings `point` in at most `limit` s; measure the lens's RRMSD (`effort`)."""
     start = time.perf_counter()
     unit = min(measure_seconds(calibration_kernel()) for _ in range(KERNEL_REPEATS))
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
@@ -314,7 +314,7 @@ def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick:
 
 
 def judge_run(run: ColdRun, base: Scene, folder: Path, effort: Effort) -> ColdRun:
-    """Return the run with the largest RRMSD of the lens in `folder` on any target of `base`, measured with `effort`."""
+    """Return `run` with the RRMSD of its lens in `folder`, measured with `effort`: the largest on targets of `base`."""
     lens, channels = read_nominal(folder)[1].lens, base.verification_channels()
     lights = [measure_goal(lens, channels, goal, effort, ghost=base.ghost, draw=base.draw) for goal in base.goals]
     if not all(light.rrmsd >= 0 for light in lights):

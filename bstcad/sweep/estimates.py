@@ -75,7 +75,7 @@ def _downsample(picture: np.ndarray, limit: int) -> np.ndarray:
 
 
 def _central_channel(scene: Scene, *more: Effect) -> Channel:
-    """Return the channel of the source's centre at its main wavelength; losses: by the scene's effects and `more`."""
+    """Return the central channel of the source at its main wavelength; losses: by the scene's effects and `more`."""
     source = scene.source.central
     loss_factors = losses((*scene.effects, *more), scene.lens, source.main_wavelength)
     return Channel(source, scene.index, losses=loss_factors, around=scene.around(source.main_wavelength))
@@ -90,9 +90,9 @@ DEFAULT_DIAMETER = 0.1  # assumed diameter of a point source, mm
 DEFAULT_DIVERGENCE = 0.1  # assumed divergence of parallel light, degrees
 # Assumed sizes for each Emitter.size_key: (size, shape, unit).
 DEFAULT_SIZES = {"diameter": (DEFAULT_DIAMETER, "disc", "mm"), "divergence": (DEFAULT_DIVERGENCE, "cone", "degrees")}
-LINE_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # band: points (offset / half width, weight)
+LINE_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # (offset / half width of the band, weight)
 DISC_POINTS = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # points (x, y, weight) in the unit disc
-FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"  # lines of scenes
+FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"  # TOML for scenes
 
 
 def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ...]:
@@ -165,7 +165,7 @@ def _dispersion(scene: Scene, reference: Reference) -> LeftOut:
 
 
 def band(scene: Scene) -> tuple[float, float]:
-    """Return the band (low, high) in nm of a single wavelength: VISIBLE_BAND for sunlight, else LINE_WIDTH wide."""
+    """Return the band (low, high) in nm assumed for a single wavelength: VISIBLE_BAND for sunlight, else LINE_WIDTH."""
     source = scene.source
     if isinstance(source, Collimated):
         divergence = source.divergence or source.real_divergence or 0.0

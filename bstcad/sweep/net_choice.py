@@ -103,7 +103,7 @@ class Choice:
 
 
 def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
-    """Return the scene with a net, and its choice (None: the scene states a net); SceneError: no light on the back."""
+    """Return the scene with a net, and its Choice (None: the scene states it); raise SceneError for an unlit back."""
     if scene.lens.back.control_points is not None:
         return scene, None
     levels = scene.tailoring.levels
@@ -179,7 +179,7 @@ def seam_shift(scene: Scene) -> float:
     """Return the distance (pixels) on the target between light from the two ends of a cell in the narrowest valley.
 
     It is p L D / R, with the width p of a cell, the throw L, the tool radius R, and the ratio D of deflection to slope
-    (Passes.deflection); infinite without R.  At a seam, where light separates, the tool limits the valley's width.
+    (Passes.deflection); infinite without R.  At a seam, where light separates, a valley is as narrow as R allows.
     """
     radius, target = scene.lens.tool_radius, scene.target
     if radius is None:

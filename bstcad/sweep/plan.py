@@ -45,7 +45,7 @@ def plan(scene: Scene, text: str = "", keys: Sequence[str] = (), tick: Tick = la
 
     caveat: sentence that states how the lens of the estimates differs from the scene's; only if it differs.
 
-    verdict: {kind, sentence}; yielded with the effects if they determine the verdict, see `verdict`.
+    verdict: {kind, sentence}, see `verdict`; yielded with the predictions, and with effects that determine the verdict.
 
     text: text of the scene file, for line numbers.  keys: keys that --set sets.  tick: called regularly, may raise.
     """
@@ -131,7 +131,7 @@ def reach_drawn(scene: Scene) -> tuple[bytes, ...]:
 
 
 def _request_of(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[str, Any]:
-    """Return {line, asked_by} for a key: its line by `at` (None: --set or a default), and words for a table."""
+    """Return {line, asked_by} for a key: its line by `at` (None: default or one of `keys`), and what sets it."""
     for other in keys:
         if other == key or key.startswith(f"{other}.") or other.startswith(f"{key}."):
             return {"line": None, "asked_by": f"--set {other}"}

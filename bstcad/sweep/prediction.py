@@ -37,7 +37,7 @@ from bstcad.tailoring.stage2 import round_shares, sheet_sizes, stage3_sheet_size
 Interval = tuple[float, float, float]  # (low, likely, high); nine of ten designs lie between low and high
 QUALITIES = ("draft", "standard", "fine")  # qualities with a prediction
 PILOT_QUALITIES = ("draft", "standard")  # qualities with a pilot; "fine" uses the pilot of "standard"
-INTERVAL_FACTORS = {"seconds": 1.5, "rrmsd": 1.5, "memory_gb": 1.25}  # factors within which nine of ten designs lie
+INTERVAL_FACTORS = {"seconds": 1.5, "rrmsd": 1.5, "memory_gb": 1.25}  # high / likely and likely / low of intervals
 
 # --- the pilot --------------------------------------------------------------------------------------------------------
 
@@ -131,7 +131,7 @@ def replace_net(scene: Scene, net: Sides, changes: Mapping[str, object] = {}) ->
 
 
 def detail(picture: np.ndarray, pixels: int) -> float:
-    """Return the RMS of a picture's cosines with more than `pixels` half waves on the longer side / RMS of them all."""
+    """Return the RMS of a picture's cosines with more than `pixels` half waves on the longer side / RMS of all."""
     from scipy.fft import dctn
 
     energy = dctn(picture, norm="ortho") ** 2
@@ -140,7 +140,7 @@ def detail(picture: np.ndarray, pixels: int) -> float:
 
 
 def blur_rrmsd(scene: Scene, lens: Lens) -> float:
-    """Return the RRMSD of the target convolved with the image of an extended source; 0 for a point."""
+    """Return the RRMSD of the target convolved with the image of an extended source; 0 without extent or light."""
     image = blur(scene.channels(), lens, scene.target.screen, scene.target.irradiance())
     return 0.0 if image is None else image.rrmsd
 
@@ -196,7 +196,7 @@ FRONT_SECONDS = 1.7  # time of the search for the free parameters of a front
 EVALUATION_SECONDS, VARIABLE_SECONDS, BLUR_SECONDS = 0.11, 0.046, 0.30  # time of the tubes, net, blur in an evaluation
 CALL_SECONDS = 0.01  # time in an evaluation that is independent of sizes
 IMAGE_SECONDS = 0.7  # time in a round for the images of an extended source
-ADAM_SECONDS = 0.1  # time of a step of the paper's procedure
+ADAM_SECONDS = 0.1  # time of a step of Wang et al.'s procedure
 START_SECONDS = 2.8  # time of the imports and of the end of the process
 WRITE_SECONDS, NET_SECONDS, PICTURE_SECONDS = 1.5, 2.4, 1.1  # time of the proof: constant part, net, pixels
 MOUNT_SECONDS = 2.5  # time of cutting and verifying the mounted part

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 # --- the table --------------------------------------------------------------------------------------------------------
 
-MIN_FRONT_RUNS = 3  # smallest number of runs on a front to which a power law is fitted
+MIN_FRONT_RUNS = 3  # smallest number of runs on a Pareto front to which a power law is fitted
 TRADEOFF_COLUMNS = (
     "knobs", "settings", "status", "seconds", "cpu_seconds", "kernel_seconds", "units", "rrmsd", "rrmsd_noise",
     "rrmsd_reported", "peak_memory_gb", "on_front", "predicted_seconds", "cost_seconds", "where", "reason",
@@ -138,7 +138,7 @@ class TradeoffTable(StoredRecord):
 
     @property
     def failed(self) -> list[ColdRun]:
-        """Runs that ended without a lens."""
+        """Runs that gave no lens, or one that leaves a target dark."""
         return [run for run in self.runs if run.status == FAILED]
 
     @property
@@ -202,7 +202,7 @@ KNOB_STYLES = {
 FIGURE_WIDTH, FIGURE_HEIGHT = 10.0, 7.4  # inches
 AXIS_MARGIN = 1.25  # factor between the outermost points and the ends of the axes
 MAX_FLOOR_DISTANCE = 6.0  # largest factor by which standard errors extend the RRMSD axis downwards
-DARK_RRMSD = 1.0  # RRMSD of a dark picture; axes do not extend to larger RRMSDs
+DARK_RRMSD = 1.0  # RRMSD of a dark picture; only runs below it extend the axes, unless there are none
 THIN_LINE: dict[str, Any] = {"lw": 0.9, "zorder": 1}  # style of the lines of the convergence and the standard error
 FRONT_STYLE: dict[str, Any] = {"color": "#f0c80073", "lw": 5.5, "solid_joinstyle": "round", "solid_capstyle": "round"}
 RING_STYLE: dict[str, Any] = {"marker": "o", "ms": 18, "mfc": "none", "mec": "#a87c00", "mew": 1.6}  # runs of the front
@@ -287,7 +287,7 @@ def draw_legend(axes: Axes) -> None:
 
 # --- the page and the terminal ----------------------------------------------------------------------------------------
 
-VERDICT_STYLES = {"pass": "bold green", "remarks": "bold yellow", "fail": "bold red"}  # CSS class: terminal style
+VERDICT_STYLES = {"pass": "bold green", "remarks": "bold yellow", "fail": "bold red"}  # terminal styles, by CSS class
 PAGE_TEMPLATE = Path(__file__).with_name("tradeoff.html.j2")
 
 

@@ -44,7 +44,7 @@ GRID_LIMITS = (32, 2048)  # minimum and maximum transport cells per side
 PIXEL_LIMITS = (8, 4096)  # minimum and maximum pixels per side
 COUNT_LIMITS = (1, 16_384)  # minimum and maximum of all other varied numbers
 ROUND_COUNTS = (1, 2, 3, 5, 8)  # numbers of rounds of transport and slope fit in stage 1
-ADAM_FRACTIONS = (1 / 8, 1 / 4, 1 / 2, 1.0)  # numbers of steps of Wang et al.'s procedure / those in the preset paper
+ADAM_FRACTIONS = (1 / 8, 1 / 4, 1 / 2, 1.0)  # steps of Wang et al.'s procedure / steps in the preset paper
 
 Points = Mapping[str, Settings]  # settings by label ("768"), in the order of increasing work
 
@@ -109,7 +109,7 @@ def knobs(scene: Scene) -> tuple[Knob, ...]:
 
 
 def _allows_paper(scene: Scene) -> bool:
-    """Return True if the paper's procedure can design the scene: one picture, one tailored face, no bounds on it."""
+    """Return True if the preset paper can design the scene: one picture, one tailored face, no bounds on this face."""
     return _is_allowed(scene, {"tailoring.quality": "paper"})
 
 
@@ -380,7 +380,7 @@ JUDGING_SECONDS = 2.0  # time to measure a lens's RRMSD with the reference (s)
 
 
 def predicted_work(scene: Scene, point: Settings) -> tuple[bool, float]:
-    """Return (True for the paper's procedure, seconds at pace 1); for a refused run, the time to start and judge."""
+    """Return (True for Wang et al.'s procedure, seconds at pace 1); for a refused run, the time to start and judge."""
     try:
         changed = scene.changed(dict(point))
     except SceneError:

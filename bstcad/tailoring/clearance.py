@@ -26,7 +26,7 @@ from bstcad.optics.outlines import inside
 from bstcad.optics.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 
-PENALTY_MARGIN = 0.01  # relative distance from a bound where the penalty begins (thickness: distance / unit of excess)
+PENALTY_MARGIN = 0.01  # relative distance before a bound at which its penalty begins (thickness: distance / `unit`)
 QUARTER_RIM_POINTS = 1025  # number of points along a quarter of the rim
 CELL_POINTS = 4  # control points per axis on which a cell may depend: it lies in at most two knot spans
 TILE_CELLS = 16  # number of cells per axis in a tile
@@ -34,7 +34,7 @@ CELL_ROUNDING = 1e-9  # allowance in the number of cells per axis, so that round
 
 
 def unit(lens: Lens, bounds: Bounds) -> float:
-    """Return max(thinnest, PENALTY_MARGIN |z_back - z_front|) (mm), the unit of the excess in `clearance`; 1 if 0.
+    """Return max(thinnest, PENALTY_MARGIN |z_back - z_front|) (mm), unit of the excess in `clearance`; 1 instead of 0.
 
     The unit does not depend on the heights of the faces, and so does not contribute to the gradient.
     """
@@ -145,7 +145,7 @@ class CellGrid:
         return np.argwhere(near)
 
     def _at(self, cells: Sequence[Tensor], s: float) -> tuple[Tensor, Tensor]:
-        """Return x and y (mm) of the points at the fraction s of the width and height of each cell."""
+        """Return x and y (mm) at the fraction s of the width and height of each cell; cells: indices along x and y."""
         x, y = ((k + s) * size - half for k, size, half in zip(cells, self.size, self.half, strict=True))
         return x, y
 

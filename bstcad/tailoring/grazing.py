@@ -8,7 +8,7 @@ reachable part has one more term, which depends on the slopes of the face alone:
 
 θ is the angle of incidence, θ'_max the largest angle of refraction allowed (optics.reach.grazing_of), and η the index
 before the face / index behind it: u = 0 at θ'_max, and u = 1 at total internal reflection.  Within a knot span ∂z/∂x is
-linear in x and quadratic in y, and ∂z/∂y the reverse, so that at ends and centres of spans they are near the extremes.
+linear in x and quadratic in y, and ∂z/∂y the reverse; both are near their extremes at the ends and centres of spans.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ from bstcad.tailoring.slope_map import centroid, pixel_corners, resample_picture
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Points, Solver, grid_coordinates, solve
 
-MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds, before the last of max(transport grid / 4, 64)² cells
+MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds; all but the last: max(transport grid / 4, 64)² cells
 MAX_WAVE_ITERATIONS = 40  # largest number of iterations for the point of a wave that sends a ray to a given point
 WAVE_TOLERANCE = 1e-9  # change (mm) below which the iterations for a point of the wave have converged
 SOURCE_FLOOR = 0.02  # smallest irradiance of the picture where a map begins / its mean: black would leave holes
@@ -199,7 +199,7 @@ def light_of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength
             return LightBehind(place, direction.numpy(), picture)
     raise SceneError(
         f"wavefront.z: rays of the wave at z = {wave.z:g} mm cross before the target; move the wavefront's plane "
-        "nearer to the target, or make the coefficients smaller"
+        "nearer to the target, or make wavefront.coefficients smaller"
     )
 
 

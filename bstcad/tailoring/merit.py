@@ -140,7 +140,7 @@ class Merit:
 
     @cached_property
     def targets(self) -> tuple[Tensor, ...]:
-        """Target pictures (rows, columns), one per goal, on the light's device; a single picture has the sum 1."""
+        """Target pictures (rows, columns), one per goal, on the light's device; that of an only goal has the sum 1."""
         pictures = tuple(torch.from_numpy(goal.picture).to(self.light.sheets[0].flux.device) for goal in self.goals)
         return tuple(picture / total(picture) for picture in pictures) if self._is_one else pictures
 
@@ -362,7 +362,7 @@ def control_point_axes(net: BSplineSurface) -> tuple[Tensor, Tensor]:
 
 
 def _excess_leverage(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, on_screen: np.ndarray) -> np.ndarray | None:
-    """Return the leverage relative to MIN_LEVERAGE times its median (m, n), at least 1; None if it is 1 everywhere.
+    """Return leverage / (MIN_LEVERAGE times its median), raised to at least 1, (m, n); None if it is 1 everywhere.
 
     The leverage is the largest singular value of ∂t/∂p, the inverse of the smallest one of ∂p/∂t; p(b, t) are the
     slopes that send light from b (`at_net`) to the target point t (`aim`).  on_screen: mask (m, n) of counted points.

@@ -64,7 +64,7 @@ class Iterate:
 
 
 def minimise(problem: Objective, method: Method, evaluations: int, best: Best = Best()) -> Iterator[Iterate]:
-    """Answer the queries of a method until it ends or the evaluations are used up; yield the state after each.
+    """Answer the queries of a method until it ends or `evaluations` are used up; yield the state after each answer.
 
     An evaluation that is not finite is counted as skipped.  best: best evaluation of the run that the method resumes.
     evaluations: largest number of evaluations, including those that `best` counts.

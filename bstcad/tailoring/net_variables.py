@@ -74,7 +74,7 @@ class NetVariables:
 
 
 def _multiply(matrix: csr_array, t: Tensor, like: Tensor) -> Tensor:
-    """Return the product of `matrix` and t by scipy, whose single thread sums in a fixed order."""
+    """Return `matrix` times t, with shape and type of `like`, by scipy, whose single thread sums in a fixed order."""
     return torch.from_numpy(matrix @ t.cpu().double().numpy().reshape(-1)).reshape(like.shape).to(like)
 
 
@@ -83,7 +83,7 @@ def along_light(source: Emitter, lens: Lens, goals: Sequence[Goal]) -> tuple[csr
     """Return R and f for a lens with two nets.
 
     f is SCALE_FRACTION times the scale at which both blocks move the pictures equally far: the weighted RMS over the
-    goals k of d_k / m_k, divided by T / (n m_b); these are paraxial shifts per slope.  T is the thickness, d_k the
+    goals k of d_k / m_k, divided by T / (n m_b); both are paraxial shifts per slope.  T is the thickness, d_k the
     distance from the back to plane k, and m_b and m_k are the magnifications of b(q) and of picture k.
     """
     front, back = lens.nets

@@ -80,7 +80,7 @@ def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT
 
 
 def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
-    """Return the goal with at most `pixels` pixels on its longer side, means of the old ones (the sum decreases)."""
+    """Return the goal with at most `pixels` pixels on its longer side, each the mean of old ones; the sum decreases."""
     screen, picture = goal.receiver, goal.picture
     shrunk = max(1.0, max(screen.shape) / pixels)
     rows, columns = (max(round(n / shrunk), 1) for n in screen.shape)
@@ -110,7 +110,7 @@ def same_order(grid: FaceGrid, aims: Points) -> Points:
 
 
 def _inside(corners: Tensor, screen: Screen, few: Screen) -> np.ndarray:
-    """Return True (rows, columns) for pixels of `screen` with values >= 0 at all corners; corners: values for `few`."""
+    """Return True (rows, columns) for pixels of `screen` with values >= 0 at all corners; corners: those of `few`."""
     where = np.meshgrid(
         *(np.linspace(0, a, n + 1) for a, n in ((few.columns, screen.columns), (few.rows, screen.rows))), indexing="ij"
     )

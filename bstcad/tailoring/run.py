@@ -83,7 +83,7 @@ RRMSD_SECONDS = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
 # is estimated from products of two pictures (measure.py).  With n² stratified rays per picture its error varies as
 # (p / n)³ / p, so a target of p pixels per side needs (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays per side.
 STAGE_EFFORT, STAGE_EFFORT_PIXELS = Effort(rays=724, accuracy=0, witness=False), 512
-FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays for scenes with accuracy or bounds, and `better`
+FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays in scenes with accuracy or bounds, and in `better`
 FLUX_EFFORT = Effort(rays=128, accuracy=1.0, witness=False)  # rays for the flux on the target alone
 
 Progress = Callable[[str, int, int, str], None]  # called with stage, units done, units in total, text
@@ -221,7 +221,7 @@ class StageStep:
 
     @property
     def lens(self) -> Lens:
-        """Best lens so far."""
+        """Lens that `make` returns."""
         assert self.make is not None, "the stage has made no lens yet"
         return self.make()
 

@@ -107,7 +107,7 @@ def face_grid(source: Emitter, lens: Lens, window: Rectangle, cells: Sides) -> F
 
 
 def lit_window(source: Emitter, lens: Lens, n: int = 128) -> Rectangle:
-    """Return the lit rectangle of the last freeform face, with a margin; SceneError if no light meets this face."""
+    """Return the lit rectangle of the last freeform face, with a margin, found on n x n cells; SceneError if unlit."""
     half_x, half_y = lens.last_freeform.outline.half_extent
     grid = face_grid(source, lens, Rectangle(2 * half_x, 2 * half_y), n)
     lit = grid.density > 0

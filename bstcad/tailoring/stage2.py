@@ -116,7 +116,7 @@ class TubeRound:
     def run(
         self, problem: Problem, variables: NetVariables, position: SearchPosition, total: int, state: TubeSearch | None
     ) -> Iterator[tuple[Iterate, StageStep]]:
-        """Yield (iterate, step) of a minimisation from a lens or saved state, until the RRMSD falls to `goal_by_tubes`.
+        """Yield (iterate, step) of a search from a lens or state, until the RRMSD is `position.goal_by_tubes` or less.
 
         total: evaluations of all rounds.
         """
@@ -319,7 +319,7 @@ class Problem:
 
 
 def variables_of(task: Task, lens: Lens, pixels: int | None = None) -> NetVariables:
-    """Return the variables of stage 2 for all nets; pixels: cells on the longer side of coarser nets; None: without."""
+    """Return the variables of stage 2 for all nets; pixels: cells on a coarser net's longer side; None: no such net."""
     nets = lens.nets
     if pixels is not None:
         lens = lens.with_nets(net.refined(coarser(net.shape, pixels + 1)) for net in nets)
@@ -397,7 +397,7 @@ def with_stage3(before: Stage | None, task: Task, lens: Lens, state: Any = None)
 
 
 def stage3_rounds(task: Task) -> tuple[TubeRound, ...]:
-    """Return the rounds of stage 3, one per entry of SOURCE_SIZES."""
+    """Return the rounds of stage 3, one per entry of SOURCE_SIZES; in a preview, one round."""
     lights = [
         replace(task, channels=channels, sampled_sources=(), extended_sources=(source,))
         for channels, source in zip(task.sampled_sources, task.extended_sources, strict=True)

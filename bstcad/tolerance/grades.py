@@ -88,7 +88,7 @@ def graded_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[
 
 
 def base_grade(table: Sequence[Tolerance]) -> str:
-    """Return the grade of the errors that are not named in a graded table; "none" if these errors are zero."""
+    """Return the grade of the errors that a graded table does not name; "none" if these errors are zero."""
     return settings_of([entry for entry in table if entry.name is None], "")["grade"]
 
 

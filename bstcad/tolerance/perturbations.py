@@ -320,9 +320,9 @@ def _decentre_front(axis: int, setup: Setup, by: float) -> Setup:
 def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
     """Rotate the back by `by` degrees about an axis (0: x, 1: y) through its vertex v; all other parts stay fixed.
 
-    A point p = v + (x, y, ζ) of the rotated face was at v + q before, with q = Rᵀ (p - v).  In place of the
-    unrotated face of height h, its tangent plane at (x, y) is used: q_z = h - h(v) + ∇h · ((q_x, q_y) - (x, y)), linear
-    in ζ.  The error of this is curvature · (angle · sag)², 1 nm at a tenth of a degree.
+    A point p = v + (x, y, ζ) of the rotated face was at v + q before the rotation R, with q = Rᵀ (p - v).  In place of
+    the face of height h, its tangent plane at (x, y) is used: q_z = h - h(v) + ∇h · ((q_x, q_y) - (x, y)), linear in ζ.
+    The error of this is curvature · (angle · sag)², 1 nm at a tenth of a degree.
     """
     back = setup.lens.back_net
     turn = Motion.of(turn=_along(axis, by)).inverse.rotation.tolist()
@@ -444,7 +444,7 @@ def _require_resolution(surface: BSplineSurface, length: float, words: str) -> N
     if length < least:
         raise ValueError(
             f"{words} of {length:g} mm is too fine for {size_text(surface.shape)} control points, which can represent "
-            f"{least:.3g} mm or more; give a longer one, or raise control_points of this face"
+            f"{least:.3g} mm or more; give a longer one, or more control points if this face is a net"
         )
 
 

@@ -135,7 +135,7 @@ def _main_channel(setup: Setup) -> tuple[Emitter, Lens]:
     return channel.source, channel.through(setup.lens)
 
 
-TracedGoal = TargetPictures | Wavefronts  # `vector` is nearly linear in the amounts; its norm is the figure of merit
+TracedGoal = TargetPictures | Wavefronts  # both have a `vector` to superpose, whose norm is the figure of merit
 
 
 def traced_figure(goal: TracedGoal, amounts: Sequence[float]) -> float:
@@ -154,7 +154,7 @@ DERIVATIVE_STEP = 0.5  # step of the central difference for each perturbation, i
 # (index of the first principal direction with these nodes, nodes ξ in standard deviations).  A picture that moves by
 # more than its detail is not a polynomial of ξ, so strong directions need many nodes.
 SPLINE_NODES = ((0, (-3.0, -2.0, -1.2, -0.5, 0.5, 1.2, 2.0, 3.0)), (4, (-2.5, -1.0, 1.0, 2.5)), (8, (-1.0, 1.0)))
-NONLINEAR_DIRECTIONS = 12  # number of strongest directions with nodes; along weaker directions pictures are linear
+NONLINEAR_DIRECTIONS = 12  # largest number of directions with nodes, the strongest; pictures are linear along others
 MIN_STRENGTH = 1e-3  # change of the picture / change along the strongest direction, below which there are no nodes
 
 

@@ -89,7 +89,7 @@ def _overlaps(n: int, pixels: int, extent: float) -> csr_array:
 
 
 def _normalised(values: np.ndarray, cover: np.ndarray, floor: float, name: str) -> Density:
-    """Raise values to floor x (mean in the picture), then scale to mean 1; cover: part of each cell in the picture."""
+    """Raise values to at least floor x (mean in the picture), then scale to mean 1; cover: fraction of a cell in it."""
     if values.ndim != 2 or values.shape[0] != values.shape[1] or values.shape[0] < 4:
         raise ValueError(f"{name}: has the shape {values.shape}; give an n x n grid with n >= 4")
     _check_values(values, name)
@@ -138,7 +138,7 @@ def gradient_at_corners(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def resample_flux(flux: np.ndarray, x: np.ndarray, y: np.ndarray, n: int, parts: tuple[int, int]) -> np.ndarray:
-    """Return the flux (n, n) in the cells of a square from pixels with corners x, y (k + 1, l + 1), in cells.
+    """Return the flux (n, n) in the cells of a square from pixels with corners x, y (k + 1, l + 1) in cell units.
 
     The flux (k, l) of each pixel is divided into parts[0] x parts[1] equal parts, evenly spaced in the pixel; each part
     is divided among the four cells with the nearest centres.  Flux outside the square is added to the cell at the rim.

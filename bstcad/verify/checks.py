@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 VERTEX_ROUNDING = 2e-7  # largest distance of a float32 vertex from a sloped face, relative to the largest coordinate
 VERIFY_SEED = 1_000_003  # offset of the seed, for rays that tailoring has not used
-TARGET_TOLERANCE = 1e-3  # largest difference of the target in design.npz from the scene's / maximum (libraries change)
+TARGET_TOLERANCE = 1e-3  # largest change of the target since design.npz / brightest pixel: picture libraries change
 DEFAULT_RRMSD_LIMIT = 0.25  # limit of the RRMSD in remarks, plans and tolerance studies if accept.rrmsd is not set
 LINE_TUBES = 1031  # smallest number of tubes per side for the picture of one line of a spectrum
 CLEAR_APERTURE_TOLERANCE = 1e-3  # largest distance (mm) between the rims of measured and designed apertures

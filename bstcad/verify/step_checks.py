@@ -36,7 +36,7 @@ from bstcad.verify.text_checks import net_check
 from bstcad.verify.verdict import Check
 
 NORMAL_TOLERANCE = 1e-9  # largest angle (rad) between written and designed normals
-CURVATURE_TOLERANCE = 1e-12  # largest difference (1/mm) of written and designed curvature
+CURVATURE_TOLERANCE = 1e-12  # largest difference (1/mm) of written and designed curvature of the front
 CONIC_TOLERANCE = 1e-9  # largest difference of sag (mm) due to the conic constant, which a flat front hardly defines
 GAP_TOLERANCE = 5e-7  # largest gap (mm) at an edge or vertex, or between edge and face; shapes are exact to 1e-7 mm
 PART_EDGE_TOLERANCE = 1e-6  # largest distance (mm) between edges of part.step and of the scene's part, exact to 1e-7 mm

@@ -22,7 +22,7 @@ from bstcad.verify.verdict import Check
 SOURCE = "STEP text"  # source of the checked values, at the beginning of the checks' names
 NET_TOLERANCE = 1e-11  # absolute tolerance of control points (mm), larger than their rounding in the text
 RELATIVE_ROUNDING = 2e-15  # relative tolerance of coordinates, larger than NET_TOLERANCE beyond 5 m from the origin
-MEASURE_TOLERANCE = 1e-6  # tolerance of area and volume, relative, and of centroid / diagonal; integrals err by 1e-9
+MEASURE_TOLERANCE = 1e-6  # relative tolerance of area and volume, and of centroid / diagonal; integrals err by 1e-9
 VALUE_TOLERANCE = 1e-12  # absolute tolerance of stated numbers (mm or g/cm³), more than their rounding in the text
 
 Numbers = tuple[float, ...]
@@ -104,7 +104,7 @@ def _largest_difference(read: np.ndarray, designed: np.ndarray, name: str) -> tu
 def measure_checks(
     stated: ValidationProperties, shape: MassProperties | None, outline: Outline, name: str = SOURCE
 ) -> Iterator[Check]:
-    """Check stated measures against `shape`, found from the faces (None: none is stated); outline: size of the lens."""
+    """Check stated measures against `shape`, found from the faces (None: the file states none); outline: the lens's."""
     if stated.of_shape:
         assert shape is not None
         measures = ("area", "mm²", stated.areas, shape.area), ("volume", "mm³", stated.volumes, shape.volume)
@@ -166,7 +166,7 @@ def part_checks(text: StepText, part: Part, name: str = SOURCE) -> Iterator[Chec
 
 
 def _worst_value(values: Sequence[Numbers], own: Numbers, who: str, unit: str) -> tuple[float, str]:
-    """Return the largest error of values from `own` (infinite: unreadable), and a sentence; who: words before `own`."""
+    """Return how far values are from `own` at most (infinite: unreadable), and a sentence; who: words before `own`."""
     off = [math.dist(each, own) for each in values]
     worst, stated = max((math.inf if math.isnan(by) else by, each) for by, each in zip(off, values, strict=True))
     return worst, f"the file states {_words(stated, unit)}, but {who} {_words(own, unit)}"
