@@ -161,9 +161,9 @@ class Design:
 
         trim: closed plane cadquery.Wire inside the lens, to which the lens is cut; the z of the wire is ignored.
         holes: such wires, or (x, y, diameter) in mm.  Trim and holes only change the boundaries of the designed faces,
-        in a second; a boolean operation on a large net would take half a minute.  body: cadquery solid, such as a
-        flange, that is joined to the lens, see bstcad.mounted.  draft: angle (degrees) of the outer walls, which lean
-        inwards to the front, from at most 0.1 mm below the back's rim or from the body; walls of holes stay along z.
+        which takes a second; a boolean operation on a large net would take half a minute.  body: cadquery solid, such
+        as a flange, that is joined to the lens, see bstcad.mounted.  draft: angle (degrees) by which the outer walls
+        lean inwards to the front, from the body or from at most 0.1 mm below the back's rim; holes stay along z.
         bevel: height along z (mm) of a bevel at 45 degrees on the edge between walls and front.  SceneError if a wire
         is open, crosses itself or another wire, or leaves the lens, if the body does not fit, or if walls would meet.
         """
@@ -173,7 +173,7 @@ class Design:
         self, path: AnyPath, trim: Any = None, holes: Sequence[Any] = (), body: Any = None, *,
         draft: float = 0.0, bevel: float = 0.0,
     ) -> Path:  # fmt: skip
-        """Write what `solid` returns for these arguments as STEP, with names of faces and [part]; return the path.
+        """Write what `solid` returns as STEP, with names of faces and the scene's [part]; return the path.
 
         The control points have all digits; cadquery's own export would round them.  The file states area, volume and
         centroid, unless the body has a face that bstcad cannot integrate, such as a freeform face of another program.
@@ -282,8 +282,9 @@ class Design:
         """Study the tolerances of manufacture, mounting and source; write tolerance.json and return its entries.
 
         grade: "moulded", "diamond-turned" or "precise", for errors that no [[tolerance]] names; None: as in the scene.
-        wanted: yield (0 to 1) for which the loosest tolerances are computed.  workers: number of processes for the
-        traces (a script then needs `if __name__ == "__main__":`); scheduler: address of a dask scheduler instead.
+        wanted: yield (0 to 1) for which the loosest tolerances are computed.  seed: seed of the random trials.
+        workers: number of processes for the traces (a script then needs `if __name__ == "__main__":`); scheduler:
+        address of a dask scheduler instead.
         """
         from bstcad.tolerance.study import StudySettings  # loaded late, as in commands.tolerance
 

@@ -43,7 +43,7 @@ START_TIME = time.perf_counter()  # start of the times in reports, which include
 INTERRUPTED, INTERNAL_ERROR = 130, 70  # exit codes after Ctrl-C and after a fault of bstcad
 NOTHING_KEPT = "there was no lens yet, and nothing is kept"  # message of generate after Ctrl-C
 NOTHING_MORE = "nothing more is written"  # message of the other commands after Ctrl-C
-TERMINAL_INTERVAL, FILE_INTERVAL = 1.0, 30.0  # pauses (s) before a sweep repeats its progress: in a terminal, a file
+TERMINAL_INTERVAL, FILE_INTERVAL = 1.0, 30.0  # pause (s) before a sweep repeats a text: on a terminal, in a file
 EXPORT_NAMES = ", ".join(files.EXPORTS)
 COMMAND_SYNONYMS = {  # wrong word -> command to suggest
     **dict.fromkeys(("design", "make", "run", "build", "create", "optimise", "optimize"), "generate"),

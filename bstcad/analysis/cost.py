@@ -48,9 +48,9 @@ class ConvergenceEnd:
 
 
 def ending(history: History, stages: StageResults, since: float = 0.0) -> ConvergenceEnd | None:
-    """Return the end of a design's history; None if no stage tailored the irradiance.
+    """Return the end of a design's convergence curve; None if no stage tailored the irradiance.
 
-    stages: results of all stages; their RRMSDs by rays, which the history also contains, are left out.
+    history: points of the curve and, at the ends of the `stages`, RRMSDs by rays, which are left out.
     since: time (s) from the start at which tailoring began to use its final channels of light.
     """
     ends = np.cumsum([seconds for seconds, _ in stages])
@@ -72,10 +72,10 @@ def ending(history: History, stages: StageResults, since: float = 0.0) -> Conver
 def _last_points(
     seconds: np.ndarray, values: np.ndarray, ends: np.ndarray, since: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (time, values) of the points in the last FITTED_FRACTION of the time after `since`, within the last stage.
+    """Return (time, RRMSD) of the curve in the last FITTED_FRACTION of the time after `since`, within the last stage.
 
-    ends: end of each stage (s).  The time of each evaluation is replaced by the median of its stage, so that other work
-    of the machine has no effect.
+    seconds, values: the curve.  ends: end of each stage (s).  The duration of each evaluation is replaced by the median
+    in its stage, so that other work of the machine has no effect.
     """
     stage = np.searchsorted(ends, seconds)
     steps = np.zeros(len(seconds))
@@ -90,7 +90,7 @@ def _last_points(
 
 
 def _fit_power(time: np.ndarray, values: np.ndarray) -> tuple[float | None, float | None]:
-    """Fit values ∝ time^-p by least squares of the logarithms; return (p, R²)."""
+    """Fit values ∝ time^-p by least squares of the logarithms; return (p >= 0, R²), None for too few points."""
     if len(time) < MIN_FIT_POINTS:
         return None, None
     x, y = np.log(time), np.log(values)
@@ -108,7 +108,7 @@ TONE_QUANTILE = 0.1  # quantile of the irradiance below which a pixel is dark; b
 
 
 def remaining(picture: np.ndarray, target: np.ndarray, per_unit: tuple[float, float]) -> dict[str, Any]:
-    """Return the fractions of the squared error in parts of the target and in octaves of spatial frequency.
+    """Return the fractions of the squared error in "parts" of the target and in "octaves" of spatial frequency.
 
     picture, target: (rows, columns), of the same sum.  per_unit: pixels along x and y per unit of the receiver.
     parts: [{name: name in `masks`, error: fraction of the squared error, pixels: fraction of the target's pixels}].
@@ -124,11 +124,11 @@ def remaining(picture: np.ndarray, target: np.ndarray, per_unit: tuple[float, fl
 
 
 def masks(target: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the pixels (rows, columns) of each part; a pixel belongs to the first part whose condition it meets.
+    """Return a mask (rows, columns) of each part; a pixel belongs to the first part whose condition it meets.
 
     rim: a strip of at least one pixel along each side, as wide as 1/64 of the target.  edges: the tenth of all pixels
     with the largest gradient (central differences), if it is at least 0.02 per pixel, relative to the brightest pixel.
-    darkest, brightest: a tenth of all pixels each, more if pixels are equal.  rest: all others.
+    darkest, brightest: a tenth of all pixels each, more if pixels are equally bright.  rest: all others.
     """
     steep = np.hypot(*np.gradient(target))
     dark, bright = np.quantile(target, (TONE_QUANTILE, 1 - TONE_QUANTILE))
@@ -150,11 +150,11 @@ def _in_rim(side: int) -> np.ndarray:
 
 
 def _octaves(error: np.ndarray, per_unit: float) -> list[dict[str, Any]]:
-    """Return the energy of an error's cosine transform (orthonormal: Parseval) by octaves of frequency, coarse first.
+    """Return a record for each octave of an error's cosine transform (orthonormal: Parseval), coarse first.
 
-    frequency: lower and upper limit in cycles per pixel (the finest octave extends to 0.71, along the diagonals).
-    period: both limits as lengths on the target, the longer first, in the unit of `per_unit` (pixels per unit).
-    error: fraction of the squared error.  The mean is in no octave, as the two pictures have the same sum.  The cosine
+    "frequency": lower and upper limit in cycles per pixel (the finest octave extends to 0.71, along the diagonals).
+    "period": both limits as lengths on the target, the longer first, in the unit of `per_unit` (pixels per unit).
+    "error": fraction of the squared error.  The mean is in no octave, as both pictures have the same sum.  The cosine
     transform is not periodic, so a difference between opposite sides adds no high frequencies.
     """
     energy = dctn(error, norm="ortho") ** 2
@@ -181,9 +181,9 @@ MIN_UNLIT_FRACTION = 5e-3  # smallest reported unlit fraction, both of the lit a
 
 
 def unlit(target: np.ndarray, irradiance: np.ndarray, screen: Screen) -> dict[str, Any]:
-    """Return the fraction of the lit area that stays dark; {} if it, or that of the light, is below MIN_UNLIT_FRACTION.
+    """Return share and place of the lit area that stays dark; {} for less than MIN_UNLIT_FRACTION of area or light.
 
-    share: the fraction.  place: the ranges of x and y of the largest dark patch, as text.
+    share: fraction of the lit area.  place: the ranges of x and y of the largest dark patch, as text.
     """
     lit = target > DARK_LEVEL * target.mean()
     dark = lit & (irradiance < UNLIT_LEVEL * target)
@@ -204,7 +204,7 @@ def unlit(target: np.ndarray, irradiance: np.ndarray, screen: Screen) -> dict[st
 def lifted(target: np.ndarray, irradiance: np.ndarray) -> dict[str, float]:
     """Return how much light the dark parts of the target get: a smooth face cannot leave all of them dark.
 
-    light: excess over the target, as a fraction of all light.  level: their mean irradiance / mean of the whole target.
+    light: excess over the target, as a fraction of all light.  level: mean irradiance there / mean of the whole target.
     """
     dark = target < DARK_LEVEL * target.mean()
     light = float((irradiance - target)[dark].sum() / target.sum())

@@ -91,7 +91,7 @@ FULL_APERTURE = 0.99  # smallest ratio of the extent of the light to the clear a
 
 
 def needed_apertures(source: Emitter, lens: Lens) -> dict[str, Outline | None]:
-    """Return the clear aperture (mm) needed on each face: the smallest circle or rectangle with all light.
+    """Return the clear aperture (mm) needed on each face: the smallest centred circle or rectangle with all light.
 
     None: the light fills the clear aperture of the face.  Only light that passes all faces counts.  An extended source
     is represented by its centre and the ends of its extent.
@@ -135,8 +135,8 @@ def _aperture(hits: Tensor, aperture: Outline) -> Outline | None:
 def rrmsd_of_ripple(channel: Channel, lens: Lens, screen: Screen, face: Literal["front", "back"]) -> float:
     """Return the RRMSD between the pictures of a lens with and without the ripple of a face; 0 without a ripple.
 
-    channel: light of one point of the source.  The ripple that is removed (`Ripple.heights`) fades towards the rim; so
-    the RRMSD, which is proportional to small heights, is divided by `Ripple.fading`.
+    channel: light of one point of the source.  The ripple that is removed (`Ripple.heights`) fades towards the rim.
+    The RRMSD, which is proportional to the height of a small ripple, is therefore divided by `Ripple.fading`.
     """
     net = getattr(lens, face)
     waves = ripple(net)
@@ -186,7 +186,7 @@ def mount_losses(lens: Lens, channels: Sequence[Channel], flange: tuple[float, f
 def _misses_opening(rays: Sequence[Rays], rim: Outline, planes: Iterable[float]) -> Tensor:
     """Return True for rays that cross a plane z = const outside the rim, before the first face or behind the last.
 
-    rays: those before the solid, then those behind each of its faces.  planes: their z (mm).
+    rays: those before the solid, then those behind each of its faces.  planes: z (mm) of these planes.
     """
     first, (coming, *_, leaving) = rays[1], rays
     outside = torch.zeros_like(leaving.alive)
@@ -247,7 +247,7 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
 
 # --- blur by an extended source ---------------------------------------------------------------------------------------
 
-MIN_DISTANCE_RATIO = 2.5  # smallest suggested ratio of a target's distance to the longest side of lens and picture
+MIN_DISTANCE_RATIO = 2.5  # smallest suggested ratio of a target's distance to the longest side of lens or picture
 MAX_NEARER_RATIO = 0.9  # largest ratio of finest details, on a nearer target / on the target, that is reported
 
 
@@ -270,7 +270,7 @@ def blur(
 ) -> Blur | None:
     """Return the blur of the picture by the extent of the source, at the first spectral line of the channels.
 
-    n: points per side of the back for which images are computed.  None for a point source, and if no light passes.
+    n: points per side of the back for which images are computed.  Return None for a point source or if no light passes.
     """
     if points_per_line(channels) == 1:
         return None
@@ -288,7 +288,7 @@ class FinestDetail:
     w = √(D² + 4/3 p²), where D is the diameter of the image of the source and p the side of a pixel
     (optics.measure.detail_width).  D is proportional to the distance L from the lens to the target: D = 2 L
     tan(δ / 2) for collimated light of divergence δ through a thin plate, and D = d L / l for a source of diameter d at
-    the distance l before it.  At a distance L' it is D L' / L.  The resolution of the control net is not included.
+    the distance l before the plate.  At a distance L' it is D L' / L.  The resolution of the net is not included.
     """
 
     width: float  # width w of a point of the picture, in `unit`

@@ -39,7 +39,7 @@ from bstcad.optics.unfolding import per_radian
 
 FACE_POINTS = 64  # points per side of the last face from which light is traced
 GHOST_RAYS_PER_SIDE, GHOST_SMOOTHING = 128, 0.7  # rays per side for a ghost; standard deviation of its blur (cells)
-FIELD_CELLS = 24  # cells per side of the target, in which the fields are averaged
+FIELD_CELLS = 24  # largest number of cells per side of the target, in which the fields are averaged
 FIELD_SMOOTHING = (0.8, 2.0, 6.0, 24.0)  # standard deviations of the smoothing (cells), wider where light is scarce
 MIN_CELL_FLUX = 1e-4  # smoothed flux of a cell / mean, below which a field needs wider smoothing
 MIN_LIGHT_SHIFT = 1e-6  # largest shift that counts as zero (pixels)
@@ -266,7 +266,7 @@ def difference(changed: np.ndarray, before: np.ndarray) -> float:
 def _trace_through(
     lens: Lens, channel: Channel, screen: Screen, points: tuple[Tensor, Tensor]
 ) -> tuple[Landed, Tensor]:
-    """Trace light through a grid of points of the last face; return (rays of flux 1 before losses, flux per cell)."""
+    """Trace light through points of the last face; return (landed rays, of flux 1 before losses; flux per cell)."""
     lens, source = channel.through(lens), channel.source
     p, q, _ = rays_to(source, lens, *points)
     rays = source.rays(p, q, lens.entrance.z, 1.0)

@@ -88,7 +88,7 @@ def _sags(lens: Lens, x: Tensor, y: Tensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _points(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
-    """Return x and y (mm) of 4 n points of the rim, and of an n x n grid inside the outline."""
+    """Return x and y (mm) of 4 n points of the rim, and of the points of an n x n grid inside the outline."""
     x, y = (torch.cat(pair) for pair in zip(sample_rim(outline, n), inside(outline, n), strict=True))
     return x, y
 
@@ -129,7 +129,7 @@ def ripple(face: BSplineSurface) -> Ripple:
 
     The octaves are computed from the net minus its best cubic polynomial, times a Hann window (sin² from rim to rim).
     (Without the window the kink of a smooth net along its rim may give the highest octave some hundred µrad.)  With E
-    the slope energy of the highest octave and E' that of the octave below, that of the ripple is E - SMOOTH_RATIO E'.
+    the slope energy of the highest octave, E' that of the octave below, the ripple has E - SMOOTH_RATIO E', at least 0.
     Mean squares over the face follow from overlaps of the basis functions of degree 2 and of their slopes.
     """
     fading = np.outer(*(np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2 for count in face.shape))
@@ -156,7 +156,7 @@ def slope_octaves(face: BSplineSurface) -> np.ndarray:
 
     It is Σ λ |ĥ|² over the cosine transform ĥ of the net minus its best cubic polynomial (the even continuation of a
     tilt has kinks), λ the eigenvalue of the negative Laplacian.  Octave k, 0 the finest, has the frequencies whose
-    larger index is in (m / 2^(k+1), m / 2^k], m the longer side's points; indices of the other side are scaled to m.
+    larger index is in (m / 2^(k+1), m / 2^k], for m points on the longer side; the other's indices are scaled to m.
     """
     energy, octave = _energy(face, scipy.fft.dctn(_without_cubic(face), norm="ortho")), _octave(face)
     return np.array([energy[octave == k].sum() for k in reversed(range(int(np.log2(max(face.shape)))))])
@@ -203,7 +203,7 @@ def departure(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> float:
     """Return the peak-to-valley departure (mm) of a face from its best sphere, which may be a plane.
 
     Least squares of P = h - k (x² + y² + h²) - a x - b y - d, h = z - mean.  P = 0 is a sphere of curvature 2 k / n,
-    n² = 1 + a² + b² - 4 k d, at the distance 2 P / (n + sqrt(n² - 4 k P)) from a point (Pratt 1987).
+    n² = 1 + a² + b² - 4 k d; its distance from a point is 2 P / (n + sqrt(n² - 4 k P)) (Pratt 1987).
     """
     h = z - z.mean()
     columns = np.stack([x**2 + y**2 + h**2, x, y, np.ones_like(x)], axis=1)
@@ -235,7 +235,7 @@ class Survey:
 
 
 def survey(lens: Lens, concave: float | None = None, convex: float | None = None, slope: float | None = None) -> Survey:
-    """Find the extremes of the back; concave, convex: bounds on radii (mm); slope: bound on the angle (degrees)."""
+    """Find the extremes of the back; concave, convex: smallest allowed radii (mm); slope: largest angle (degrees)."""
     lens = lens.plain()
     back = lens.back_net
     x, y, along_x, along_y = _grid(back)
@@ -281,7 +281,7 @@ def _radius(bend: Extreme) -> Extreme:
 
 
 def _angle(lens: Lens, slope: Extreme) -> Extreme:
-    """Return the largest slope of the back as an angle in degrees, including the rim between the points of the grid."""
+    """Return the largest slope of the back, rim included, in degrees; slope: largest tangent on the grid."""
     x, y = sample_rim(lens.outline, GRID_POINTS)
     _, z_x, z_y = lens.back.sag_and_slope(x, y)
     steep = torch.hypot(z_x, z_y)

@@ -19,7 +19,7 @@ U_η = sqrt(1 / A_η ∫ (E - E_η)² dA) / E_η        beam uniformity, over A_
 U_P = ΔE / E_max                                 plateau uniformity, ΔE the full width at half maximum of the peak of
                                                  the histogram of E near E_max: 0 if uniform, 1 without a plateau
 s_ηε = (A_ε - A_η) / A_ε, ε < η                  edge steepness: 0 if vertical
-efficiency                                       fraction of all light inside the outline; not in the standard
+efficiency                                       fraction of all light inside a given outline; not in the standard
 
 At η = 0.9 any beam has a flatness of at least 0.9 and, except for pixels brighter than E_max, a uniformity of at most
 0.06, so read them with the fractional power, or at a lower η.  Hot pixels count in powers, averages and uniformity.
@@ -105,7 +105,7 @@ def _maximum(e: np.ndarray) -> float:
 
 
 def plateau_uniformity(e: np.ndarray, maximum: float) -> float:
-    """Return U_P = ΔE / E_max by the histogram of the irradiance E (any shape), at most 1.
+    """Return U_P = ΔE / E_max, at most 1, by the histogram of the irradiance e (of any shape); maximum: E_max.
 
     The width of the bins is that of Freedman and Diaconis (1981) for the n pixels above E_max / 2, 2 IQR n^-1/3, and at
     least E_max / MAX_BINS.  From the fullest bin above E_max / 2 the half maximum is sought on each side, interpolated

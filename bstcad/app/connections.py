@@ -71,7 +71,7 @@ def bound(port: int) -> Iterator[socket.socket]:
         try:
             own.bind(("127.0.0.1", port))
         except OSError as error:
-            raise SceneError(f"--port {port}: not available ({error.strerror}); give another, or omit it") from None
+            raise SceneError(f"--port {port}: not available ({error.strerror}); give another, or omit --port") from None
         own.listen()  # browsers that connect before the server runs are queued
         yield own
 

@@ -19,7 +19,7 @@ def target_of(scene: Scene, key: str) -> Target:
     """Return the target at a key such as target or target[1].  SceneError if it does not exist or has no photo."""
     found = dict(zip(scene.target_keys, scene.targets, strict=True)).get(key)
     if found is None or (found.image is None and found.sample is None):
-        raise SceneError(f"{key[:40]}: there is no such target, or it has no photo; give it an image or a sample")
+        raise SceneError(f"{key[:40]}: no such target, or it has no photo; choose a target with an image or a sample")
     return found
 
 
@@ -38,10 +38,10 @@ def small_photo(target: Target) -> bytes:
 
 
 def in_proportions(data: Mapping[str, Any], key: str, target: Target) -> dict[str, Any]:
-    """Return the changes, by key, that give the plate and the picture the proportions of a target's photo.
+    """Return the changes, by key, that give the lens and the picture the proportions of a target's photo.
 
-    data: tables of the scene.  key: key of the target.  The longer sides keep their lengths.  A round plate, and a
-    plate with several targets, keeps its shape.  A source's aperture that equals the outline of the plate changes too.
+    data: tables of the scene.  key: key of the target.  The longer sides keep their lengths.  A round lens, and a lens
+    for several targets, keeps its outline.  A source's aperture that equals the outline of the lens changes with it.
     """
     shown = shown_size(target)
     sides = [each / max(shown) for each in shown]

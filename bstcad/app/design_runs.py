@@ -52,7 +52,7 @@ class Run:
     # ---- start and stop ----
 
     def begin(self, job: Mapping[str, Any] | None = None, contents: Mapping[str, bytes] | None = None) -> None:
-        """Start the run in its own process, and delete the files of an earlier one.  SceneError if it is running.
+        """Start the run in its own process, after deleting the files of an earlier start.  SceneError if it is running.
 
         job: entries of job.json besides the kind.  contents: other files for the run, by name.
         """
@@ -136,7 +136,7 @@ class Run:
             return NO_RUN
 
     def read(self, name: str) -> bytes:
-        """Return the bytes of a file of the run; b"" if it does not exist or a link leads outside the designs."""
+        """Return the bytes of a file of the run; b"" if it is absent, too large or a link out of the designs."""
         try:
             folder = self.folder
             return files.contents(files.within(folder / name, folder.parent), MAX_PROGRESS_SIZE)
@@ -157,7 +157,7 @@ class Run:
         return str(self.folder) in command_of(process)
 
     def news(self, since: int) -> dict[str, Any]:
-        """Return the state, and the progress from line `since` on: [seconds since 1970, stage, done, total, text]."""
+        """Return the state and "lines", the progress from line `since` on: [s since 1970, stage, done, total, text]."""
         state = self.state
         lines = self.read(PROGRESS).decode("utf-8", "replace").split("\n")[:-1]
         progress = [found for line in lines[max(since, 0) :] if (found := _read(line)) is not None]
@@ -188,9 +188,9 @@ def _read(line: str) -> list[Any] | None:
 
 
 def begin_design(scene: Scene, design: Path, text: str = "") -> Run:
-    """Start the design of a scene into a folder; text: text of its scene file, which is stored with the run.
+    """Start the design of a scene into a folder; text: text of the scene file, which is stored with the run.
 
-    SceneError if the folder contains other files, or a run is already running.
+    SceneError if the folder contains other files, or this design is already running.
     """
     files.check_free(design)
     run = Run(design)

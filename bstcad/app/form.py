@@ -203,7 +203,7 @@ def _without(group: Group, taken: set[str]) -> Group:
 
 
 def _group(key: str, node: Node, table: Table, data: Table, removable: bool = False) -> Group:
-    """Return the group of `table`, at `key` in `data`; if it states no known kind, only with the field of the kind."""
+    """Return the group of `table`, at `key` in `data`; a table without a known kind has only the field of the kind."""
     union = records_at(key, data)
     kinds = matching_records(union, table)
     tag, nodes = tags(union[0]), kinds[0]["properties"]
@@ -229,7 +229,7 @@ def _group(key: str, node: Node, table: Table, data: Table, removable: bool = Fa
 
 
 def _list(key: str, node: Node, value: Any, data: Table, maximum: int) -> Group:
-    """Return the group of a list of tables, `value`, or of the only table if it need not be in a list, as a target."""
+    """Return the group of a list of tables, `value`, or of a single table that need not be in a list, as a target."""
     tables = [part if isinstance(part, dict) else {} for part in (value if isinstance(value, list) else [value])]
     tables = tables if value else []
     behind = f"{key}[{len(tables)}]"
@@ -322,7 +322,7 @@ class Slider:
 
 
 def slider(field: Field) -> Slider | None:
-    """Return a slider from half to twice a field's number, or its pair's width; None without number or limits."""
+    """Return a slider from half to twice a field's number or the width of its pair; None without number or limits."""
     words, middle = field.value or field.default or field.example, ""
     value = number(words) if field.control == "number" else None
     if field.control == "pair":

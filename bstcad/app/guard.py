@@ -86,7 +86,7 @@ class Guard:
                 await _refusal("size", 413)(scope, receive, send)
 
     def _refusal(self, scope: Scope) -> Response | None:
-        """Return the refusal of a request, or the redirect of an address with a token; None to accept it."""
+        """Return the refusal of a request, or the redirect of an address with a token; None: it is accepted."""
         headers = Headers(scope=scope)
         if headers.get("host", "") not in self._hosts:
             return _refusal("host", 403)

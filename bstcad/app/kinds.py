@@ -144,7 +144,7 @@ def _hashable(table: Table) -> dict[str, str]:
 def convert_table(key: str, tag: Mapping[str, str], data: Table) -> dict[str, Any]:
     """Return the table at a key with another kind, which `tag` states, such as {"kind": "point"}.
 
-    Keys that both kinds have stay, others are removed, and required keys are added.
+    Keys with the same meaning in both kinds stay, others are removed, and required keys are added.
     """
     union, old = records_at(key, data), table_at(key, data)
     chosen = next((record for record in union if tag.items() <= tags(record).items()), None)
@@ -262,7 +262,7 @@ def _on_axis(z: float | None) -> list[float] | None:
 
 
 def _screw_circle(data: Table) -> float | None:
-    """Return the diameter (mm) of a flange's circle of holes: the mean of the sizes of lens and flange."""
+    """Return the diameter (mm) of a flange's circle of holes: the mean of the smaller sides of lens and flange."""
     sizes = extent(table_at("lens.outline", data)), extent(table_at("mount.flange.outline", data))
     return None if None in sizes else (min(sizes[0]) + min(sizes[1])) / 2
 

@@ -26,8 +26,8 @@ from bstcad.sweep.plan import plan
 
 STAGES = ("preview", "settled", "effects", "predicted")  # names of the answers to a request, in their order
 MAX_PAGES = 32  # largest number of pages with a stored request
-IDLE_DELAY = 0.7  # pause (s) after the first preview of a request, in case another change comes
-JOIN_TIMEOUT = 0.5  # time (s) in which the thread has to end
+IDLE_DELAY = 0.7  # pause (s) between the first preview of a request and its other answers, in case another change comes
+JOIN_TIMEOUT = 0.5  # time (s) that `end` waits for the thread
 PAGE_TIMEOUT = 60.0  # time (s) after a page's last poll until the thread stops working for it, up to its next poll
 
 

@@ -204,7 +204,7 @@ def _after_comment(found: Sequence[Piece], k: int) -> int:
 
 
 def _table_end(found: Sequence[Piece], k: int) -> int:
-    """Return the index after a table with last piece `k`, and after comments below it unless a statement follows."""
+    """Return the index after a table with last piece `k`, and after comments below that no statement follows."""
     end = over = _after_comment(found, k)
     while over < len(found) and found[over].role == "comment":
         over += 1

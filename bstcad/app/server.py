@@ -310,7 +310,7 @@ class Workbench:
         return Response(crop.small_photo(crop.target_of(scene, key)), media_type="image/png")
 
     def take_proportions(self, name: str, body: Body) -> dict[str, Any]:
-        """Give plate and picture the proportions of a target's photo; body: {key}, the key of the target."""
+        """Give lens and picture the proportions of a target's photo; body: {key}, the key of the target."""
         key = str(body.get("key") or "target")
 
         def with_proportions(text: str) -> str:
@@ -438,7 +438,7 @@ class Workbench:
         return JSONResponse({})
 
     def edit(self, request: Request) -> Response:
-        """Write a new scene file with the scene of a design, and answer with its name."""
+        """Write the scene of a design as a new scene file, and answer with the name of the new scene."""
         name = request.path_params["name"]
         folder = self.workspace.design(name)
         source = folder if (folder / "scene.toml").is_file() else Run(folder).folder

@@ -196,7 +196,7 @@ class Workspace:
         return name
 
     def _show(self, name: str, key: str, value: str, plate: new_scene.Plate | None) -> None:
-        """Replace the picture of a new scene file; an error removes the file.  plate: None for a template."""
+        """Set the picture of a new scene file, key = value; an error removes the file.  plate: None for a template."""
         path = self.path(name)
         try:
             text = self._text(path)
@@ -304,7 +304,7 @@ class Workspace:
         except (OSError, ValueError, RuntimeError):  # name too long or with a NUL; endless links
             known = False
         if not known or _hidden(Path(name)) or _hidden(path.relative_to(folder)):
-            raise SceneError(f"{name!r}: is not a file of the design {design}; choose one from its list")
+            raise SceneError(f"{name!r}: is not a file of the design {design}; choose one on its page")
         return path
 
     def file_names(self, design: str) -> list[str]:

@@ -42,7 +42,7 @@ from bstcad.tailoring.run import StageStep, Task
 from bstcad.tailoring.slope_fit import conjugate_gradients, monomials, with_polynomial
 from bstcad.transport.mapping import Mapping
 
-MAX_STARTS = 3  # maximum number of initial points, each moved along +z as far as the distance from the front requires
+MAX_STARTS = 3  # largest number of initial points; if the back is too near to the front, the next lies farther along +z
 FITTED_POINTS_PER_CELL = 4  # fitted points per side of a control cell of the coarser nets; the last net uses all points
 # Fits of the coarsest net, the nets in between and the last: weight of the second differences relative to heights,
 # conjugate-gradient iterations, and degree of a polynomial that is fitted first.  The first fit extrapolates smoothly
@@ -72,7 +72,7 @@ def steps(task: Task, lens: Lens, state: None = None) -> Iterator[StageStep]:
 
 @torch.no_grad()
 def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") -> Lens:
-    """Return the lens whose back is the net through the points of the map.
+    """Return the lens whose back is the net fitted to the points that the integration of the map gives.
 
     The initial point lies on the ray through the centre of the first surface, in the plane of the back.  If the back
     would come too near to the front, the integration is repeated from a point further along +z.  first: as in `march`.
@@ -164,7 +164,7 @@ class _Grid:
         return torch.stack([-p, -q, torch.ones_like(p)])
 
     def meet(self, point: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-        """Return intersections with planes of these normals through points (3, rays, lines) mm, and True for hits."""
+        """Return where rays meet planes with these normals through points (3, rays, lines) mm, and True for hits."""
         along = dot(normal, self.direction)
         ok = self.rays.sense * along > TANGENCY_TOLERANCE * torch.sqrt(dot(normal, normal))
         path = dot(normal, point - self.origin) / torch.where(ok, along, torch.ones_like(along))
@@ -214,7 +214,7 @@ def fit_heights(
 ) -> BSplineSurface:
     """Minimise Σ |h(x, y) - z|² + bending Σ |second differences|² by `count` conjugate-gradient iterations.
 
-    x, y and z, relative to the surface's plane, are (n,) mm.  The iteration starts from the heights of the surface,
+    x, y, z: (n,) mm, z relative to the surface's plane.  The iteration starts from the heights of the surface,
     after the fit of a polynomial of this degree if it is not zero.
     """
     u, v = surface.along_net(x, y)

@@ -106,7 +106,7 @@ def nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _triangles(grid: np.ndarray, rising: np.ndarray) -> np.ndarray:
-    """Return the nodes of two triangles per cell of `grid`, (2 n², 3), counterclockwise.  rising: see `_diagonals`."""
+    """Return the nodes of two triangles per cell of `grid`, (2 n², 3), counterclockwise.  rising: from `_diagonals`."""
     a, b, c, d = _cell_corners(grid)
     rising = rising[..., None]
     first = np.where(rising, np.stack([a, b, c], axis=-1), np.stack([a, b, d], axis=-1))

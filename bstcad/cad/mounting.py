@@ -104,8 +104,6 @@ class _BodyPlane(NamedTuple):
 
 @dataclass(frozen=True)
 class _Opening:
-    """The opening of a body for a lens."""
-
     lens: Lens
     name: str  # name of the lens in messages
     z: float  # height of the lens's frame in the body's frame (mm)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 EXTRA_POINTS = 4  # control points of a coarse copy beyond the rim, at each end: two for the end span, and two more
 RIM_POINTS_PER_CELL = 8  # number of points on each piece of a rim per control point along the back's longer side
-IMAGE_TOLERANCE = 1e-12  # relative deviation below which an edge's image in (u, v) is written as a line or circle
+IMAGE_TOLERANCE = 1e-12  # largest deviation / size of an edge's image in (u, v) that is written as a line or circle
 IMAGE_SAMPLES = 65  # number of points of an image that are compared with a line and a circle
 INVALID_LENS = (
     "lens: front, back and walls do not bound a valid solid; check that the back lies above the front, and move wires "
@@ -195,7 +195,7 @@ def cap(patch: Patch, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
 
 
 def front_caps(lens: Lens, rails: Sequence[Rail]) -> list[NamedFace]:
-    """Return the front inside the first rail and outside the others, and the plane around a front with an outline."""
+    """Return the front, and the plane around it if it has an outline, inside the first rail and outside the others."""
     if lens.front.outline is None:
         return [(cap(front_patch(lens), rails, along=False), "front")]
     dome, rim = dome_cap(lens)

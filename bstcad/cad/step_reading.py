@@ -266,7 +266,7 @@ def _looks_up(face: TopoDS_Face, surface: BRepAdaptor_Surface) -> bool:
 
 
 def _front_face(rest: Sequence[OccFace]) -> OccFace:
-    """Return the face of a front without a net: sphere, patch of 3 x 3, or smallest plane z = const that faces -z."""
+    """Return the face of a front without a net: a sphere or patch of 3 x 3, else the smallest plane that faces -z."""
     planes = [face for face in rest if face[1].GetType() == Kind.GeomAbs_Plane]
     level = [face for face in planes if abs(face[1].Plane().Axis().Direction().Z()) > 1 - AXIAL_TOLERANCE]
     if len(level) > 1:

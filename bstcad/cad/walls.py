@@ -44,7 +44,7 @@ RIM_TOLERANCE = 1e-8  # largest deviation (mm) of an edge from the exact curve
 MIN_WALL = 1e-3  # smallest height of a wall (mm)
 SMOOTH_TURN = 1e-7  # angle (rad) between successive pieces below which they join smoothly
 MIN_CORNER = 0.05  # smallest 1 + cos of the exterior angle at a corner; a mitre is then at most 6.3 times the offset
-MAX_NEWTON_STEPS, NEWTON_TOLERANCE = 50, 1e-13  # largest number of steps; size of the last one, relative to 1 mm + |z|
+MAX_NEWTON_STEPS, NEWTON_TOLERANCE = 50, 1e-13  # largest number of steps; largest last step / (1 mm + |z|)
 WALL_SAMPLES = 129  # number of points along a piece at which its wall is checked
 
 NamedFace = tuple[TopoDS_Face, str]  # face and its name, as in solid.NamedSolid

@@ -26,7 +26,7 @@ WIRE_TOLERANCE = 1e-7  # largest deviation (mm) of a wire from its plane z = con
 MIN_CLEARANCE = 1e-6  # distance (mm) below which wires are said to touch
 POLYGON_SIDES = 400  # number of sides of the polygon that represents a loop in checks
 MIN_INTERVALS = 64  # smallest number of intervals of a spline over a piece
-MAX_INTERVALS, MAX_HALVINGS = 1 << 14, 4  # a spline is not refined above 1 << 14 and 2^4 times its first intervals
+MAX_INTERVALS, MAX_HALVINGS = 1 << 14, 4  # largest number of intervals: 1 << 14 or, if more, 2^4 times the first number
 QUINTIC_INTERVALS = 256  # intervals of a quintic; along half a circle on a sphere or conic its error is 1e-12 mm
 MIN_BREAK_DISTANCE = 1e-7  # smallest distance of two breaks, relative to the length of the piece
 ONE_SIDED_SLOPE = np.array([-25, 48, -36, 16, -3]) / 12  # weights of 5 values (spacing 1) for the slope at the first
@@ -91,7 +91,7 @@ def wire_loop(given: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list
 
 
 def shape_in(given: Any) -> tuple[Any, str]:
-    """Return (shape, its type's name), also for a Workplane of one object; for others (None, their size in words)."""
+    """Return (shape, name of its type), in a Workplane of one object too; else (None, number of objects as text)."""
     values = given.vals() if hasattr(given, "vals") else [given]
     if len(values) != 1:
         return None, f"a Workplane of {len(values)} objects"
