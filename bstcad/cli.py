@@ -204,17 +204,17 @@ def say(summary: Any, where: object) -> None:
 
 
 def argument(kind: Any, metavar: str, words: str, **more: Any) -> Any:
-    """Return the type of an argument, with its help."""
+    """Return the type of an argument of type `kind`, with the help `words`."""
     return Annotated[kind, typer.Argument(metavar=metavar, help=words, **more)]
 
 
 def option(kind: Any, metavar: str | None, words: str, *names: str, **more: Any) -> Any:
-    """Return the type of an option, with its help."""
+    """Return the type of an option of type `kind`, with the help `words`."""
     return Annotated[kind, typer.Option(*names, metavar=metavar, help=words, **more)]
 
 
 def path_option(metavar: str, words: str, *names: str) -> Any:
-    """Return the type of an option that is a path."""
+    """Return the type of an option that is a path, with the help `words`."""
     return option(Path | None, metavar, words, *names, parser=user_path)
 
 

@@ -150,7 +150,7 @@ def _in_rim(side: int) -> np.ndarray:
 
 
 def _octaves(error: np.ndarray, per_unit: float) -> list[dict[str, Any]]:
-    """Return a record for each octave of an error's cosine transform (orthonormal: Parseval), coarse first.
+    """Return a record for each octave of an error picture's cosine transform (orthonormal: Parseval), coarse first.
 
     "frequency": lower and upper limit in cycles per pixel (the finest octave extends to 0.71, along the diagonals).
     "period": both limits as lengths on the target, the longer first, in the unit of `per_unit` (pixels per unit).

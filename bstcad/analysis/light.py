@@ -42,7 +42,7 @@ GRID_LINES = 33  # number of grid lines in each direction in `ray_map`
 
 
 def fan(source: Emitter, lens: Lens, plane: Receiver) -> np.ndarray:
-    """Return polylines (rays, points, 3) in mm, from the source via each surface to the plane; rays start in y = 0."""
+    """Return polylines (rays, points, 3) in mm from the source to the plane, via (x, 0) on the first vertex plane."""
     half = clear_window(source, lens).width / 2
     x = torch.linspace(-0.98 * half, 0.98 * half, FAN_RAYS, dtype=torch.float64)
     return _polylines(source.rays(x, torch.zeros_like(x), lens.entrance.z, 1.0), lens, plane)[0]

@@ -2,9 +2,9 @@
 
 An effect adds channels of light: from another point, at another wavelength, or with less flux.  At a point b of the
 last face the light of all channels meets the same slope.  So a channel's shift of the landing point and its
-transmission vary with b as smoothly as directions and lengths do, however fine the structure of the face, and few rays
-suffice for two fields over the target: for the light that lands at t without the effect, the shift δ_k(t) in channel k
-and the relative transmission w_k(t).  The picture E, of the target or of a finished lens, becomes
+transmission vary with b as smoothly as directions and lengths do, however fine the structure of the face.  Few rays
+therefore suffice for two fields over the target, of the light that lands at t without the effect: its shift δ_k(t) and
+its relative transmission w_k(t) in channel k.  The picture E, of the target or of a finished lens, becomes
 
     E'(t') = Σ_k c_k w_k(t) E(t) |∂t'/∂t|⁻¹,  t' = t + δ_k(t),  c_k the weights of the channels.
 

@@ -75,7 +75,7 @@ def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[Stage
 
 
 def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: Level | None) -> Iterator[Iterate]:
-    """Run or resume stage 1 on the net of `lens`: vary heights and free front parameters for the least miss."""
+    """Run or resume stage 1 on the net of `lens`: minimise the miss of rays through `area` by heights and front."""
     n = min(task.knobs.rays, MAX_RAYS_PER_CONTROL_POINT * max(lens.back_net.shape))
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)

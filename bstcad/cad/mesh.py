@@ -181,7 +181,7 @@ def fit_mesh(lens: Lens, tolerance: float, max_triangles: int | None = None) -> 
 
 
 def chordal_error_goal(lens: Lens, tolerance: float) -> float:
-    """Return the chordal error (mm) that meets the tolerance after the corners have been rounded to float32."""
+    """Return the chordal error (mm), at least 0.1 tolerance, that meets it after the corners are rounded to float32."""
     rounding = 2 * FLOAT32_ROUNDING * largest_coordinate(lens)
     return max(0.1 * tolerance, min(GOAL_FRACTION * tolerance, tolerance - rounding))
 

@@ -28,7 +28,7 @@ FIXED_FORMAT, SCIENTIFIC_FORMAT = "%.14f", "%.16E"  # formats of numbers in [FIX
 FIXED_MIN, FIXED_MAX = 0.1, 1e3  # limits of the absolute values that are written in FIXED_FORMAT
 PLACEHOLDER_X = 1e60  # x (mm), beyond any lens; the first control point of placeholder k is at (k + 1) PLACEHOLDER_X
 REFERENCES_PER_LINE = 16  # number of entries per line of a list
-OTHER_FORM = "UNSPECIFIED"  # name in Part 21 of a knot vector whose form is not in KNOT_FORMS
+OTHER_FORM = "UNSPECIFIED"  # name in Part 21 of any other form, or of two different forms in u and v
 KNOT_FORMS = {  # names in Part 21 of the forms of knot vectors
     Distribution.GeomAbs_Uniform: "UNIFORM_KNOTS",
     Distribution.GeomAbs_QuasiUniform: "QUASI_UNIFORM_KNOTS",
