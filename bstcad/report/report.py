@@ -39,14 +39,14 @@ BADGES = {  # verdict of a report: (sign, style on the page, style on the termin
 }
 # style on the terminal of each kind of a plan's verdict
 PLAN_STYLES = {"blurred": "bold red", "beyond": "bold red", "within": "bold green", "no limit": "bold cyan"}
-GLASS_LINES = ("lost through the sides", "total internal reflection")  # lines of a ledger; omitted for a mirror if 0
+GLASS_LINES = ("lost through the sides", "total internal reflection")  # lines of `ledger`, omitted for a mirror if 0
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
 
 
 def counts(checks: Sequence[Check]) -> str:
-    """Return a phrase with the numbers of passed checks, of failed ones, and of passed ones without a limit."""
+    """Return a phrase with the numbers of checks that meet a limit, that failed, and that have no limit."""
     failed = sum(not check.passed for check in checks)
     unjudged = sum(check.passed and check.limit is None for check in checks)
     more = ((failed, "failed"), (unjudged, "without a limit (not judged)"))
@@ -62,7 +62,7 @@ def explanation(report: Contents) -> str:
 
 
 def doubts(report: Contents | Examined) -> list[Remark]:
-    """Return remarks on the verdict: the light or the RRMSD has no limit in the scene; the RRMSD is not resolved."""
+    """Return remarks on the verdict: the scene does not limit the light or the RRMSD; the RRMSD is not resolved."""
     if isinstance(report, Examined):
         return []
     return written("verdict.txt.j2", "doubts", report=report)
@@ -76,7 +76,7 @@ def check_line(check: Check) -> str:
 
 
 def machine(facts: Mapping[str, Any]) -> Rows:
-    """Return the known facts of the machine as rows; for a GPU a row says that another run gives another lens."""
+    """Return the known facts of report.json's machine as rows; for a GPU also that another run gives another lens."""
     known = {key: value for key, value in facts.items() if value is not None}
     sizes = {
         key: f"{value:.3g} GB" for key, value in known.items() if key.endswith("_gb") and not isinstance(value, str)
@@ -88,7 +88,7 @@ def machine(facts: Mapping[str, Any]) -> Rows:
 
 
 def ledger(flux: Mapping[str, float], of: str) -> dict[str, float]:
-    """Return a flux ledger (fractions of the source's flux by fate) in the words of a report; of: lens or mirror."""
+    """Return a flux ledger (fraction of the source's flux by where it goes) in a report's words; of: lens or mirror."""
     lines = {line: part for line, part in flux.items() if of == "lens" or part or line not in GLASS_LINES}
     for old, new in (("the lens", f"the {of}"), ("glass", "material"), ("on t", "on the t"), ("off t", "beside the t")):
         lines = {line.replace(old, new): part for line, part in lines.items()}
@@ -96,7 +96,7 @@ def ledger(flux: Mapping[str, float], of: str) -> dict[str, float]:
 
 
 def first_figures(report: Contents | Examined) -> list[Figure]:
-    """Return the numbers at the top of report.html and of the terminal; for a STEP file alone, those of the part."""
+    """Return the first numbers of report.html and of the terminal, on a design or on a STEP file without one."""
     if isinstance(report, Examined):
         return [(name, value, "") for name, value in report.part.items()]
     rows = tables("first_figures.txt.j2", report=report)["first"]
@@ -119,8 +119,8 @@ def html(
     """Return the content of report.html, which contains its pictures and styles and loads nothing.
 
     figures: PNG bytes by name; None or absent: the picture is omitted (a sentence replaces the 3-D picture).  scene:
-    TOML text of the scene with all defaults.  prescription: rows from bstcad.report.prescription.sections.  solid: JSON
-    from bstcad.report.rendering.turnable; "": a page without a script.  tolerances: HTML from
+    TOML text of the scene with all defaults.  prescription: rows by heading, from bstcad.report.prescription.sections.
+    solid: JSON from bstcad.report.rendering.turnable; "": a page without a script.  tolerances: HTML from
     bstcad.report.tolerances.  sections: (heading, HTML) of each section that a script of the user adds.
     """
     from markupsafe import Markup
@@ -209,7 +209,7 @@ def check_lines(checks: Sequence[Check], verbose: bool, of: str = "") -> Iterato
 
 
 def topic_tag(line: Check | Remark) -> tuple[str, str]:
-    """Return (text, style): " [NAME]" with which `bstcad docs NAME` explains the line, or "" without such a page."""
+    """Return (" [NAME]", style) if `bstcad docs NAME` explains this check or remark, else ("", style)."""
     return line.topic and f" [{line.topic}]", "dim"
 
 
@@ -249,7 +249,7 @@ def _verdict(plan: Mapping[str, Any]) -> Iterator[Text]:
 
 
 def _of_target(plan: Mapping[str, Any], of: str, optic: str) -> Iterator[RenderableType]:
-    """Yield estimates and sentences on one target; plan: its entry in `goals`.  of: suffix ", target[1]", or ""."""
+    """Yield effects not simulated and sentences on a target; plan: its entry in `goals`; of: ", target[1]" or ""."""
     from rich.text import Text
 
     left_out = _table(f"not simulated{of}", "light on target", "RRMSD", "blur")

@@ -1,7 +1,7 @@
 """tolerance.json as a record, its section of report.html and its table for the terminal.
 
-bstcad.tolerance computes the study.  A superposed picture is that of the design plus changes by the errors, which were
-traced separately; a full trace is a picture of the lens with all errors of a trial.
+bstcad.tolerance computes the study.  A trial is one random draw of all errors.  Its superposed picture is the
+design's picture plus the change by each error, traced alone; its full trace is the picture with all errors together.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ MAX_PAGE_BYTES = 30_000_000  # largest report.html that is read (bytes)
 MAX_PICTURE_BYTES = 1_000_000  # largest picture of a study that is read (bytes)
 PNG = b"\x89PNG\r\n\x1a\n"
 FIGURES = ("tolerance_trials", "tolerance_worst")  # names of the study's pictures: figures/NAME.png
-MAX_DISAGREEMENT = 0.1, 0.03  # largest relative errors of trusted superposed pictures: 95th percentile, median
-MIN_FRACTION = 1e-3  # errors that cause less than this fraction of the mean square change are in a second table
+MAX_DISAGREEMENT = 0.1, 0.03  # largest Disagreement of trusted superposed pictures: 95th percentile, median
+MIN_FRACTION = 1e-3  # errors with a smaller fraction of the mean square change of the pictures are in a second table
 WIDEST = 10.0  # largest factor by which the search for the loosest tolerances widens an error
 MAX_NAMED_ERRORS = 3  # largest number of errors that are named per trial
 
 Yield = tuple[Fraction, Fraction, Fraction]  # lower bound, estimate and upper bound of the yield (95 % Wilson interval)
 Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
 Width = Annotated[float, Field(gt=0, le=1e6)]
-Spread = TypedDict("Spread", {"5 %": Size, "50 %": Size, "95 %": Size})  # percentiles of RRMSD, or of RMS (waves)
+Spread = TypedDict("Spread", {"5 %": Size, "50 %": Size, "95 %": Size})  # percentiles of RRMSD, or waves RMS
 Disagreement = TypedDict("Disagreement", {"median": Size, "95 %": Size})  # relative errors of superposed RRMSD or RMS
 
 
@@ -70,7 +70,7 @@ class Sensitivity:
 
 @dataclass(frozen=True)
 class Trial:
-    """A fully traced trial."""
+    """Trial that was traced in full."""
 
     number: Annotated[int, Field(ge=0)]  # number of the trial, as in bstcad tolerance --trial
     rrmsd: Size  # RRMSD of the lens of the trial
@@ -160,7 +160,7 @@ class Tolerances:
 
     @property
     def trusted(self) -> bool:
-        """True if superposed pictures agree with full traces, and superposed wavefronts too if they have a limit."""
+        """True if superposed pictures, and wavefronts if limited, agree with full traces within MAX_DISAGREEMENT."""
         limited = self.wavefront is not None and self.wavefront.limit is not None
         found = (self.model_off, self.wavefront.model_off) if limited else (self.model_off,)
         return all(each["95 %"] <= MAX_DISAGREEMENT[0] and each["median"] <= MAX_DISAGREEMENT[1] for each in found)
@@ -172,7 +172,7 @@ class Tolerances:
 
 
 def _file_keys(value: Any) -> Any:
-    """Return a value of `plain` with "yield" in place of "passed" in its keys, without entries that are None."""
+    """Return a value from `plain` with "yield" in place of "passed" in its keys, without entries that are None."""
     if isinstance(value, dict):
         return {key.replace("passed", "yield"): _file_keys(part) for key, part in value.items() if part is not None}
     return list(map(_file_keys, value)) if isinstance(value, list) else value
@@ -215,7 +215,7 @@ def of_folder(folder: Path, optic: str) -> str:
 
 
 def put_into(page: Path, section: str) -> bytes | None:
-    """Return the report.html `page` with `section` between BEGIN and END; None if it lacks these or is unreadable."""
+    """Return the report.html `page` with `section` between BEGIN and END; None if `page` is unreadable or lacks one."""
     try:
         text = files.contents(page, MAX_PAGE_BYTES).decode("utf-8")
     except (OSError, ValueError):
@@ -228,7 +228,7 @@ def put_into(page: Path, section: str) -> bytes | None:
 def errors(found: Tolerances) -> list[dict[str, Any]]:
     """Return the rows of the table of errors as dicts with the keys of `_error`, the largest fraction first.
 
-    The fields of a form error are one row, with the sum of their changes and the quadratic sum of their widths.
+    The fields of a form error are one row, with the sum of their changes, and with their widths added in quadrature.
     """
     groups: dict[str, list[Sensitivity]] = {}
     for item in found.sensitivities:

@@ -27,7 +27,7 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float | bool | None) -> str:
-    """Return text such as 0.0284 (three digits), 6 512 (integer), 3.2 × 10⁻⁷ (below 1e-3 or from 1e6 on), yes, none."""
+    """Return text such as 6 512 (integer), 0.0284 (three digits), 3.2 × 10⁻⁷ (others < 1e-3 or ≥ 1e6), yes, none."""
     if value is None:
         return "none"
     if isinstance(value, bool | np.bool_):
@@ -86,7 +86,7 @@ def duration(seconds: float) -> str:
 
 
 def bound(check: Check) -> str:
-    """Return the limit of a check, with ≤ if a value below the limit passes, with ≥ if such a value fails."""
+    """Return the limit of a check, with ≤ if a value below the limit passes, with ≥ if it fails; "" without a limit."""
     value, limit, unit = check.value, check.limit, check.unit
     if limit is None:
         return ""
@@ -97,7 +97,7 @@ def bound(check: Check) -> str:
 
 
 def amount(value: float, unit: str, signed: bool = False) -> str:
-    """Return an amount with its unit; "mm", "mm RMS" and "deg" change to a unit that suits `value`; signed: with +."""
+    """Return an amount with its unit; "mm", "mm RMS" and "deg" become a unit that suits it; signed: + if positive."""
     length, _, kind = unit.partition(" ")
     text = quantity(value, length) if length in ("mm", "deg") else f"{number(value)} {unit}".strip()
     text = f"{text} {kind}".strip() if length == "mm" else text
@@ -173,7 +173,7 @@ def _plain_text() -> Environment:
 
 
 def prepare() -> None:
-    """Compile all templates; called in a thread that otherwise waits while OCC reads a file."""
+    """Compile all templates before they are needed; called in a thread of its own, during verification."""
     for templates in (environment(), _plain_text()):
         for name in templates.list_templates(extensions=["j2"]):
             templates.get_template(name)

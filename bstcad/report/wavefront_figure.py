@@ -21,7 +21,7 @@ REMOVED = "piston and tilt removed"
 
 @styled
 def wavefront_map(error: WavefrontError) -> Figure:
-    """Draw the OPD (waves) on the plane error.z, without piston and tilt, and cuts along x and y through its centre."""
+    """Draw the OPD (waves) at z = error.z, without piston and tilt, and cuts along x and y through its centre."""
     figure = new_figure(9.0, 4.3)
     face, cut = figure.subplots(1, 2, width_ratios=(1.15, 1.0))
     edge = round_up(float(np.nanmax(np.abs(error.opd))))
@@ -54,7 +54,7 @@ def _cuts(axes: Axes, error: WavefrontError, edge: float) -> None:
 
 
 def words(error: WavefrontError) -> str:
-    """Return a line on the removed tilt, the angles of the rays to those of the goal wave, and the rounding error."""
+    """Return a line on the removed tilt, the angles of the rays to the requested rays, and the rounding error."""
     piston, (along_x, along_y) = error.without_piston, error.tilt
     return (
         f"Removed tilt: ({number(along_x)}, {number(along_y)}) µrad; with this tilt, RMS {number(piston.rms)} waves.  "

@@ -25,7 +25,7 @@ import torch
 from bstcad.runs import files
 from bstcad.runs.files import SceneError
 
-MAGIC = b"bstcad checkpoint 9\n"  # first line of the file; increase the number if fields of states or purposes change
+MAGIC = b"bstcad checkpoint 9\n"  # first line of the file; increase the number if fields of a state or Purpose change
 DIGEST_SIZE = 65  # length of the line with the SHA-256 (bytes)
 MAX_SIZE = 8 << 30  # largest size of a checkpoint (bytes); 2049 x 2049 control points need 1 GB
 MAX_WRITING_FRACTION = 0.02  # largest fraction of the run's time that checkpoints may take
@@ -80,7 +80,7 @@ def read(path: Path, kind: type, device: str = "cpu") -> tuple[Purpose, Any]:
 
 
 def _packed(arrays: dict[str, np.ndarray], value: Any) -> dict[str, Any]:
-    """Encode a value for JSON: {"@module.Class": fields}, {"@array" or "@tensor": its name in `arrays`}, or a dict."""
+    """Encode a record as {"@module.Class": fields}, an array as {"@array": its name in `arrays`}, a mapping as dict."""
     if isinstance(value, torch.Tensor):
         return {"@tensor": _packed(arrays, value.detach().cpu().numpy())["@array"]}
     if isinstance(value, np.ndarray):
@@ -92,7 +92,7 @@ def _packed(arrays: dict[str, np.ndarray], value: Any) -> dict[str, Any]:
 
 
 def _unpacked(arrays: Mapping[str, np.ndarray], records: Mapping[str, type], device: str, found: dict) -> Any:
-    """Decode a dict of `_packed` whose inner values are already decoded; records: classes by their "module.Class"."""
+    """Decode a dict from `_packed` whose inner values are already decoded; records: classes by their "module.Class"."""
     (kind, content), *_ = [*found.items(), ("", None)]
     if kind == "@array":
         return arrays[content]
@@ -177,7 +177,7 @@ class Keeper:
             write(path, self.purpose, self.latest)
         except (OSError, MemoryError):
             path.parent.rmdir()
-            return "the design so far is lost: no space is left beside the folder or for temporary files"
+            return "the design so far is lost: it can be written neither beside the folder nor among temporary files"
         return f"the design so far is kept in {path}; move it to {self.path} and use --resume to continue it"
 
     def load(self) -> Any:
@@ -199,7 +199,7 @@ class Keeper:
         self.path.unlink(missing_ok=True)
 
     def withdraw(self) -> None:
-        """Delete the checkpoint if this run wrote it, since the scene is refused; else that of an earlier run stays."""
+        """Delete the checkpoint, since the scene is refused, if this run wrote it; that of an earlier run stays."""
         self.latest = None
         if self._own:
             self.remove()

@@ -21,7 +21,7 @@ CONNECTION_TIMEOUT = 30.0  # longest time (s) to wait for the scheduler's answer
 JOB_INTERVAL = 0.5  # time (s) between two checks for finished jobs
 RETRIES = 2  # number of times that a job which raised an error on a worker is done again
 MAX_WORKERS = 1000  # largest value of --workers
-THIS_MACHINE = "here"  # value of `Answer.where` for a job on this machine; for others, the address of the worker
+THIS_MACHINE = "here"  # value of `Answer.where` for a job on this machine; otherwise the address of a worker
 
 _one_at_a_time = threading.Lock()  # limits a worker process to one job, whatever its number of threads
 
@@ -122,7 +122,7 @@ class Cluster:
         self._keys[future] = key
 
     def next(self, tick: Callable[[], None] = lambda: None) -> Answer:
-        """Wait until a job ends, calling `tick` regularly; return its answer.  MachineError without a scheduler."""
+        """Wait until a job ends, calling `tick` regularly; return its answer.  MachineError if the scheduler ends."""
         return self._ended(self._keys, tick)
 
     def _ended(self, futures: Collection[Any], tick: Callable[[], None] = lambda: None) -> Answer:
@@ -138,7 +138,7 @@ class Cluster:
     def spread(self, work: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]) -> Iterator[Any]:
         """Yield work(shared, item) for each item, in order.  MachineError if a worker fails.
 
-        `shared` is sent once, as the result of a job, which the scheduler repeats if the worker that has it is lost.
+        `shared` is sent once, as the result of a job, which the scheduler repeats if the worker with it is lost.
         """
         import dask
 
@@ -166,7 +166,7 @@ class Cluster:
 
 
 def answer(wanted: str, key: Any, work: Callable[..., Any], *arguments: Any) -> Answer:
-    """Do the job work(*arguments) on this worker and return its Answer: a failure if the version is not `wanted`."""
+    """Return the Answer of work(*arguments) on this worker; a failure if its version of bstcad is not `wanted`."""
     from distributed import get_worker
 
     with _one_at_a_time:

@@ -123,7 +123,7 @@ def contents(path: Path, largest: int) -> bytes:
 
 
 def within(path: Path, *folders: Path) -> Path:
-    """Return the path with links resolved.  ValueError if links lead out of all these folders, or to themselves."""
+    """Return the path with links resolved.  ValueError if that is in none of these folders, or if links form a loop."""
     try:
         found = path.resolve()
         endless = found.is_symlink()  # newer versions of pathlib return a link; older ones raise
@@ -156,7 +156,7 @@ def names(path: Path) -> list[str]:
 
 
 def net(path: Path, most: int) -> np.ndarray:
-    """Return control_points (m, n, 3) of an .npz archive; ValueError if m or n exceeds `most`, or as in `arrays`."""
+    """Return control_points (m, n, 3) of an .npz archive; raises as `arrays`, and ValueError if m or n > `most`."""
     with zipfile.ZipFile(io.BytesIO(contents(path, MAX_ARCHIVE_SIZE))) as archive:
         with archive.open("control_points.npy") as file:
             (m, n, *_), _ = _header(file, "control_points")

@@ -23,13 +23,13 @@ REDRAW_INTERVAL = 0.2  # shortest time (s) between two updates of the table in a
 
 
 class Throttled:
-    """Progress function that passes on a new text at once, and a repeated text only after a pause (s)."""
+    """Progress function that passes on a new text at once, and a repeated text only after `pause` (s)."""
 
     def __init__(self, progress: ProgressFunction, pause: float) -> None:
         self._progress, self._pause, self._last = progress, pause, ("", -math.inf)
 
     def __call__(self, stage: str, done: int, total: int, text: str) -> None:
-        """Call the wrapped function, unless the text is the same as in its last call less than the pause ago."""
+        """Call the wrapped function, unless its last call, less than the pause ago, had the same text."""
         now = time.perf_counter()
         if text != self._last[0] or now - self._last[1] >= self._pause:
             self._last = text, now

@@ -61,7 +61,7 @@ Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
 
 @dataclass(frozen=True)
 class FileNet(FileContent):
-    """The net in a file: a B-spline surface, vertex at z = 0.  A Scene contains its heights, not the file's path."""
+    """The net in a file: a B-spline surface, vertex at z = 0.  A Scene contains the heights, not the file's path."""
 
     name = NET_FILE
     shape: tuple[int, int]  # control points along x and along y
@@ -201,7 +201,7 @@ class _Front:
         return replace(self, **surface.plain().parameters(), optimise=False) if self.free else self
 
     def complaints(self, outline: Outline) -> Iterator[str]:
-        """Yield the faults of the front for a lens of this outline, each as "key: sentence"."""
+        """Yield the faults of the front for a lens of this outline, as "key: sentence" with a key of lens.front."""
         own, half = self.outline, min(outline.half_extent)
         if own is None:
             return
@@ -255,9 +255,9 @@ class SphereFront(_Front):
         if self.outline is not None:
             return
         if not bool(self.surface.reaches(*_farthest(outline))):
-            rim, radius = math.hypot(*outline.farthest), 1 / abs(self.curvature)
+            rim, radius = f"the rim, {math.hypot(*outline.farthest):g} mm from the axis", 1 / abs(self.curvature)
             remedy = "make the curvature smaller, or give lens.front an outline of its own"
-            yield f"curvature: a sphere of radius {radius:g} mm does not reach the rim, at {rim:g} mm; {remedy}"
+            yield f"curvature: a sphere of radius {radius:g} mm does not reach {rim}; {remedy}"
 
 
 @dataclass(frozen=True)
@@ -442,7 +442,7 @@ def fit_net(surface: Surface, outline: Outline) -> BSplineSurface:
 
 
 def net_extent(outline: Outline, net: Sides) -> tuple[float, float]:
-    """Return half the width in x and y (mm) of a net that extends two control-point spacings past the rim of the lens.
+    """Return the half widths in x and y (mm) of a net that extends two control-point spacings past the rim of the lens.
 
     Then x is linear in the spline parameter t inside the rim.  In the end spans, which are 1.5 spacings wide, x(t) is
     quadratic, and d/dx of the slope z'(t) / x'(t) grows eightfold inwards, for any heights.  With light there, the edge
@@ -454,7 +454,7 @@ def net_extent(outline: Outline, net: Sides) -> tuple[float, float]:
 
 
 def net_complaints(outline: Outline, points: Sides | None) -> Iterator[str]:
-    """Yield complaints about the control points per side of a net for a lens of this outline; None: chosen later."""
+    """Yield complaints about a net's control points per side for a lens of this outline; points None: chosen later."""
     m, n = as_pair(points or MIN_ROUND_POINTS)
     if outline.is_round and m != n:
         yield f"a round lens (lens.outline) needs a square net, not {m} x {n} control points; give one number"
@@ -608,14 +608,14 @@ class LensBlank(Record):
         return tuple(face for face in self.passes.faces if tailored[face])
 
     def front_net(self, net: Sides) -> Sides | None:
-        """Return the control points per side of the front's net for a back with `net`; None if the front has no net."""
+        """Return the control points per side of the front's net if the back has `net`; None if the front has no net."""
         if self.front.is_tailored:
             return self._tailored_front_net(net)
         fixed = _net_of(self.front.surface, self.outline) if isinstance(self.front, _FittedFront) else self.front.file
         return None if fixed is None else simplified(fixed.shape)
 
     def _tailored_front_net(self, net: Sides) -> Sides:
-        """Return the control points per side of a tailored front for a back with `net`, in the ratio of the scene."""
+        """Return a tailored front's control points per side if the back has `net`, in the scene's ratio."""
         own = self.front.file.shape if self.front.file else self.front.control_points
         if own is None:
             return net
@@ -630,7 +630,7 @@ class LensBlank(Record):
         return (back,) if front is None else (back, front)
 
     def flat_front(self, net: Sides, as_wide_as: Sides | None = None) -> Surface:
-        """Return the front before tailoring for a back with `net`; as_wide_as: as in Scene.flat_lens."""
+        """Return the front before tailoring for a back of `net` control points; as_wide_as: see Scene.flat_lens."""
         if not self.front.is_tailored:
             return self.front_surface
         if self.front.file is not None:
@@ -692,5 +692,5 @@ class LensBlank(Record):
                 yield f"lens.max_thickness: {less}; make it larger, or lens.{key} smaller"
         if thickest is not None and thickest - thinnest < highest - lowest:
             thick = f"{thinnest:g} mm at its thinnest point and {thinnest + highest - lowest:.6g} mm at its thickest"
-            why = f"{thickest:g} mm is too small: with its curved front and a flat back the lens is {thick}"
+            why = f"{thickest:g} mm is too small, as with its curved front and a flat back the lens is {thick}"
             yield f"lens.max_thickness: {why}; make it larger"

@@ -59,7 +59,7 @@ def tables_at(node: Any, key: str, shown: str = "") -> Iterator[tuple[str, Any]]
 
 
 def _inner(table: dict[str, Any], steps: Sequence[Step], shown: str) -> dict[str, Any]:
-    """Return the table in `table` at the first of the remaining steps of a key; an absent table is created."""
+    """Return the table in `table` at the first of `steps`, the remaining parts of a key; an absent table is created."""
     name, number = steps[0]
     inner = table.setdefault(name, {})
     listed = isinstance(inner, list) and all(isinstance(part, dict) for part in inner)

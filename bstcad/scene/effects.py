@@ -136,7 +136,7 @@ def find_effect(effects: Effects, kind: type[OneEffect]) -> OneEffect | None:
 
 
 def reflection_of(effects: Effects) -> Fresnel | None:
-    """Return the scene's effect `fresnel`; with only a ghost, one of bare faces; None if the scene has neither."""
+    """Return the scene's effect `fresnel`; if it has only `ghost`, that of bare faces; None if it has neither."""
     bare = Fresnel(kind="fresnel") if find_effect(effects, Ghost) else None
     return find_effect(effects, Fresnel) or bare
 

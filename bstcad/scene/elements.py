@@ -226,7 +226,7 @@ class LightPath:
         for (one, reverses), (other, _) in pairwise(stops):
             sense = -sense if reverses else sense
             if not (other.low - one.high if sense > 0 else one.low - other.high) > 0:
-                follows = " must follow ".join(f"{p.words}, z = {p.low:.6g} to {p.high:.6g}," for p in (other, one))
+                follows = " must follow ".join(f"{p.words}, z = {p.low:.6g} to {p.high:.6g} mm," for p in (other, one))
                 yield f"{other.key}: {follows} along {DIRECTIONS[sense]}, as the light travels; move one of them"
         sense = reversal(self.behind)
         for key, target in self.targets.items():

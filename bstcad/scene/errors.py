@@ -191,7 +191,7 @@ def toml_positions(text: str) -> dict[str, int]:
 
 
 def line_of(key: str, lines: Mapping[str, int]) -> int | None:
-    """Return the line of a key, or of the innermost table or value around it; None: no line; lines: toml_positions."""
+    """Return the line of a key, or of the innermost table or value around it, or None; lines: from toml_positions."""
     while key and key not in lines:
         key = key.rpartition("[" if key.endswith("]") else ".")[0]
     return lines.get(key)

@@ -14,7 +14,7 @@ IRRADIANCE_SAMPLES = 200  # points per side of the lens at which the irradiance 
 
 
 def complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
-    """Yield complaints about the profile and the spectrum of the source, and those of its kind (source.complaints)."""
+    """Yield complaints about the profile and the spectrum of the source, and those by source.complaints."""
     width = source.widths.get(source.profile)
     if width and source.profile != source.unbounded and getattr(source, width) is None:
         unit = "mm" if width == "radius_1e2" else "degrees"

@@ -270,7 +270,7 @@ def _wall_complaints(mount: Mount, lens: LensBlank, rim: Round | Box) -> Iterato
     wall = top - front.max()
     if not wall > 0:
         level = f"the {above} is at z = {top:g} mm, and the rim of the front reaches z = {front.max():.4g} mm"
-        yield f"{key}: no wall is left below the {above}: {level}; {remedy}"
+        yield f"{key}: no wall is left below the {above}, as {level}; {remedy}"
     descent = _steepest_descent(lens.front.surface, rim.outline)
     for name, slope in (("bevel", bool(mount.bevel)), ("draft", tangent)):
         if not 1 - slope * descent > MIN_CLOSING:

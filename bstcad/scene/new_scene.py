@@ -177,9 +177,9 @@ def new_scene(
     """Write NAME.toml to `folder`, a commented scene that loads; SceneError for an existing file.
 
     The scene is a plate with a picture as large as the plate's shadow on the wall, or a copy of a template.  light: a
-    name of LIGHTS.  size: size of the plate (mm), a number or width x height such as "80x60"; in the proportions of
-    the picture "photo" or "120xphoto".  distance: from plate to wall (mm).  picture: path, relative to `folder`; None:
-    letters.  template: name of a template, without the other options.
+    name of LIGHTS.  size: size of the plate (mm), a number or width x height such as "80x60"; "photo" or "120xphoto"
+    takes the proportions of the picture.  distance: from plate to wall (mm).  picture: path, relative to `folder`;
+    None: letters.  template: name of a template, without the other options.
     """
     from bstcad.scene.picture import photo_size, read_picture, safe_name  # slow to load
 

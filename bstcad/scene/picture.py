@@ -51,7 +51,7 @@ FLOATS = "floats and no colour tag: they are read as irradiance; with gamma = 2.
 MAX_BLACK = 8 / 255  # largest pixel value, from 0 to 1, that counts as black in a picture in black on transparency
 MAX_GAMMA = 10.0  # largest gamma that is used if a file states it; the smallest is 1 / MAX_GAMMA
 LINEAR, PQ, HLG = 8, 16, 18  # transfer characteristics of a cICP chunk (ITU-T H.273)
-SWAPPED = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}  # opposite of each Pillow byte order
+SWAPPED = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}  # opposite of each byte order of Pillow
 DEVICE = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.IGNORECASE)  # names of devices on Windows
 Sample = Literal["astronaut", "camera"]  # scikit-image's bundled pictures, public domain and CC0
 SAMPLES: tuple[str, ...] = get_args(Sample)
@@ -260,13 +260,13 @@ class Photo:
         return sum(light_of[channel] for channel in channels) / len(channels)  # .mean(-1) takes three times as long
 
     def silhouette(self, box: PixelBox) -> np.ndarray:
-        """Return the irradiance (h, w) in a box, read from the opacity alone as from grey pixel values."""
+        """Return the irradiance (h, w) in a box, with the opacity as the pixel values of a grey picture."""
         _, alpha = self.numbers(box)
         assert alpha is not None  # `transparency` has found a logo
         return self.curve(alpha)
 
     def numbers(self, box: PixelBox) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return pixel values (h, w, channels), integers or floats from 0 to 1; and opacity (h, w), None: opaque."""
+        """Return pixel values (h, w, channels), integers or floats up to 1, and opacity (h, w; or None) in a box."""
         image, low, alpha = self.image.crop(box), self.low and self.low.crop(box), None
         if image.mode.startswith(("I", "F")):
             return self._one_channel(image)
@@ -357,7 +357,7 @@ def photo_size(given: Picture | str) -> tuple[int, int]:
 
 
 def _white(image: Image.Image) -> float:
-    """Return the pixel value of white: 1 for floats, 65535 for 32-bit integers, but at least the largest value."""
+    """Return the pixel value of white: 1 for floats, 65535 for 32-bit integers, but at least the picture's largest."""
     if image.mode not in ("I", "F"):
         return 1.0
     usual, (_, largest) = 65535.0 if image.mode == "I" else 1.0, image.getextrema()
@@ -433,7 +433,7 @@ def _grey_curve(profile: Conversion) -> Curve:
 
 
 def letters(text: str, width: int, height: int) -> Image.Image:
-    """Draw a text, centred, in a picture of this size (pixels); it fills 84 % of the width or 80 % of the height."""
+    """Draw a text centred in a picture of this size (pixels), filling 84 % of the width or 80 % of the height."""
     at_100 = _ink(text, 100.0)
     scale = min(0.84 * width / at_100.width, 0.80 * height / at_100.height)
     ink = _ink(text, max(100.0 * scale, 1.0))

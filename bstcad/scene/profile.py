@@ -16,7 +16,7 @@ from scipy.special import erf
 from bstcad.optics.key import Key
 from bstcad.scene.schema import LENGTHS, Record
 
-# Gauss-Legendre nodes per quadrature cell of a super-Gaussian: in cells up to w / n wide, and in cells below w / (4 n).
+# Gauss-Legendre nodes per cell of a super-Gaussian of radius w and order n: in cells up to w / n wide; below w / (4 n).
 NODES, FEWER_NODES = 8, 4
 MAX_VALUES = 1 << 20  # number of values of E that are computed at a time
 DARK = 1e-20  # E, as a fraction of E at the centre, below which a pixel has no light
@@ -173,7 +173,7 @@ def _distances(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lit_pixels(at: np.ndarray, reach: float) -> tuple[np.ndarray, slice]:
-    """Return those of the pixel edges `at` (mm) that bound pixels within `reach` (mm) of 0, and the slice of these."""
+    """Return the edges, among `at` (mm), of pixels within `reach` (mm) of 0, and the slice of these pixels."""
     low, high = np.minimum(at[1:], at[:-1]), np.maximum(at[1:], at[:-1])
     lit = np.flatnonzero((low < reach) & (high > -reach))
     first, last = int(lit[0]), int(lit[-1]) + 1
@@ -181,7 +181,7 @@ def _lit_pixels(at: np.ndarray, reach: float) -> tuple[np.ndarray, slice]:
 
 
 def _nodes(at: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes (pixels, nodes), weights (nodes,) for means over pixels with edges `at`, in cells up to `width`."""
+    """Return nodes (pixels, n) and weights (n,) for means over pixels with edges `at`; width: of the widest cell."""
     pitch = abs(float(at[1] - at[0]))
     node, weight = np.polynomial.legendre.leggauss(FEWER_NODES if 4 * pitch < width else NODES)
     cells = max(math.ceil(pitch / width), 1)

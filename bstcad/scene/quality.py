@@ -27,7 +27,7 @@ BASELINES = {  # method without limits of time, accuracy or shape: (name in mess
     "adam": ("the paper's procedure", "tailoring.quality"),
     "integration": ("point-by-point integration", "tailoring.method"),
 }
-COARSEST_GRID = 64  # cells per side of the transport map that cost almost no time: its default is not reduced further
+COARSEST_GRID = 64  # fewest cells per side to which the transport grid is reduced; they cost almost no time
 VERIFICATION_POINTS = 32  # points of an extended source in a verification; the RRMSD uses random points instead
 VERIFICATION_DRAW = 1 << 12  # number of the set of these points; each further spectral line has the next number
 
@@ -192,7 +192,7 @@ NONE = "none"  # grade of an error that is always zero
 
 
 class Tolerance(Record):
-    """The tolerance of one error or of several; a key that is None has the value of an earlier table or the grade."""
+    """The tolerance of one error or several; a key that is None has the value of an earlier table or of the grade."""
 
     name: Annotated[
         Name | None, Key("Name of the error (lens.decentre: along x and along y); all errors if absent.")
@@ -213,17 +213,17 @@ class Tolerance(Record):
     pattern: Annotated[Literal["raster", "spiral"] | None, Key("Pattern of the tool marks.", example="spiral")] = None
 
     def covers(self, error: str) -> bool:
-        """Return True if the table applies to this error, such as lens.tilt_x (a table on lens.tilt does)."""
+        """Return True if the table covers this error; one on lens.tilt, or without a name, covers lens.tilt_x."""
         return self.name is None or error == self.name or error.startswith(f"{self.name}_")
 
     @property
     def stated(self) -> dict[str, Any]:
-        """Keys of the table that are set, without the name."""
+        """Keys of the table that are set, with their values, without the name."""
         return self.model_dump(exclude={"name"}, exclude_none=True)
 
 
 def settings_of(tables: Sequence[Tolerance], error: str) -> dict[str, Any]:
-    """Return the keys of an error from all tables that cover it; a later grade replaces a limit, and vice versa."""
+    """Return the keys and values for an error from all tables on it; a later grade replaces a limit, and vice versa."""
     merged: dict[str, Any] = {}
     for stated in (table.stated for table in tables if table.covers(error)):
         for one, other in (("grade", "limit"), ("limit", "grade")):
@@ -247,4 +247,4 @@ def tolerance_complaints(tables: Sequence[Tolerance]) -> Iterator[str]:
             if key in stated and table.name not in names:
                 yield f"{where}.{key}: this key is for {' and '.join(names)} only; remove it, or change the name"
         if "distribution" in stated and table.name in FORM:
-            yield f"{where}.distribution: a form error is always normally distributed; remove it"
+            yield f"{where}.distribution: a form error is always normally distributed; remove this key"

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 MESH_TOLERANCE = 1e-3  # mm; default maximum distance of mesh facets from a lens up to 100 mm wide
 IMAGE_KEY = re.compile(r"target(\[\d+\])?\.image")  # dotted keys of images
-SEARCH_RANGE = 0.999  # fraction of the possible range of the front's sag at the rim in which tailoring searches
+SEARCH_RANGE = 0.999  # fraction of the possible range of a front's sag at the rim that tailoring searches
 FLOAT32_ROUNDING = 2.0**-24  # largest relative rounding error of a coordinate in float32
 FINEST_MESH = 4 * FLOAT32_ROUNDING  # smallest tolerance of a mesh, as a fraction of the largest coordinate
 

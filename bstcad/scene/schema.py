@@ -193,7 +193,7 @@ def records(node: Node) -> list[Node]:
 
 
 def tags(record: Node) -> dict[str, Any]:
-    """Return the tag by which a union recognises this table, such as {"kind": "plane"}; {} for a table without."""
+    """Return the tag by which a union recognises this table, such as {"kind": "plane"}, or {} if it has none."""
     keys = record["properties"]
     return {name: keys[name]["const"] for name in TAGS if "const" in keys.get(name, ())}
 
@@ -217,7 +217,7 @@ class Row:
 
 
 def rows(record: Node | None = None, table: str = "") -> list[Row]:
-    """Return the keys of a table and of the tables in it.  record: its schema (None: the scene); table: its key."""
+    """Return the keys of a table and of the tables in it.  record: its schema (None: the scene's); table: its key."""
     record, found = record or schema(), []
     for name, node in record["properties"].items():
         inner, key = records(node), f"{table}.{name}".lstrip(".")

@@ -35,7 +35,7 @@ WITHOUT_GAMMA = ("text", "uniform", "profile")  # picture keys that allow no gam
 MAX_TARGETS = 8  # largest number of targets of a scene
 NOTICEABLE = 0.01  # RRMSD between two readings of a picture above which a remark states the reading
 PLANE_DISTANCE = 1e-3  # mm; smallest distance between the planes of two targets
-LARGEST_IN_METRES, FARTHEST_IN_METRES = 0.5, 10.0  # m; largest plausible width of a lens; z or width of a target
+LARGEST_IN_METRES, FARTHEST_IN_METRES = 0.5, 10.0  # m; largest plausible width of a lens, and z or width of a target
 MAX_REDUCTION = 20.0  # largest plausible ratio of the width of a lens to the width of its target
 EDGE_ON = math.sin(math.radians(1.0))  # sine of the smallest angle between the line of sight and a target's plane
 GRAZING_VIEW = 8.0  # degrees; a flatter view of a target gets a warning (RRMSD 0.07 at 30, 0.33 at 10, 1.6 at 5)
@@ -144,7 +144,7 @@ class Target(Record):
                 yield f"target.outline: is larger than the target along {axis}; make it smaller, or widen target.{axis}"
 
     def _profile_complaints(self) -> Iterator[str]:
-        """Yield complaints about a profile larger than the target, or narrower than a pixel."""
+        """Yield complaints about a profile larger than the target, or narrower than two pixels."""
         pixels = (side / n for side, n in zip(self.size, self.columns_rows, strict=True))
         for axis, half, size, pixel in zip("xy", self._half_profile, self.size, pixels, strict=True):
             if 2 * half > size:

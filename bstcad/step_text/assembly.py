@@ -142,7 +142,7 @@ def _shapes(entities: Entities) -> dict[str, set[str]]:
 
 
 def _transformation(name: str, first: list[str], second: list[str], entities: Entities) -> Placement:
-    """Return the placement, by transformation `name`, of a representation of items `first` in one of `second`."""
+    """Return the placement by transformation `name` of a representation with items `first` in one with `second`."""
     if entities.bodies[name][0] != "ITEM_DEFINED_TRANSFORMATION":
         return _frame(name, entities)
     origin, target = _pair(name, entities)
@@ -167,7 +167,7 @@ def _frame(name: str, entities: Entities) -> Placement:
             return found
     except ValueError as error:
         raise ValueError(f"#{name} = {kind}: {error}; export the lens without this placement") from error
-    raise ValueError(f"#{name} = {kind} places the lens, but is of an unknown kind; export the lens without it")
+    raise ValueError(f"#{name} = {kind} is a placement of an unknown kind; export the lens without it")
 
 
 def _axes(location: str, axis: str | None, reference: str | None, entities: Entities) -> Placement:

@@ -88,7 +88,7 @@ def without_blanks(text: str) -> tuple[str, list[str]]:
 
 
 def read_entities(text: str) -> tuple[str, Entities]:
-    """Return a STEP file's text without blanks, strings and POINT_ROWS, and its entities; ValueError if damaged."""
+    """Return (text without blanks, strings and POINT_ROWS; entities) of a STEP file; ValueError if it is damaged."""
     parts = [text] if POINTS_MARK in text else POINT_ROWS.split(text)
     data, strings = without_blanks(POINTS_MARK.join(parts[::2]))
     start, end = data.find("DATA;"), data.rfind("ENDSEC;")

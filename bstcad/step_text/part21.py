@@ -259,7 +259,7 @@ def _reference_lists(kind: str, entities: Entities) -> dict[str, list[str]]:
 
 
 def _flagged_references(kind: str, before: str, entities: Entities) -> dict[str, tuple[str, str]]:
-    """Return (reference, flag T or F) at the end of each entity of a kind; before: pattern of the text before them."""
+    """Return (reference, flag T or F) at the end of each entity of a kind, by number; before: pattern before them."""
     pattern = re.compile(before + r"#(\d+),\.([TF])\.\)")
     flagged = {name: required(pattern.fullmatch(body)) for name, body in entities.of(kind).items()}
     return {name: (hit[1], hit[2]) for name, hit in flagged.items()}
@@ -287,7 +287,7 @@ def _freeform_surfaces(entities: Entities) -> list[FreeformSurface]:
 
 
 def _middle_and_normal(surface: FreeformSurface) -> tuple[np.ndarray, np.ndarray]:
-    """Return the control point (3,) at the centre of a net, and the unit normal (3,) along its sides' product u x v."""
+    """Return the control point (3,) at the centre of a net, and the unit normal (3,) along u x v of its sides."""
     net = surface.control_points
     m, n, _ = net.shape
     normal = np.cross(net[-1, 0] - net[0, 0], net[0, -1] - net[0, 0])
@@ -373,7 +373,7 @@ def _properties(entities: Entities, products: set[str], unit: float) -> Validati
 
 
 def _measure(entities: Entities, item: str, kind: str) -> float:
-    """Return the value of a measure, converted from its unit to powers of mm and g; kind: pattern of its type."""
+    """Return the value of the measure in entity `item`, in powers of mm and g; kind: pattern of the type of measure."""
     value = re.search(rf"{kind}\(({NUMBER})\),#(\d+)", entities.bodies.get(item, ("", ""))[1])
     return float(value[1]) * _unit_scale(entities, value[2]) if value else UNKNOWN_VALUE
 
