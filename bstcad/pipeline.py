@@ -128,7 +128,7 @@ def design(
     """
     began, merit = time.perf_counter() if began is None else began, options.merit
     if merit is not None and (len(scene.targets) > 1 or scene.wavefront is not None):
-        raise SceneError("merit: a merit function needs a scene with one goal; omit it, or omit the other goals")
+        raise SceneError("merit: a merit function needs one target and no wavefront; omit it, or the other goals")
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
     goals, edge = within_reach(scene, hooks.progress)
@@ -444,7 +444,7 @@ def reserve(scene: Scene) -> float:
 
 
 def purpose(scene: Scene, device: str) -> dict[str, Any]:
-    """Return all data that determine the result of `design`; a checkpoint with equal data can be resumed."""
+    """Return the data, except DesignOptions, that determine a design; a checkpoint with equal data can be resumed."""
     keys = scene.model_dump(mode="json", exclude={"name", "title", "output", "accept"})
     return {
         "version": bstcad.__version__,

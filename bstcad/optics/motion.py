@@ -26,7 +26,7 @@ class Motion:
 
     @classmethod
     def of(cls, shift: Vector = ORIGIN, turn: Vector = ORIGIN, about: Vector = ORIGIN) -> Motion:
-        """Return the motion that rotates about x, y, then z through `about` by `turn` (degrees), then shifts (mm)."""
+        """Return a rotation by `turn` (degrees) about x, then y, then z through `about` (mm), then a shift (mm)."""
         return cls(Rotation.from_euler("xyz", turn, degrees=True).as_matrix(), about, shift)
 
     @property

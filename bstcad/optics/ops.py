@@ -39,7 +39,7 @@ WHOLE_PATHS = [("net", True)], [("revolved", False), ("net", False)]
 
 
 def kernel(name: str, *tensors: Tensor) -> Callable[..., Any] | None:
-    """Return the kernel of KERNELS[name] for tensors on one device and of one of DTYPES; None: there is none."""
+    """Return kernel `name` of KERNELS for tensors that are on one device and have one of DTYPES; None: none fits."""
     device, dtype = tensors[0].device.type, tensors[0].dtype
     found = KERNELS[name].get(device) if ENABLED else None
     if found is None or dtype not in DTYPES or any(t.device.type != device or t.dtype != dtype for t in tensors):
@@ -48,7 +48,7 @@ def kernel(name: str, *tensors: Tensor) -> Callable[..., Any] | None:
 
 
 def whole_kernel(name: str, interfaces: Sequence[Any]) -> Callable[..., Any] | None:
-    """Return the kernel `name` that traces rays across all these Interfaces; None: none supports their sequence."""
+    """Return kernel `name` of KERNELS for rays across all these Interfaces; None: no kernel supports them."""
     path = [(SURFACE_FORMS.get(interface.surface.kind), interface.law.reverses) for interface in interfaces]
     if path not in WHOLE_PATHS or not all(loss.fused for interface in interfaces for loss in interface.losses):
         return None

@@ -36,7 +36,7 @@ class _Box(ABC):
 
     @property
     def farthest(self) -> tuple[float, float]:
-        """Point (x, y) (mm) of the rim farthest from the axis, x, y >= 0: in line with the axis and an arc's centre."""
+        """Point (x, y) (mm) of the rim, with x, y >= 0, that is farthest from the outline's centre."""
         a, b, r2 = self.limits
         r, d = math.sqrt(r2), math.hypot(a, b)
         return (a * (1 + r / d), b * (1 + r / d)) if d else (r, 0.0)
@@ -68,7 +68,7 @@ class _Box(ABC):
         return x, y
 
     def inset_direction(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the shift (x, y) of rim points per mm of inset: inward normal; (-x/a, -y/b) on a rectangle 2a x 2b."""
+        """Return the shift (x, y) of rim points per mm of inset: inward normal; on a rectangle 2a x 2b (-x/a, -y/b)."""
         a, b, r2 = self.limits
         if r2 == 0:
             return -x / a, -y / b

@@ -90,7 +90,7 @@ class Passes:
 
     @property
     def optic(self) -> Literal["lens", "mirror"]:
-        """Name of the solid: "mirror" if a face reflects the light."""
+        """Name of the solid: "mirror" if a face reflects the light, else "lens"."""
         return "mirror" if self.reflects else "lens"
 
     @property

@@ -80,7 +80,7 @@ class Point(Emitter):
         return self.position[2] + (reach if upwards else -reach)
 
     def complaints(self, z: float, optic: str) -> Iterator[str]:
-        """Yield "key: sentence" for a size that is missing, superfluous or larger than the distance to z (mm)."""
+        """Yield faults of the sizes as "key: sentence"; z: plane of the first face (mm), optic: "lens" or "mirror"."""
         given = [name for name in ("width", "height") if getattr(self, name) is not None]
         if given and self.diameter is not None:
             yield f"diameter: the source also has a {given[0]}; give a diameter, or width and height"
@@ -257,7 +257,7 @@ class Point(Emitter):
         return distance / (2 * math.pi * (1 - math.cos(self.edge))), 0.0, 3, min_cosine
 
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
-        """Return the rectangle on the plane z (mm) with all rays that can meet the first surface inside its outline.
+        """Return the rectangle about the axis on plane z (mm) crossed by all rays to the first surface in `outline`.
 
         The surface lies between the planes at `sags` (mm) above the plane z.  Seen from the source, a surface appears
         larger if it bends towards the source, and may appear shifted if it bends away and the source is off the axis.

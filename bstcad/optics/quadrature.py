@@ -58,7 +58,7 @@ class Sums:
 
 
 def of_face(face: Surface, border: Border, raised: float = 0.0) -> Sums:
-    """Return the sums over z = h(x, y) + raised (mm) inside a border, with n dA = (-h_x, -h_y, 1) dx dy.
+    """Return the sums over z = h(x, y) + raised (mm) inside a border; n points up, n dA = (-h_x, -h_y, 1) dx dy.
 
     ∫∫ g dx dy = -∮ G dx, where G = ∫ g dy along a chord of constant x from y = 0 to the border; both are Gauss
     quadratures.  h: heights of the face, in float64.
@@ -120,7 +120,7 @@ def divided(breaks: np.ndarray, parts: int) -> np.ndarray:
 
 
 def outline_border(outline: Outline, face: Surface) -> Border:
-    """Return the border of a circle or of a box with sharp corners, in parts that cross no knot line of a face."""
+    """Return the border of a circle or a rectangle with sharp corners, in parts that cross no knot line of a face."""
     net = face if is_net(face) else None
     count = _points(net) if net else GAUSS_POINTS_PER_PART
     if outline.is_round:
@@ -155,7 +155,7 @@ def _chords(face: Surface, x: np.ndarray, y: np.ndarray, dx: np.ndarray) -> tupl
 
 
 def _chord_ends(face: Surface, y: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return y (mm) of the ends of each chord's parts, (n, parts + 1), some of length 0, and the points per part."""
+    """Return (y (mm) of the ends of each chord's parts, some of which are empty, (n, parts + 1); points per part)."""
     low, high = np.minimum(y, 0.0)[:, None], np.maximum(y, 0.0)[:, None]
     if not is_net(face):
         return np.hstack([low, high]), CHORD_POINTS

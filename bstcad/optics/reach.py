@@ -38,7 +38,7 @@ def largest_deflection(index: float, grazing: float = MAX_EXIT_ANGLE) -> float:
 def grazing_of(index: float, others: Iterable[float], spread: float = 0.0) -> float:
     """Return the largest exit angle (rad) of a ray at which all other light at the point leaves within MAX_EXIT_ANGLE.
 
-    index, others: relative indices at the ray's wavelength and at the others; the largest limits the angle.
+    index, others: relative indices at the ray's wavelength and at the other ones; the largest index limits the angle.
     spread: largest angle (rad) in the glass between a ray and the other rays that meet the face at the same point.
     """
     largest = math.asin(math.sin(MAX_EXIT_ANGLE) / max((index, *others)))  # incidence at the wavelength deflected most

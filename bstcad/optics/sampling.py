@@ -75,13 +75,13 @@ def random(window: Rectangle, count: int, seed: int, dtype: torch.dtype = torch.
 
 
 def point_pairs(outline: Outline, pairs: int, draw: int = 0) -> list[tuple[float, float]]:
-    """Return points (x, y) uniformly over an outline, each followed by its reflection in the centre: their mean is 0.
+    """Return points (x, y) spread over an outline, each followed by its reflection in the centre: their mean is 0.
 
     A golden lattice, a = (k + 1/2) / pairs and b = (k φ + shift) mod 1 for k = 0, 1, … (φ: GOLDEN_RATIO), covers one
-    half: of a rectangle as (a, 2 b - 1), of a disc as the sunflower spiral r² = a, ψ = π b.  `draw` determines the
-    shift.  For two or more pairs the second moments are set to those of the outline, so that a point may lie outside a
-    rectangle by hundredths of its size.  32 points of a disc have 2/3 of the noise of 128 random ones at a hard edge of
-    a picture, 1/5 at a soft one.
+    half: (a, 2 b - 1) of a rectangle, r² = a and ψ = π b (a sunflower spiral) of a disc, in half extents.  `draw`
+    determines the shift.  For two or more pairs the second moments are set to those of the outline, so that a point may
+    lie outside a rectangle by hundredths of its size.  32 points of a disc have 2/3 of the noise of 128 random ones at
+    a hard edge of a picture, 1/5 at a soft one.
     """
     half_x, half_y = outline.half_extent
     lattice = [((k + 0.5) / pairs, (0.5 + draw * DRAW_SHIFT + k * GOLDEN_RATIO) % 1.0) for k in range(pairs)]
@@ -97,7 +97,7 @@ def shifted_lattice(outline: Outline, count: int, seed: int) -> list[tuple[float
     """Return points (x, y) over an outline; over all seeds each is uniformly distributed, so that means are unbiased.
 
     A golden lattice of `count` points, a = k / count and b = k φ (φ: GOLDEN_RATIO), shifted by two random numbers
-    modulo 1 (Cranley and Patterson 1976); on a disc r² = a, ψ = 2 π b.
+    modulo 1 (Cranley and Patterson 1976); in half extents (2 a - 1, 2 b - 1), on a disc r² = a and ψ = 2 π b.
     """
     (move_a,), (move_b,) = jitter(hash_seed(seed), np.zeros(1, np.int64))
     half_x, half_y = outline.half_extent

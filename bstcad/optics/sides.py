@@ -39,14 +39,14 @@ def scaled(net: Sides, share: float) -> Sides:
 
 
 def in_proportion(net: Sides, of: Sides, to: Sides) -> Sides:
-    """Return `to` with its point spacings, on each side, multiplied by the ratio of those of `net` to those of `of`."""
+    """Return a net with m t / o point spacings on each side, where `net` has m, `to` has t and `of` has o."""
     each = zip(as_pair(net), as_pair(of), as_pair(to), strict=True)
     x, y = (max(round((m - 1) * (t - 1) / (o - 1)) + 1, MIN_SIDE) for m, o, t in each)
     return simplified((x, y))
 
 
 def coarser(net: Sides, longer: int) -> Sides:
-    """Return `net` coarsened in proportion to `longer` points on its longer side; unchanged if it has no more."""
+    """Return `net` coarsened, both sides in proportion, to `longer` points on its longer side if it has more there."""
     longest = max(as_pair(net))
     return net if longer >= longest else scaled(net, (longer - 1) / (longest - 1))
 

@@ -113,7 +113,7 @@ class Surface(ABC):
 
 
 def sampled(surface: Surface, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return z (mm), ∂z/∂x and ∂z/∂y of a surface at points (mm), arrays of one shape or numbers, in float64."""
+    """Return z (mm), ∂z/∂x and ∂z/∂y in float64 at points x, y (mm), which are arrays of one shape, or numbers."""
     x, y = (np.require(p, float, ["C", "W"]) for p in np.broadcast_arrays(x, y))
     values = surface.plain().sag_and_slope(*(torch.from_numpy(p.ravel()) for p in (x, y)))
     z, z_x, z_y = (value.numpy().reshape(x.shape) for value in values)

@@ -67,7 +67,7 @@ class TiltedSurface(Surface):
         return f / (n_z + root), (self.face_curvature * x - n_x) / root, (self.face_curvature * y - n_y) / root
 
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
-        """Return True where the surface has a point over (x, y)."""
+        """Return True where the surface has a point over (x, y) and is not vertical."""
         return self._cos2(self._from_vertex(x, y)[2]) > MIN_COS2
 
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:

@@ -128,9 +128,9 @@ def window(source: Emitter, lens: Lens) -> Rectangle:
 def _useful(
     source: Emitter, before: tuple[Interface, ...], faces: tuple[Interface, ...], area: Rectangle, n: int = WINDOW_CELLS
 ) -> Rectangle:
-    """Return the part of `area`, on the plane of the first vertex, whose light meets one of the planes `faces`.
+    """Return the rectangle in `area`, on the plane of the first vertex, with all light that meets a plane of `faces`.
 
-    Two n x n grids of rays are traced; the second covers only the useful part found on the first.
+    Two n x n grids of rays are traced; the second covers only the rectangle found with the first.
     """
     z = before[0].surface.z
     for _ in range(2):
@@ -178,7 +178,7 @@ class Simulation:
     """Simulated light of one set of rays behind a lens."""
 
     box: Tensor  # flux in each pixel (rows, columns), as a fraction of the source's, row 0 = y max
-    tent: Tensor  # flux in each pixel by linear (tent) binning; shape and unit as of `box`
+    tent: Tensor  # flux in each pixel by linear (tent) binning; shape and unit as for `box`
     flux: dict[str, float]  # ledger of the flux by fate, as fractions of the source's; the lines sum to 1
     rays: int  # number of rays launched
 
@@ -223,7 +223,7 @@ def simulate_plain(lights: Lights, screen: Screen, n: int) -> Simulation:
 
 
 def _as_fractions(lights: Lights, box: Tensor, tent: Tensor, flux: dict[str, float], count: int) -> Simulation:
-    """Return the sums as fractions of the source's light; light not launched is beside the lens or on its underside."""
+    """Return the sums as fractions of the source's light; light not launched missed the lens or met its underside."""
     launched = sum(flux.values())
     whole = max(launched, 1.0)  # the sum may exceed 1 slightly: a cell at the rim of a beam counts whole
     flux = {line: value / whole for line, value in flux.items()}

@@ -30,7 +30,7 @@ from bstcad.optics.trace import behind, from_first_net, is_transmitted, whole_ke
 
 ALL = slice(None)  # all rows or columns
 SHEET_TUBES = 256  # tubes per side of the sheet from which finer sheets are interpolated
-RIM_SHRINK = 1e-9  # relative shrinkage towards the centre, so that corners on the rim of the light count as lit
+RIM_SHRINK = 1e-9  # relative shrinkage of a sheet towards its centre, so that corners on the rim of the light are lit
 MAX_BAND_ROWS = 256  # maximum rows of tubes traced at a time for a picture; even, since the diagonals alternate
 MAX_BAND_TUBES = 1 << 19  # maximum tubes traced at a time for a picture, which limits its memory
 MAX_RAYS_PER_BAND = 1 << 17  # maximum rays traced at a time in plain torch, a megabyte per coordinate
@@ -153,7 +153,7 @@ def _tubes(source: Emitter, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tube
 
 
 def _density(source: Emitter, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | None) -> Tensor:
-    """Return each tube's flux per mm² of the vertex plane; lit: True for lit corners; None: all are lit."""
+    """Return each tube's flux per mm² of the vertex plane; lit: True at lit corners, or None if all are lit."""
     density = source.irradiance(middle(x), middle(y), lens.entrance.z)
     if lit is not None:
         count = middle(lit.to(density))
@@ -165,7 +165,7 @@ def _density(source: Emitter, lens: Lens, x: Tensor, y: Tensor, lit: Tensor | No
 
 
 def _sheet(source: Emitter, lens: Lens, n: int, few: int = SHEET_TUBES, over_the_back: bool = False) -> _Sheet:
-    """Return the sheet over the beam; over the back face if the lens cuts the beam, or if `over_the_back` is True."""
+    """Return the sheet over the beam, or over the back face if the lens cuts the beam or `over_the_back` is True."""
     return (None if over_the_back else _over_the_beam(source, lens, n)) or _over_the_back(source, lens, n, few)
 
 
@@ -226,7 +226,7 @@ def _tubes_per_side(lens: Lens, light: Outline, n: int) -> Sides:
 
 
 def _quads(p: Tensor, where: Tensor) -> tuple[Tensor, ...]:
-    """Return one coordinate of the four corners of the tubes where `where` is True, each (n,), row by row."""
+    """Return p (x or y of all corners) at the four corners of each tube where `where` is True: (n,) each, by rows."""
     row, column = where.nonzero(as_tuple=True)
     return p[row, column], p[row, column + 1], p[row + 1, column], p[row + 1, column + 1]
 
@@ -276,7 +276,7 @@ def rays_to(
     """Find the rays that meet an interface of the lens at the points (x, y), a grid (rows, columns) in mm.
 
     number: number of the interface; None: the back.  Returns x and y (mm) at which the rays cross the vertex plane of
-    the first surface, and the rays at the interface, not yet deflected.
+    the first surface, and the rays at the interface, not yet deflected; rays that are not found there are lost.
 
     Broyden's method starts from a Jacobian of difference quotients.  On a fine grid the initial points and Jacobian
     are interpolated from the solution on a coarse grid.
@@ -368,7 +368,7 @@ def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tenso
     """Return (picture (rows, columns), outside) of tubes.
 
     corner: (column, row) of the corners in pixels, (2, n + 1, m + 1).  flux: flux of the tubes, (n, m).
-    outside: Σ flux · (mean of the corners' squared distances outside the border, pixel²); light outside has a gradient.
+    outside: Σ flux · (mean of the corners' squared distances to the picture, pixel²): a gradient for light outside.
     """
     if corner.dtype == torch.float64 and (fast := ops.kernel("tubes.collect", corner)):
         return fast(corner, flux, shape, MIN_TRIANGLE_AREA)
@@ -376,7 +376,7 @@ def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tenso
 
 
 def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Run `collect` in plain torch, by Green's theorem (see clip.py): the edges are split at all pixel borders.
+    """Collect as `collect` does, but in plain torch, by Green's theorem (clip.py); edges are split at pixel borders.
 
     On a GPU `index_add` sums in no fixed order, so that the last bits change from run to run.
     """

@@ -47,7 +47,7 @@ class ExitPupil:
     x: Tensor  # (n, n) x of the rays on the plane, mm
     y: Tensor  # (n, n) y of the rays on the plane, mm
     direction: Tensor  # (3, n, n) unit vectors of the rays
-    path: Tensor  # (n, n) optical path to the plane, mm, from the reference of `optical_path`
+    path: Tensor  # (n, n) optical path to the plane, mm, from the wavefront at which `optical_path` starts
     flux: Tensor  # (n, n) fraction of the source's flux, after losses at faces and in glass
     alive: Tensor  # (n, n) bool, False for lost rays and rays without flux, whose other numbers are meaningless
     rounding: float  # bound of the rounding error of `path`, mm
@@ -193,7 +193,7 @@ def residual(pupil: ExitPupil, wave: Wave, nm: float) -> Tensor:
 
 
 def _compare(pupil: ExitPupil, wave: Wave, nm: float) -> tuple[Tensor, Tensor, _Fit, Tensor]:
-    """Return (compared rays (n, n); for these: OPD without piston in mm, its plane fit, flux divided by its sum)."""
+    """Return (True at compared rays (n, n), their OPD without piston (mm), plane fit of the OPD, flux / its sum)."""
     compared = pupil.alive & wave.contains(pupil.x, pupil.y)
     if int(compared.sum()) < 3:
         raise ValueError(f"too few rays reach the goal wave at z = {wave.z:g} mm; change z, or a Zernike wave's circle")
@@ -235,7 +235,7 @@ def _rms(values: Tensor, share: Tensor) -> float:
 def _map(
     x: Tensor, y: Tensor, opd: Tensor, slopes: list[Tensor], cells: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (x (k,), y (k,), OPD (k, k)): the OPD of rays on a grid of k x k square cells, NaN where no ray is near.
+    """Return (x (k,), y (k,), OPD (k, k)) of a map of k x k square cells, k = `cells`; NaN where no ray is near.
 
     Each ray contributes to the four cell centres around it, with bilinear weights and extrapolated by its slope (∇OPD),
     so that the error of the map is of second order in the cell size.

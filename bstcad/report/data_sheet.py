@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 297.0, 210.0  # size of the page, A4 (mm)
 FRAME = (20.0, 10.0, 287.0, 200.0)  # left, lower, right and upper edge of the frame (mm, ISO 5457)
-TABLE_TOP, TITLE_LEFT, LIGHT_LEFT = 60.5, 205.0, 226.0  # y of the tables' top, x of title block and of light (mm)
+TABLE_TOP, TITLE_LEFT, LIGHT_LEFT = 60.5, 205.0, 226.0  # y of the tables' top; x where title block and light begin (mm)
 ROW_HEIGHT, TABLE_FONT, HEADING_FONT = 3.57, 2.3, 2.6  # height of a table row, font sizes of rows and headings (mm)
 PICTURE_PIXELS = 256  # largest number of pixels along the longer side of a picture of the light
 APERTURE_ROUNDING = 1e-4  # relative amount by which a printed clear aperture may be too small
@@ -45,7 +45,7 @@ class DataSheet:
 
     scene: Scene
     designed: Lens  # lens as designed, not cut to the rim of its mount
-    shape: Mapping[str, float | None]  # facts of analysis.shape.describe inside the mount's rim; volume of lens.step
+    shape: Mapping[str, float | None]  # facts of analysis.shape.describe inside the mount's rim, volume of lens.step
     order: Order  # order for the shop; order.file is the STEP file that the sheet describes
     target: np.ndarray  # picture of the first target (rows, columns), row 0 at y max, column 0 at x min
     irradiance: np.ndarray  # irradiance on the first target, in the form and with the sum of `target`
@@ -88,7 +88,7 @@ class DataSheet:
 
 
 def _aperture(patch: Outline | None, outline: Outline) -> str:
-    """Return the size of a clear aperture (None: the whole face) in words, rounded up to 3 digits, within `outline`."""
+    """Return a clear aperture in words, rounded up to 3 digits, a rectangle within `outline`; None: the whole face."""
 
     def up(value: float) -> float:
         return float(rounded_up(value * (1 - APERTURE_ROUNDING)))

@@ -77,7 +77,7 @@ def footnote(figure: Figure, text: str) -> None:
 
 @styled
 def png(figure: Figure, ground: str = "#ffffff") -> bytes:
-    """Return the figure as PNG on the colour `ground`, cropped to MARGIN; with fewer pixels above MAX_PNG_BYTES."""
+    """Return the figure as PNG on the colour `ground`, cropped to MARGIN, with fewer pixels if above MAX_PNG_BYTES."""
     picture = _encode(figure, DPI, ground)
     if len(picture) > MAX_PNG_BYTES:
         picture = _encode(figure, DPI * 0.95 * (MAX_PNG_BYTES / len(picture)) ** 0.5, ground)

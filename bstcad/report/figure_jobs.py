@@ -275,7 +275,7 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
 
 @styled
 def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
-    """Draw the lines of a regular grid (k, k, 2) on the front (mm) and their images (k, k, 2) on the target."""
+    """Draw lines of a grid `source` (k, k, 2) on the first vertex's plane (mm), and `image` (k, k, 2) on the target."""
     figure, where = new_figure(8.2, 3.9, layout="compressed"), "front of the lens" if view.optic == "lens" else "mirror"
     sides = ((f"Grid on the {where}", source, LevelPlane(0.0).labels), ("Its image on the target", image, view.labels))
     for axes, (title, points, (x, y)) in zip(figure.subplots(1, 2), sides, strict=True):

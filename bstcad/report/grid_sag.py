@@ -37,7 +37,7 @@ MAX_FLUSH_POINTS = 1_050_000  # number of points up to which a grid that ends at
 SHIFT_RAYS = 192  # rays per side of the bundle by which a shift is measured
 RIM_ROUNDING = 1e-9  # distance from the rim that counts as zero (in pitches of the net, or steps of the grid)
 NEWTON_STEPS = 12  # steps of Newton's method to the intersection with the patches; smooth faces need 5
-MIN_DERIVATIVE = 1e-6  # lower bound of the derivative in a step of Newton's method
+MIN_DERIVATIVE = 1e-6  # |F'| up to which a step of Newton's method divides by this number instead
 HIT_TOLERANCE = 1e-9  # residual of the last step below which a ray hits the face (mm)
 
 Pair = tuple[np.ndarray, np.ndarray]  # x and y of the points of a grid (mm)
@@ -250,7 +250,7 @@ class GridSag:
 
     @classmethod
     def of(cls, lens: Lens, face: BSplineSurface, points: int | None = None, light: GridLight | None = None) -> GridSag:
-        """Return a grid with `points` along the wider side; None: through the knots, as fine as MAX_SHIFT requires."""
+        """Return a grid, `points` along the wider side; None: through the knots, as fine as MAX_SHIFT requires."""
         if points is not None:
             return cls._at(lens, face, axes(lens.outline, max(points, MIN_ZEMAX_POINTS), MIN_ZEMAX_POINTS), light)
         grids = [at for parts in CELLS_PER_SPAN if (at := through_knots(face, lens.outline, parts)) is not None]

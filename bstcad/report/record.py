@@ -481,7 +481,7 @@ def plain(value: Any) -> Any:
 
 
 def write_json(report: Contents, path: str | Path) -> None:
-    """Write report.json: one record per line, numbers with 12 digits; ValueError names a number that is not finite."""
+    """Write report.json: one record per line, rounded by `_rounded`; ValueError names a number that is not finite."""
     lines = ",\n".join(f"  {_line(key)}: {_block(_rounded(value, key))}" for key, value in report.facts().items())
     files.put(Path(path), f"{{\n{lines}\n}}\n".encode())
 

@@ -79,7 +79,7 @@ def lens_picture(mesh: Mesh) -> bytes | None:
 
 
 def draw(path: LightPath, picture: Path | None) -> bool:
-    """Write `picture` (PNG; None: show a window until the user closes it); False if this machine cannot draw in 3-D."""
+    """Draw into the PNG `picture`, or if None in a window until it closes; False: this machine cannot draw in 3-D."""
     given = vars(path).items()
     arrays = {name: np.asarray(value) for name, value in given if not isinstance(value, tuple)}
     arrays |= {f"{name} {k}": each for name, value in given if isinstance(value, tuple) for k, each in enumerate(value)}
