@@ -282,7 +282,7 @@ def check_front(lens: Lens, scene: Scene) -> None:
 
 
 def _with_comparison(making: DesignCourse, task: Task, lens: Lens, before: int) -> DesignCourse:
-    """Return the record with the comparison of precisions for the lens of stage 1, inserted after `before` stages."""
+    """Return `making` with the comparison of precisions for the lens of stage 1, after the first `before` stages."""
     began, cpu = time.perf_counter(), time.process_time()
     comparison = cast(PrecisionTest, asdict(compare_precisions(task, lens)))
     stage = StageRecord(COMPARISON_STAGE, time.perf_counter() - began, cpu_seconds=time.process_time() - cpu)
@@ -291,7 +291,7 @@ def _with_comparison(making: DesignCourse, task: Task, lens: Lens, before: int) 
 
 
 def _design_course(result: Stage1Result, record: DesignRecord, stopped: str, steep: Steepness) -> DesignCourse:
-    """Return the course of a design for the report; stopped: reason why tailoring ended."""
+    """Return the course of a design for the report; stopped: reason why tailoring ended; steep: needed slope."""
     solved = result.mapping.transport
     return DesignCourse(
         seconds_total=record.seconds,

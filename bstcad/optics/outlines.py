@@ -21,7 +21,7 @@ STRICT = {"extra": "forbid", "arbitrary_types_allowed": True, "revalidate_instan
 # are boxes with round corners; a circle (a = b = 0) and a rectangle (r = 0) are the limiting cases.
 Limits = tuple[float, float, float]
 SIZE_RANGE = (1e-3, 1e6)  # smallest and largest width, height or radius of an outline in a scene, mm
-OUTLINE_POINTS = 720  # number of rim points on all arcs of an outline, and about the number on all its straight sides
+OUTLINE_POINTS = 720  # rim points on all arcs of an outline together, and about as many on all its straight sides
 
 
 class _Box(ABC):

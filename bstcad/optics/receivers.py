@@ -106,7 +106,7 @@ class Receiver(ABC):
         return torch.stack([x - rays.position[0], y - rays.position[1], z - rays.above(0.0)])
 
     def clearance(self, outline: Outline, z: float) -> float:
-        """Return the least path (mm) along +z from a rim on the plane z to the receiver; -inf: a line misses it."""
+        """Return the least path (mm) along +z from the rim at z to the receiver; -inf: a rim point has no such path."""
         x, y = (torch.as_tensor(p, dtype=torch.float64) for p in outline.rim_points())
         along = torch.stack([torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)])
         start = torch.stack([x, y, torch.zeros_like(x)])

@@ -334,7 +334,7 @@ class Recess(Surface):
         return torch.where(inside, h, rim), torch.where(inside, z_x, zero), torch.where(inside, z_y, zero)
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Return, lower one first, zero and the sag (mm) at the rim of the optical part, or of a smaller `outline`."""
+        """Return 0 and the sag (mm) at the rim of the optical part or of a smaller `outline`, the lower one first."""
         smaller = math.hypot(*outline.farthest) < self.outline.radius
         return self.face.sags(outline if smaller else self.outline)
 

@@ -86,7 +86,7 @@ class TiltedSurface(Surface):
         return s, ok & (self.face_curvature * s * dz < n_z)
 
     def sags(self, outline: Outline) -> tuple[float, float]:
-        """Return minimum and maximum (mm) of zero and the heights over the plane z, on axis and on an outline's rim."""
+        """Return minimum and maximum (mm) of 0 and the heights over the plane z on the axis and at the outline."""
         x, y = (torch.from_numpy(np.append(p, 0.0)) for p in outline.rim_points())
         h = self.relative_sag_and_slope(x, y)[0]
         return min(float(h.min()), 0.0), max(float(h.max()), 0.0)

@@ -368,7 +368,7 @@ def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tenso
     """Return (picture (rows, columns), outside) of tubes.
 
     corner: (column, row) of the corners in pixels, (2, n + 1, m + 1).  flux: flux of the tubes, (n, m).
-    outside: Σ flux · (mean of the corners' squared distances to the picture, pixel²): a gradient for light outside.
+    outside: Σ flux · (mean squared distance of corners to the picture, pixel²), so that light outside has a gradient.
     """
     if corner.dtype == torch.float64 and (fast := ops.kernel("tubes.collect", corner)):
         return fast(corner, flux, shape, MIN_TRIANGLE_AREA)
@@ -420,7 +420,7 @@ def _triangles(corner: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _pieces(start: Tensor, end: Tensor, sizes: tuple[int, int]) -> tuple[Tensor, ...]:
-    """Return (edge, s at its start, s at its end, column, row) of each piece of an edge between pixel borders.
+    """Return (number of the edge, s at start and end, column, row) of each piece of an edge between pixel borders.
 
     s runs from 0 to 1 along the edge.  Outside the screen (columns, rows) edges are not split.  The pixel of a piece
     follows from the borders crossed before it.  Its midpoint would not do: at the corner of a pixel a piece has length

@@ -88,7 +88,7 @@ class Pictures:
         self._jobs.append(self._vtk.submit(lambda: {"lens": rendering.lens_picture(mesh)}))
 
     def lens(self, lens: Lens) -> None:
-        """Start the jobs that draw the maps of the lens and its rays."""
+        """Start the job `draw_lens`, and a job `draw_transport` for each target."""
         source, screens = self._scene.source.central, [target.screen for target in self._scene.targets]
         self.begin(draw_lens, source, lens, screens)
         for k, screen in enumerate(screens):

@@ -250,7 +250,7 @@ class GridSag:
 
     @classmethod
     def of(cls, lens: Lens, face: BSplineSurface, points: int | None = None, light: GridLight | None = None) -> GridSag:
-        """Return a grid, `points` along the wider side; None: through the knots, as fine as MAX_SHIFT requires."""
+        """Return a grid, `points` along the wider side, or if None through the knots, as fine as MAX_SHIFT requires."""
         if points is not None:
             return cls._at(lens, face, axes(lens.outline, max(points, MIN_ZEMAX_POINTS), MIN_ZEMAX_POINTS), light)
         grids = [at for parts in CELLS_PER_SPAN if (at := through_knots(face, lens.outline, parts)) is not None]
