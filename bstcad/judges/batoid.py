@@ -28,7 +28,7 @@ from bstcad.optics.rays import Rays, axes
 from bstcad.optics.tilted import TiltedSurface
 from bstcad.optics.trace import launch_strips
 
-GRID_MARGIN = 0.125  # margin of a Bicubic beyond each edge of the net, for searches for hits / width of the net
+GRID_MARGIN = 0.125  # margin of a Bicubic beyond each edge of the net / width of the net; searches for hits need it
 POLYGON_CORNERS = 4096  # number of corners of the polygon that represents an outline with round corners
 COMPARISON_POINTS = 100_000  # largest number of points at which batoid's faces are compared with the lens's
 

@@ -24,7 +24,7 @@ from bstcad.optics.unfolding import per_radian
 
 PARAMETER_STEPS = 6  # steps of Newton's method for t at a given x; the first guess has an error of at most half a span
 GRID_CELLS = 512  # number of cells per side of the coarsest grid over a curved face without knots
-PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # ring radii / rim radius; many, as slim triangles leak
+PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # radii of rings / rim radius; slim triangles leak light
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,7 @@ def face_mesh(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Trime
     """Return a mesh of a face inside the outline, and its error; exact normals at corners, towards +z (up) or -z.
 
     The grid (Face.lines(parts)) has lines through all knots.  Between corners, normals are interpolated linearly,
-    nearly as on a quadratic spline.  Cells outside the rim are omitted; cells that the rim crosses end on the rim.
+    nearly as on a quadratic spline.  Cells without a corner inside are omitted; then corners outside move to the rim.
     """
     x, y = face.lines(parts)
     shape = face.on_grid(x, y)

@@ -37,9 +37,9 @@ STEP_TOLERANCE = 1e-10  # largest component (mm at the rim) of a step that ends 
 FOOT_ITERATIONS = 3  # iterations for the foot of a perpendicular; each multiplies the error by distance x curvature
 INDEPENDENT_PATCHES = 100  # assumed number of patches of a face with independent form errors
 SCALE_PATCHES = 16  # assumed number of independent patches of form errors that resemble a scale error: errors of power
-MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty of a motion due to form errors / BackFace.reach, above which it stays zero
+MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty of a motion (from form errors) / BackFace.reach, above which it stays zero
 MIN_SENSITIVITY = 1e-7  # smallest RMS change of the distances per motion (mm/mm); smaller ones are rounding errors
-RIM_MARGIN = 2e-3  # width of the ignored strip along the rim, whose points may lie on the edge / half width of the face
+RIM_MARGIN = 2e-3  # width of the ignored strip along the rim / half width of the face; points in it may lie on the edge
 FACE_DISTANCE_FRACTION = 0.25  # largest distance along z of a point from the face / smallest thickness of the lens
 MOTION_NAMES = ("shift in x", "shift in y", "shift in z", "rotation about x", "rotation about y", "rotation about z")
 
@@ -320,7 +320,7 @@ def first_pose(face: BackFace, cloud: np.ndarray) -> tuple[Pose, float]:
 
 
 def find_axis_exchange(face: BackFace, cloud: np.ndarray, original: float) -> tuple[np.ndarray, str] | None:
-    """Return (matrix (3, 3), words) of an axis exchange that more than halves `first_pose`'s distance `original`."""
+    """Return (matrix, words) of an axis exchange that more than halves `first_pose`'s distance `original`, or None."""
     sample, fitting = _sample(cloud)[:: START_SAMPLE // AXES_SAMPLE], []
     for matrix, words in sorted(_axis_exchanges(), key=lambda exchange: _rarity(exchange[0])):
         turned = sample @ matrix.T

@@ -59,7 +59,7 @@ def channels_of(source: Emitter, index: Callable[[float], float], points: int, d
 
 
 def drawn_channels(source: Emitter, index: Callable[[float], float], points: int, seed: int) -> tuple[Channel, ...]:
-    """Return channels at random points of an extended source; the mean of their images over many seeds is unbiased.
+    """Return channels at random points of an extended source; the mean of their pictures over many seeds is unbiased.
 
     points: number of sample points of all lines together, at least one per line (sampling.shifted_lattice).
     """

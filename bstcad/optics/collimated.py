@@ -25,7 +25,7 @@ MAX_INCLINATION = 89.0  # limit of the angle between light and the axis of the l
 
 @dataclass(frozen=True)
 class Collimated(Emitter):
-    """Parallel rays through an aperture in a plane z: E constant there, or ∝ exp(-2 r² / w²), w: radius_1e2.
+    """Parallel rays through an aperture, on whose plane z the irradiance is constant, or ∝ exp(-2 r² / radius_1e2²).
 
     With a tilt the rays go along n = (n_x, n_y, n_z) (rays.axes).  On another plane the light is shifted by
     (n_x, n_y) / n_z times the distance, and its irradiance on planes z = const is unchanged.  With a divergence the
@@ -83,7 +83,7 @@ class Collimated(Emitter):
 
     @property
     def is_rotation_invariant(self) -> bool:
-        """True if the aperture is round; the cone always is."""
+        """True if the aperture is round; the cone of directions always is."""
         return self.aperture.is_round
 
     def moved(self, motion: Motion, entrance: float) -> Collimated:
@@ -137,7 +137,7 @@ class Collimated(Emitter):
         return torch.where(inside, peak, torch.zeros_like(x))
 
     def _gaussian(self) -> tuple[float, float]:
-        """Return (∫ exp(-2 r² / w²) over the aperture, w²) of a gaussian profile, each in mm²."""
+        """Return (∫ exp(-2 r² / w²) over the aperture, w²) of a gaussian profile, w: radius_1e2, each in mm²."""
         assert self.radius_1e2 is not None  # a gaussian profile needs it (`widths`)
         w = self.radius_1e2
         if isinstance(self.aperture, Circle):

@@ -301,7 +301,7 @@ def _newton(
 
 
 def slopes_beyond(surface: BSplineSurface, x: Tensor, y: Tensor, z_x: Tensor, z_y: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the slopes of the sag continued outside the net: zero in the direction across the rim."""
+    """Return slopes (z_x, z_y), zero across the rim for points outside the net, where the sag continues constant."""
     in_x, in_y = ((p >= ends[0]) & (p <= ends[1]) for p, ends in ((x, surface.x), (y, surface.y)))
     return torch.where(in_x, z_x, torch.zeros_like(z_x)), torch.where(in_y, z_y, torch.zeros_like(z_y))
 

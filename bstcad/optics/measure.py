@@ -460,7 +460,7 @@ class RayTubes:
 def tubes_picture(
     lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, over_the_back: bool = False
 ) -> Tensor:
-    """Return the flux per pixel as a fraction of the source's, by n x n tubes per channel; options: `tubes.picture`."""
+    """Return flux per pixel / flux of the source by n x n tubes per channel; over_the_back: as in `tubes.picture`."""
     few = COARSE_SHEET if over_the_back else tubes.SHEET_TUBES
     lights = ((c.source, c.through(lens)) for c in channels)
     pictures = (tubes.picture(*light, screen, n, few=few, over_the_back=over_the_back) for light in lights)

@@ -26,7 +26,7 @@ from typing import Any
 
 MAKERS_SHELF = "specs"  # shelf of the data sheets of glass makers, in which a glass name alone identifies a page
 MAX_NAMES_LISTED = 8  # largest number of page names listed in a message
-MAX_NAME_LENGTH = 60  # characters up to which a name is quoted in full; names twice as long are still looked up
+MAX_NAME_LENGTH = 60  # characters up to which a name is quoted in full; names up to twice as long are looked up
 RANGE_TOLERANCE = 1e-9  # relative tolerance of the wavelength range, for rounding by a change of unit
 
 _NAMES = re.compile(r"^ *(?:- )?(SHELF|BOOK|PAGE|data): (.*)$", re.MULTILINE)  # lines of a catalogue

@@ -363,7 +363,7 @@ def _reversed(edge):
 
 @inlined
 def _triangle_adjoint(a, b, c, ab, bc, ca, flux):
-    """Return (gradients in the corners a, b and c, gradient in the flux) of a triangle from its edges' integrals."""
+    """Return (gradients in a, b and c, gradient in the flux) of a triangle abc; ab, bc, ca: its edges' `along_edge`."""
     area = area_of(a, b, c)
     phi, w = ab[0] + bc[0] + ca[0], flux / area
     mean = phi / area

@@ -37,7 +37,7 @@ NO_TABLE = LightTable(0, 0, 0.0, 0.0, 0.0, 0.0, *3 * (np.zeros(0),))
 
 
 class Beam(NamedTuple):
-    """Irradiance E = peak exp(-fall r²) / d^power on the first vertex's plane; r: distance from (x, y), d: from source.
+    """Irradiance E = peak exp(-fall r²) / d^power on the first vertex's plane; r, d: distances from (x, y) and source.
 
     The irradiance of a tilted point source is `Point._tilted_irradiance`: peak times c / d^4, 1 / d³ or exp(-fall (d² -
     c²) / c²) / c³, c = d cos θ, for the powers 4, 3 and 0.  With a table E is peak times the table's irradiance.
@@ -84,7 +84,7 @@ class Fates(NamedTuple):
 
 
 class TiltedScreen(NamedTuple):
-    """Tilted plane as numbers, in the frame in which light starts along +z; `Faces.throw` is z of C over the net."""
+    """Tilted plane as numbers, in the frame in which light starts along +z; `Faces.throw`: height of C over the net."""
 
     x: float  # position of the centre C of the rotation (mm), also the coordinates of C on the plane
     y: float
