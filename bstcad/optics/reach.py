@@ -92,7 +92,7 @@ def slopes_towards(at_face: Rays, out: Tensor, law: Law) -> tuple[Tensor, Tensor
 
 
 def normal_towards(at_face: Rays, out: Tensor, law: Law) -> Tensor:
-    """Return ±(η d - d'): the normal (3, …), of any length, of a face that deflects each ray from d into d' = `out`."""
+    """Return n = ±(η d - d'), normals (3, …) of a face that deflects rays from d into d' = `out`; n_z < 0: overhang."""
     return (at_face.sense if law.eta >= 1 else -at_face.sense) * (law.eta * at_face.direction - out)
 
 
