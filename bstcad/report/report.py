@@ -263,7 +263,7 @@ def _of_target(plan: Mapping[str, Any], of: str, optic: str) -> Iterator[Rendera
 
 
 def plan_predictions(plan: Mapping[str, Any]) -> Group:
-    """Return the predicted seconds, RRMSD and memory of each quality, and of quality standard with a finer net."""
+    """Return predicted seconds, RRMSD and memory by quality, and for a finer net; plan: as for `plan_effects`."""
     from rich.console import Group
     from rich.text import Text
 

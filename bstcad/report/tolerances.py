@@ -200,7 +200,7 @@ def section(found: Tolerances, pictures: Mapping[str, bytes], optic: str) -> str
 
 
 def of_folder(folder: Path, optic: str) -> str:
-    """Return the `section` on the study in a design's folder; "" if it contains no readable tolerance.json."""
+    """Return `section` on the study in a design's folder; "" if tolerance.json is unreadable; optic: lens or mirror."""
     try:
         found = read(folder / "tolerance.json")
     except ValueError:

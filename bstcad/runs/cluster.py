@@ -83,7 +83,7 @@ def _local(workers: int) -> Iterator[str]:
 
 
 class Cluster:
-    """Workers of a scheduler at an address such as tcp://10.0.0.1:8786; patience: see CONNECTION_TIMEOUT."""
+    """Workers of a scheduler at an address such as tcp://10.0.0.1:8786; patience (s): see CONNECTION_TIMEOUT."""
 
     def __init__(self, address: str, patience: float = CONNECTION_TIMEOUT) -> None:
         self._distributed, self.address = _library("--scheduler"), address

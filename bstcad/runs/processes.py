@@ -75,7 +75,7 @@ PRELOADED = (  # modules that the second process loads at its start
 )
 # Growth of memory (bytes) at which loky ends a process; with its default, a solid in memory would count as a leak.
 MEMORY_LEAK_LIMIT = "1000000000000000"
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # parameters of glibc's mallopt (malloc.h)
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # numbers of two parameters of glibc's mallopt (malloc.h)
 MAX_KEPT = (1 << 31) - 1  # largest total of freed memory that stays with the process (bytes)
 MAX_KEPT_ARRAY = 1 << 27  # largest freed array that stays with the process (bytes)
 
@@ -323,7 +323,7 @@ def _end(child: subprocess.Popen) -> None:
 
 
 def end_with_parent() -> None:
-    """If this process was started by `run`, end it and its group once its parent has ended; else do nothing."""
+    """If `run` started this process, end its process group once the parent has ended; else do nothing."""
     parent = os.environ.pop(PARENT, None)
     if parent is not None and os.getpgrp() == os.getpid():
         _end_with(int(parent), lambda: os.killpg(0, signal.SIGKILL))

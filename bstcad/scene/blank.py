@@ -197,7 +197,7 @@ class _Front:
         return tuple(name for name in names if not isinstance(chosen, tuple) or name in chosen)
 
     def with_parameters(self, surface: Surface) -> Self:
-        """Return the front with all parameters of `surface`, fixed; a front without free parameters is unchanged."""
+        """Return the front, fixed, with the parameters of `surface`; a front without free parameters is unchanged."""
         return replace(self, **surface.plain().parameters(), optimise=False) if self.free else self
 
     def complaints(self, outline: Outline) -> Iterator[str]:

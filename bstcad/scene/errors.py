@@ -136,7 +136,7 @@ def _sentence(problem: ErrorDetails) -> str:
 
 
 def _type_sentence(kind: str, location: _Location, value: Any, context: Mapping[str, Any]) -> str:
-    """Return the sentence on an error that pydantic reports."""
+    """Return the sentence on an error of type `kind` by pydantic; value: refused value; context: `ctx` of the error."""
     key, last = location.key, location.key.rpartition(".")[2]
     shown = _value_text(value)
     tag, name = str(context.get("tag")), context.get("discriminator", "").strip("'")

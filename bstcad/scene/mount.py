@@ -21,7 +21,7 @@ from bstcad.scene.blank import LensBlank
 from bstcad.scene.schema import COORDINATES, LENGTHS, Record
 
 MAX_DRAFT = 30.0  # degrees; largest draft angle of the walls of a lens
-MIN_WEB = 0.1  # mm; smallest width of a flange between the lens and its edge, and between a hole and any other edge
+MIN_WEB = 0.1  # mm; smallest width of a flange beside the lens, and of the web between a hole and any other edge
 LAND = 0.1  # height of the upright wall below the back's rim: 0.1 mm, or a tenth of a wall lower than 1 mm
 ITERATIONS = 60  # iterations to find the end of a bevel or wall; each halves the error on a front of slope 0.5
 MIN_CLOSING = 0.25  # smallest rate at which a bevel or a wall with draft nears the front (mm per mm of depth)
@@ -309,7 +309,7 @@ def _corner_complaints(key: str, shape: Round | Box, taken: float) -> Iterator[s
 
 
 def _flange_complaints(flange: Flange, lens: LensBlank, rim: Round | Box) -> Iterator[str]:
-    """Yield complaints: a flange too thin for its bevels or beside the wall of the lens; holes that do not fit."""
+    """Yield complaints: a flange too thin for its bevels, or above or below the lens's wall; holes that do not fit."""
     key, upper = "mount.flange", flange.z + flange.thickness
     taken = flange.bevel + flange.thickness * math.tan(math.radians(flange.draft))
     if not 2 * flange.bevel < flange.thickness:

@@ -144,7 +144,7 @@ class Plate:
         return even_image(image).deviation(scene.target.irradiance())
 
     def text(self, name: str, picture: Path | None = None, blurred: float | None = None) -> str:
-        """Return the text of the scene file; picture: path (None: letters); blurred: as for `expectation`."""
+        """Return the text of the file of scene `name`; picture: path (None: letters); blurred: as for `expectation`."""
         import jinja2  # slow to load, and not needed for a list of the templates
 
         text = jinja2.Template(

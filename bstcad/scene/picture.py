@@ -165,7 +165,7 @@ def _silent() -> Iterator[None]:
 
 
 def _open_picture(name: str, data: bytes) -> ImageFile.ImageFile:
-    """Return the picture with its header read and its pixels not decoded yet."""
+    """Return the picture in `data` with its header read and its pixels not decoded yet; name: for messages."""
     sizes, kinds = [], f"not a {FORMAT_NAMES} picture; save it in one of these formats"
     try:
         if data[4:8] == b"ftyp":  # boxes of a HEIF file, which may show a part of the coded pixels

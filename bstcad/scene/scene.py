@@ -480,7 +480,7 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
 def of_text(
     text: str, data: dict[str, Any], path: Path, overrides: Mapping[str, Any] | None = None, bounds: Sequence[Path] = ()
 ) -> Scene:
-    """Read the scene from the text of a TOML file.
+    """Read the scene from the text of a TOML file; overrides: as for `load`.
 
     data: the tables of the text.  path: its file, which need not exist.  bounds: folders; a path into one of them must
     not lead out of them by symbolic links.  Raises SceneError, with the line of the fault as a note.

@@ -234,7 +234,7 @@ class Target(Record):
             yield f"target.z: {where} along {DIRECTIONS[sense]}, as the light travels; move one of them"
 
     def clearance(self, lens: LensBlank, highest: float) -> float:
-        """Return the gap (mm) between the target's plane and a lens that ends at z = highest (mm); < 0: they cross."""
+        """Return the gap (mm) from a lens that ends at z = highest (mm) to the target's receiver; < 0: they overlap."""
         return self.screen.plane.clearance(lens.outline, highest)
 
     def grazed(self, lens: LensBlank) -> Iterator[str]:
@@ -401,7 +401,7 @@ def _drawing(target: Target) -> Drawing:
 
 
 def _photo_light(target: Target, given: Picture | str, pixels: Pixels, size: Size) -> tuple[np.ndarray, list[str]]:
-    """Return the irradiance (rows, columns) of a photo over `pixels` of a target before its rotation, and remarks."""
+    """Return the irradiance (rows, columns) of photo `given` over `pixels`, before the rotation, and remarks on it."""
     photo = picture.photo(given, target.gamma, target.invert)
     if target.crop is not None:
         photo = photo.part(crop_box(photo.image.size, target.crop))

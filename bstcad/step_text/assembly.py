@@ -62,7 +62,7 @@ def _representations_and_links(solid: str, entities: Entities) -> tuple[list[str
 
 
 def _paths(home: str, links: dict[str, list[Link]], seen: frozenset[str]) -> list[list[Placement]]:
-    """Return the paths from `home` to representations without a parent, as placements, outermost first; two at most."""
+    """Return at most two paths (placements, outermost first) up from `home` to the last parent; seen: those below."""
     same = _equal_representations(home, links)
     if not same.isdisjoint(seen):
         raise damaged(f"representation #{home} is part of itself")
@@ -123,7 +123,7 @@ def _links(items: dict[str, list[str]], entities: Entities) -> Iterator[tuple[st
 
 
 def _components(entities: Entities) -> Iterator[tuple[str, set[str]]]:
-    """Yield (relationship, representations) of each part of an assembly."""
+    """Yield (relationship, representations of the part) for each part of an assembly."""
     shapes = _shapes(entities)
     for context in entities.of("CONTEXT_DEPENDENT_SHAPE_REPRESENTATION"):
         relation, shape = _pair(context, entities)

@@ -118,9 +118,9 @@ def read_entities(text: str) -> tuple[str, Entities]:
     if len(missing):
         raise damaged(f"entity #{missing.min()} is missing")
     if not np.isfinite(xyz).all():
-        raise ValueError("a CARTESIAN_POINT is not finite; write the file again")
+        raise ValueError("a CARTESIAN_POINT is not finite; export the file again")
     if np.abs(xyz).max(initial=0.0) > MAX_COORDINATE:
-        raise ValueError(f"a CARTESIAN_POINT has a coordinate above {MAX_COORDINATE:g}; write the file again")
+        raise ValueError(f"a CARTESIAN_POINT has a coordinate above {MAX_COORDINATE:g}; export the file again")
     order = np.argsort(numbers)
     bodies = {hit[1]: (hit[2] or "COMPLEX", hit[3]) for hit in hits}
     return data, Entities(bodies, strings, numbers[order], xyz[order])
@@ -135,7 +135,7 @@ def required(hit: re.Match[str] | None) -> re.Match[str]:
 
 def damaged(fault: str) -> ValueError:
     """Return the error of a damaged file; fault: for example "it has no DATA section"."""
-    return ValueError(f"the file is damaged ({fault}); write it again")
+    return ValueError(f"the file is damaged ({fault}); export it again")
 
 
 def decode(string: str) -> str:
@@ -147,7 +147,7 @@ def decode(string: str) -> str:
 
 
 def _check_tokens(rest: str, hits: Sequence[re.Match[str]]) -> None:
-    """Raise ValueError if the statements `rest` have an unknown token, or a number too long or beyond a double."""
+    """Raise ValueError if the text `rest` of statements `hits` has an unknown token, or too long or large a number."""
     if TOKENS.sub("", rest):
         number, kind, body = next(hit.groups() for hit in hits if TOKENS.sub("", hit[3]))
         atoms = (atom for atom in re.split(r"[(),]+", body) if TOKENS.sub("", f"({atom})"))

@@ -163,7 +163,7 @@ def _parse(text: bytes) -> StepText:
     if (fault := beginning.fault(text)) is not None:
         raise ValueError(fault)
     if b"END-ISO-10303-21;" not in text[-200:]:
-        raise ValueError("the file is truncated (no END-ISO-10303-21 at its end); write or copy it again")
+        raise ValueError("the file is truncated (no END-ISO-10303-21 at its end); export or copy it again")
     data, entities = read_entities(text.decode("latin-1"))  # Part 21 is ASCII; latin-1 never fails
     lengths, angles = (_units(kind, entities) for kind in ("LENGTH", "PLANE_ANGLE"))
     if len(lengths) != 1:
@@ -194,7 +194,7 @@ def _parse(text: bytes) -> StepText:
 def _schema(data: str, strings: Sequence[str]) -> str:
     schema = re.search(r"FILE_SCHEMA\(\('(\d*)'", data)
     if schema is None:
-        raise ValueError("the header has no FILE_SCHEMA; write the file again")
+        raise ValueError("the header has no FILE_SCHEMA; export the file again")
     return one_line(strings[int(schema[1])])
 
 
@@ -322,10 +322,10 @@ def _net(text: str) -> np.ndarray:
     """Return the entity numbers (m, n) of the points of a control net; text: the rows of references to them."""
     lines = text.split("),(")
     if not all(REFERENCES.fullmatch(line) for line in lines):
-        raise ValueError("the control net is damaged; write the file again")
+        raise ValueError("the control net is damaged; export the file again")
     rows = [np.fromstring(line.replace("#", ""), dtype=np.int64, sep=",") for line in lines]
     if len({len(row) for row in rows}) != 1:
-        raise ValueError("the control net is not rectangular; write the file again")
+        raise ValueError("the control net is not rectangular; export the file again")
     return np.stack(rows)
 
 

@@ -95,7 +95,7 @@ REFUSED = {
     "of itself": (MAPPED.replace("(#110,#90)", "(#110,#90,#153)") + """#153 = MAPPED_ITEM('',#154,#110);
 #154 = REPRESENTATION_MAP(#110,#120);\n""", "part of itself"),
     "in a plane": (ASSEMBLY.replace("AXIS2_PLACEMENT_3D('',#101,#102,#103)", "AXIS2_PLACEMENT_2D('',#101,#103)"),
-                   "AXIS2_PLACEMENT_2D places the lens"),
+                   "AXIS2_PLACEMENT_2D is a placement"),
 }  # fmt: skip
 
 
