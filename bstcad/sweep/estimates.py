@@ -165,7 +165,7 @@ def _dispersion(scene: Scene, reference: Reference) -> LeftOut:
 
 
 def band(scene: Scene) -> tuple[float, float]:
-    """Return the band (low, high) in nm assumed for a single wavelength: VISIBLE_BAND for sunlight, else LINE_WIDTH."""
+    """Return the band (low, high), nm, assumed for one wavelength: VISIBLE_BAND for sunlight, else LINE_WIDTH wide."""
     source = scene.source
     if isinstance(source, Collimated):
         divergence = source.divergence or source.real_divergence or 0.0

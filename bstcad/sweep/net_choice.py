@@ -176,10 +176,10 @@ def _affordable(scene: Scene, candidates: list[Candidate]) -> tuple[tuple[Candid
 
 
 def seam_shift(scene: Scene) -> float:
-    """Return the distance (pixels) on the target between light from the two ends of a cell in the narrowest valley.
+    """Return the distance (pixels) on the target between light from both ends of a cell in the tool's narrowest valley.
 
     It is p L D / R, with the width p of a cell, the throw L, the tool radius R, and the ratio D of deflection to slope
-    (Passes.deflection); infinite without R.  At a seam, where light separates, a valley is as narrow as R allows.
+    (Passes.deflection); infinite without R.  At a seam, where light separates, the back has such a valley.
     """
     radius, target = scene.lens.tool_radius, scene.target
     if radius is None:
@@ -226,7 +226,7 @@ def area_cells(scene: Scene, lens: Lens) -> ControlCells:
 
 
 def net_rrmsd(light: ControlCells, scene: Scene, image: float = 0.0) -> float:
-    """Estimate the RRMSD of a scene from detail finer than its net's cells or than cells twice as wide, and an offset.
+    """Estimate the RRMSD of a scene: detail finer than its net's cells, finer than cells twice as wide, and an offset.
 
     light: see `area_cells`.  image: RRMSD of the target blurred by the image of the source.  The estimate is fitted to
     designs in standard quality: half are within a factor 1.3, nine of ten within 2.  Other qualities: less accurate.

@@ -69,12 +69,12 @@ from bstcad.tailoring.source_image import BlurOperator, ExtendedSource, blur_err
 
 LAPLACIAN_POWER = 0.5  # power of the Laplacian in `SobolevVariable`
 COARSE_LAPLACIAN_POWER = 0.75  # power of the Laplacian in `CoarseVariable`, whose net has about one cell per pixel
-TARGET_BLUR = 1.0  # standard deviation of the blur of the target before the local weight is computed (pixels)
-WEIGHT_SMOOTHING = 1.5  # standard deviation of the smoothing of the weight's logarithm (control points)
+TARGET_BLUR = 1.0  # standard deviation (pixels) of the blur of the target before the local weight is computed
+WEIGHT_SMOOTHING = 1.5  # standard deviation (control points) of the smoothing of the weight's logarithm
 MAX_LOCAL_WEIGHT = 4.0  # largest local weight; the smallest is 1 / MAX_LOCAL_WEIGHT, before division by the leverage
 # Range of the leverage / median in which the weight is proportional to 1 / leverage.
 MIN_LEVERAGE, MAX_LEVERAGE = 3.0, 96.0
-LEVERAGE_STEP = 1e-6  # shift of target points t / their largest distance, in difference quotients of p(b, t)
+LEVERAGE_STEP = 1e-6  # shift of target points t / their largest distance from the lens, for quotients of p(b, t)
 LEVERAGE_STRIDE = 8  # every 8th control point is checked first, since few lenses have a large leverage anywhere
 
 

@@ -194,7 +194,7 @@ class Task:
         return (before, then) if then.beats(now) else (latest, now)
 
     def flux_on_target(self, lens: Lens) -> float:
-        """Return the fraction of the light entering the lens that falls on the first target."""
+        """Return the light on the first target as a fraction of the light that meets the lens."""
         return measure_goal(lens.plain(), self.channels, self.goals[0], FLUX_EFFORT, ghost=None, draw=None).used
 
 

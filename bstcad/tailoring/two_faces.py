@@ -40,7 +40,7 @@ from bstcad.tailoring.slope_map import FaceGrid, SlopeMap, Slopes
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Points, Solver
 
-POINT_SHIFT = 1e-4  # shift of a point for difference quotients of slopes, relative to the thickness
+POINT_SHIFT = 1e-4  # shift of a point of the back for difference quotients of slopes, relative to the thickness
 # Number of fine rounds: the last one has the full grid and nets, the others have half as many cells per side and the
 # second finest nets.  Several rounds are needed until the faces fit each other.  (With two, the errors of two
 # photographs, averaged over blocks of 4 to 32 pixels, are 1.5 times larger.)

@@ -88,12 +88,12 @@ def graded_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[
 
 
 def base_grade(table: Sequence[Tolerance]) -> str:
-    """Return the grade of the errors that a graded table does not name; "none" if these errors are zero."""
+    """Return the grade of the errors that a `graded_table` does not name; "none" if these errors are zero."""
     return settings_of([entry for entry in table if entry.name is None], "")["grade"]
 
 
 def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None = None) -> tuple[Perturbation, ...]:
-    """Return all errors of the setup, with limits from a graded table; material: lens.material or None.
+    """Return all errors of the setup, with limits from a `graded_table`; material: lens.material or None.
 
     Form errors and ripple that need a finer net are omitted.  Errors of one face relative to the other are included
     only if the table names them.  SceneError if the table names an omitted error, or if all errors are zero.

@@ -67,7 +67,7 @@ def run_locally(work: Callable[[Any, Any], Any], shared: Any, items: Sequence[An
 
 
 def _threads_may_share() -> bool:
-    """Return True if two threads may run numba's parallel kernels at a time, which the workqueue layer cannot."""
+    """Return True if two threads may run kernels at a time, which numba's layer workqueue does not allow."""
     try:
         return numba.threading_layer() in ("tbb", "omp")
     except ValueError:  # unknown before the first kernel runs
@@ -287,7 +287,7 @@ class Study:
 
     @property
     def disagreement(self) -> np.ndarray:
-        """Relative difference (fewer,) between the model and the full traces."""
+        """Relative difference between model and full trace, for each of the trials that are traced in full."""
         return np.abs(self.linear[: len(self.full)] / self.full - 1)
 
     def change_of(self, error: str) -> float:

@@ -50,8 +50,8 @@ def tolerance(folder: Path, settings: StudySettings) -> Tolerances:
         for key, _, allowed, designed in goals if settings.wanted is not None else ():
             if not designed < allowed:
                 raise SceneError(
-                    f"{key}: the design itself has {designed:.4f}, which is not below the limit {allowed:g}, so no "
-                    "tolerances give the wanted yield; improve the design, or raise this limit in scene.toml"
+                    f"{key}: the design itself has the value {designed:.4f}, which is not below the limit {allowed:g}, "
+                    "so no tolerances give the wanted yield; improve the design, or raise this limit in scene.toml"
                 )
         results = [studies.study(goal, allowed, designed, settings) for _, goal, allowed, designed in goals]
         study = studies.worst_of(results[: len(pictures)])
@@ -71,7 +71,7 @@ def tolerance(folder: Path, settings: StudySettings) -> Tolerances:
 
 
 def write_trial(folder: Path, number: int, path: Path, settings: StudySettings) -> tuple[tuple[Kind, float], ...]:
-    """Write the lens of one trial as a STEP file, in the frame of the lens; return all amounts of the trial by kind."""
+    """Write the lens of one trial as a STEP file, in the frame of the lens; return (kind, amount) of all its errors."""
     scene, nominal = read_nominal(folder)
     pictures = _pictures(scene, nominal, settings)[0]
     [amounts] = trials(pictures.perturbations, settings.seed, [number])
@@ -96,7 +96,7 @@ def _rrmsd(nominal: Nominal, pictures: TargetPictures) -> float:
 
 
 def _grade(scene: Scene, grade: str | None) -> Grade:
-    """Return the grade of the errors, in words that state whether the scene overrides some of them."""
+    """Return the grade of the errors; its words state whether the scene's tolerances override it for some of them."""
     name = base_grade(graded_table(scene.tolerance, grade))
     words = GRADES[name].words if name in GRADES else "nothing"
     if any(entry.name for entry in scene.tolerance):

@@ -12,9 +12,8 @@ error levels off at a few per cent, which monge_ampere.py then reduces.
 The c-transform is exact, in a time linear in the number of cells.  phi^c(x) = min_y |x - y|²/2 - phi(y) is
 |x|²/2 - v*(x), where v* is the Legendre transform of v(y) = |y|²/2 - phi(y).  It separates into transforms of lines:
 v*(x1, x2) = max_y1 [x1 y1 + max_y2 (x2 y2 - v(y1, y2))].  Each line needs the lower convex hull of its n values and one
-monotone pass over x (Lucet 1997, Numerical Algorithms 16).  A vertex of the hull is the maximiser from that x onwards
-which equals the slope of the hull edge before it.  These x are stored first, so the pass has no branch that depends on
-the data.
+monotone pass over x (Lucet 1997, Numerical Algorithms 16).  The slope of the hull edge before a vertex is the first x
+at which this vertex is the maximiser.  These x are stored first, so the pass has no branch that depends on the data.
 
 Poisson's equation (Hockney 1965, "A fast direct solution of Poisson's equation using Fourier analysis", Journal of the
 ACM 12): -Δ is the five-point Laplacian on n x n cells with zero normal derivative.  For the k-th term of the cosine

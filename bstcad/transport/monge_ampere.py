@@ -24,7 +24,7 @@ from bstcad.transport.bfm import Listener, PoissonWithoutCheckerboard, Transport
 from bstcad.transport.density import Density, inner, threads
 
 SOFTENING = 0.2  # addition to the eigenvalues of rho cof(D²v), to limit Newton's steps in dark, nearly folded regions
-BLUR = 1.0  # standard deviation of the Gaussian blur of phi that removes the noise of the coarser grid (cells)
+BLUR = 1.0  # standard deviation (cells) of the Gaussian blur of phi that removes the noise of the coarser grid
 CG_ITERATIONS, CG_TOLERANCE = 15, 0.1  # conjugate gradients: maximum number of iterations, relative tolerance
 MIN_STEP = 0.05  # smallest fraction of Newton's step in the line search
 MAX_ERROR_RATIO = 0.9  # ratio of mass errors, after to before a step, above which the solve stops
