@@ -27,7 +27,7 @@ from bstcad.optics.unfolding import image_from_last_net
 from bstcad.tailoring.merit import Spectrum
 
 BLOCK_POINTS = 1 << 22  # number of points whose slopes and residuals are in memory together: 0.3 GB
-DEPENDENCE_TOLERANCE = 1e-12  # squared slopes of a monomial after / before orthogonalisation: below this, rounding
+DEPENDENCE_TOLERANCE = 1e-12  # squared slopes of a monomial after / before orthogonalisation; less is rounding
 
 
 @dataclass(frozen=True)

@@ -199,7 +199,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
 def aimed_rays(
     source: Emitter, lens: Lens, goal: Goal, n: int, side: int, iterations: int
 ) -> tuple[Rays, Tensor, Mapping]:
-    """Return side x side rays in the clear window, their aims in the target's unit, and their map on n x n cells."""
+    """Return side x side rays in `clear_window`, their aims in the target's unit, and their map on n x n cells."""
     mapping = slope_map.map_to_target(source, lens, goal, n, solver=Solver(iterations))
     area = clear_window(source, lens)
     x, y = (t.to(lens.like) for t in sampling.grid(area, side))

@@ -407,7 +407,7 @@ def _mesh_checks(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal)
 def _light_checks(light: Light, accept: Accept, optic: str = "lens", of: str = "", why: str = "") -> list[Check]:
     """Check the irradiance of the re-read lens, computed with rays and with flux tubes, which share only the trace.
 
-    of: suffix of the checks' names, for one of several targets (Goal.suffix).  why: reason why a limit is not met.
+    of: suffix of the checks' names, for one of several targets (Goal.suffix).  why: reason stated if a limit is missed.
     """
     closure, tubes = abs(sum(light.flux.values()) - 1), light.witness
     off, error = RESOLVED * light.standard_error, f"standard error of the RRMSD, times five{of}"
