@@ -123,7 +123,8 @@ def test_the_back_face_keeps_to_the_same_rule_in_every_form(spread, holds):
     # per ray: a slope turns d' by at most 2 η² / MIN_COS_REFRACTION, and the landing moves by throw / ez² < 1e3 / 0.1²
     # of that angle; a control point acts on two slopes, by less than 2 / pitch each
     bound = 2 * N * N / MIN_COS_REFRACTION * 1e5 * 2 * 2 / back.pitch[0]
-    holds("derivative of a landing point by a control point, relative to its bound", max(gradients) / bound, 1.0)
+    figure = "derivative of a landing point by a control point, divided by its theoretical limit"
+    holds(figure, max(gradients) / bound, 1.0)
     if spread == 1e-5:  # where the cap sets in; nearer the angle one form reflects other rays than the other
         (status, plain), (other, fused) = found["plain"], found["fused"]
         assert torch.equal(status, other)
@@ -151,7 +152,7 @@ def test_tubes_across_the_angle(dtype, holds):
     assert whole - 1e-3 <= leaves <= border + 1e-3
     picture, outside = sheet.collect(corners, screen)
     won = abs(float(picture.detach().sum()) - whole)
-    holds("light that tubes across the critical angle lose or gain", won, n * eps(torch.float64))
+    holds("tubes across the critical angle: part of their light that is lost or gained", won, n * eps(torch.float64))
     (g,) = torch.autograd.grad(picture.square().sum() + outside, lens.back.heights)
     assert torch.isfinite(g).all()
     holds("sum of the ledger across the critical angle, minus 1", abs(sum(told.values()) - 1), 400 * eps(torch.float64))

@@ -90,15 +90,15 @@ def test_the_solid_is_valid_and_its_face_is_the_designed_one(holds, written):
     lens = replace(written.lens, back=written.lens.back.to(torch.float64))
     found = {check.id: check for check in step_checks.check(written.path, lens, 1e-9, 1 << 14)}
     assert all(check.passed for check in found.values()), found
-    holds("deviation of the back of the solid as read again", found["form"].value, 1e-9, "mm")
-    holds("deviation of the normals of this back", found["normals"].value, 1e-9, "rad")
+    holds("distance of the back in the file from the designed back", found["form"].value, 1e-9, "mm")
+    holds("angle between the normals of these two backs", found["normals"].value, 1e-9, "rad")
     holds("largest gap at an edge", found["gaps"].value, 5e-7, "mm")
 
 
 def test_a_parser_that_is_not_occ_finds_the_same_net_and_each_edge_twice(holds, written):
     text, m = part21.read(written.path), written.lens.back.m
     off = np.abs(text.surface.control_points - written.lens.back.control_points()).max()
-    holds("deviation of the control points in the text of the file", float(off), 1e-11, "mm")
+    holds("distance of the control points in the text of the file from the designed ones", float(off), 1e-11, "mm")
     assert np.abs(written.reread.control_points - text.surface.control_points).max() <= 1e-11
     assert all(np.array_equal(full, knots(m)) for full in text.surface.full_knots)
     edges = 12 if isinstance(written.lens.outline, Rectangle) else 6
@@ -153,4 +153,4 @@ def test_occ_meshes_the_solid_closed_at_each_deflection(holds, written, tmp_path
     assert meshes.is_closed(found)
     off = abs(meshes.volume_and_area(found)[0] / written.volume - 1)
     bound = deflection * written.area / written.volume
-    holds(f"OCC's mesh at {deflection:g} mm: error of the volume", off, bound, "of it")
+    holds(f"OCC's mesh with a chordal error of at most {deflection:g} mm: error of the volume", off, bound, "of it")
