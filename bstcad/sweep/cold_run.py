@@ -263,7 +263,7 @@ class ColdRun(StoredRecord):
 def run_and_judge(
     contents: SceneFiles, point: Settings, limit: float, effort: Effort, tick: Tick = lambda: None
 ) -> ColdRun:
-    """Design the scene `contents` with settings `point` in at most `limit` s; measure the lens's RRMSD (`effort`)."""
+    """Design the scene `contents` with settings `point` in at most `limit` s, and measure the RRMSD with `effort`."""
     start = time.perf_counter()
     unit = min(measure_seconds(calibration_kernel()) for _ in range(KERNEL_REPEATS))
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
@@ -314,7 +314,7 @@ def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick:
 
 
 def judge_run(run: ColdRun, base: Scene, folder: Path, effort: Effort) -> ColdRun:
-    """Return `run` with the RRMSD of its lens in `folder`, measured with `effort`: the largest on targets of `base`."""
+    """Return `run` with the RRMSD of the lens in `folder` by `effort`: the largest on the targets of `base`."""
     lens, channels = read_nominal(folder)[1].lens, base.verification_channels()
     lights = [measure_goal(lens, channels, goal, effort, ghost=base.ghost, draw=base.draw) for goal in base.goals]
     if not all(light.rrmsd >= 0 for light in lights):
