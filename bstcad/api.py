@@ -173,7 +173,7 @@ class Design:
         self, path: AnyPath, trim: Any = None, holes: Sequence[Any] = (), body: Any = None, *,
         draft: float = 0.0, bevel: float = 0.0,
     ) -> Path:  # fmt: skip
-        """Write what `solid` returns as STEP, with names of faces and the scene's [part]; return the path.
+        """Write what `solid` returns for these arguments as STEP, with face names and the scene's [part].
 
         The control points have all digits; cadquery's own export would round them.  The file states area, volume and
         centroid, unless the body has a face that bstcad cannot integrate, such as a freeform face of another program.

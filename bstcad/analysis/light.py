@@ -117,7 +117,7 @@ def _hits(source: Emitter, lens: Lens) -> Tensor:
 
 
 def _aperture(hits: Tensor, aperture: Outline) -> Outline | None:
-    """Return the smallest outline that contains points (2, n) of a face; None if they fill its clear `aperture`."""
+    """Return the smallest outline with all `hits` (2, n) of a face, in mm; None if they fill its clear `aperture`."""
     if not hits.numel():
         return Circle(0.0)
     half_x, half_y = (float(part.abs().max()) for part in hits)
@@ -268,7 +268,7 @@ class Blur:
 def blur(
     channels: Sequence[Channel], lens: Lens, screen: Screen, target: np.ndarray, n: int = IMAGE_POINTS_PER_SIDE
 ) -> Blur | None:
-    """Return the blur of the picture by the extent of the source, at the first spectral line of the channels.
+    """Return the blur of the picture `target` by the extent of the source, at the first spectral line of the channels.
 
     n: points per side of the back for which images are computed.  Return None for a point source or if no light passes.
     """

@@ -80,7 +80,7 @@ class Reference:
     ) -> Reference:
         """Trace light from FACE_POINTS x FACE_POINTS points of the lit part of the last face.
 
-        control_points: number of control points of the finished lens; None: that of `lens`.
+        picture: see the field.  control_points: number of control points of the finished lens; None: that of `lens`.
         """
         half_x, half_y = lens.apertures[1].half_extent
         for few in (32, FACE_POINTS):  # the first grid finds the lit part
@@ -238,7 +238,7 @@ class Spline:
 
 
 def to_pixels(field: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Interpolate a field, given for each cell of the target, linearly to its pixels, (rows, columns)."""
+    """Interpolate a field, given for each cell of the target, linearly to its pixels; shape: (rows, columns)."""
     for axis, pixels in enumerate(shape):
         cells = field.shape[axis]
         at = ((np.arange(pixels) + 0.5) / pixels * cells - 0.5).clip(0, cells - 1)

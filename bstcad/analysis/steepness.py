@@ -71,7 +71,7 @@ def needed_steepness(
 
 
 def _at_corners(picture: np.ndarray, screen: Screen, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the least of the four pixels around each pixel corner at x, y, as (c, r): zero on the rim of the light."""
+    """Return, as (c, r), the least of the four pixels of a picture around each corner x, y: zero on the light's rim."""
     around = np.pad(picture[::-1].T, 1)  # x first, y upwards
     least = np.minimum.reduce([around[1:, 1:], around[1:, :-1], around[:-1, 1:], around[:-1, :-1]])
     per_x, per_y = screen.per_unit

@@ -146,6 +146,6 @@ class FlatTop:
     def of(
         cls, key: str, picture: np.ndarray, pixel: tuple[float, float], inside: np.ndarray, on_picture: float
     ) -> FlatTop:
-        """Return the figures of a picture; inside: fraction of each pixel in the profile; others: as in `top_hat`."""
+        """Return a picture's figures; inside: fraction of each pixel in the profile; others: as in `top_hat`."""
         found = top_hat(picture, pixel, inside, on_picture=on_picture)
         return cls(key, **{each.name: float(getattr(found, each.name)) for each in fields(cls) if each.name != "key"})

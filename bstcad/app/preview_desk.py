@@ -77,7 +77,7 @@ class PreviewDesk:
             self._news.notify_all()
 
     def answer(self, request: PreviewRequest, stage: int, patience: float) -> tuple[str, Any] | None:
-        """Wait up to `patience` seconds for the answer of a stage (index in STAGES); None if late or replaced."""
+        """Return (name, answer) of a stage (index in STAGES) within `patience` seconds; None if late or replaced."""
         with self._news:
             request.poll_time = time.monotonic()
             self._news.notify_all()  # the thread serves this page again if it had stopped polling

@@ -164,7 +164,7 @@ class _Grid:
         return torch.stack([-p, -q, torch.ones_like(p)])
 
     def meet(self, point: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-        """Return where rays meet planes with these normals through points (3, rays, lines) mm, and True for hits."""
+        """Return where rays meet the planes through `point` with `normal`, (3, rays, lines) mm, and True for hits."""
         along = dot(normal, self.direction)
         ok = self.rays.sense * along > TANGENCY_TOLERANCE * torch.sqrt(dot(normal, normal))
         path = dot(normal, point - self.origin) / torch.where(ok, along, torch.ones_like(along))

@@ -417,7 +417,7 @@ def read_stl(path: str | Path) -> Mesh:
 
 @njit(cache=True, nogil=True)
 def _weld(bits):
-    """Group equal corners, float32 (n, 3) as uint32, by hash; return each group's first corner and each corner's group.
+    """Group equal corners, float32 as uint32 (n, 3), by hash; return each group's first corner and each corner's group.
 
     The two arrays are empty if a corner meets MAX_PROBES occupied slots, which no real surface causes.
     """

@@ -52,7 +52,7 @@ class LargeNet:
 
 
 def with_placeholders(shape: TopoDS_Shape) -> tuple[TopoDS_Shape, list[LargeNet]]:
-    """Return a copy of the shape with a placeholder for each large net (the shape if it has none), and the nets."""
+    """Return the shape, as a copy with a placeholder for each large net if it has any, and these nets."""
     nets: list[LargeNet] = []
     data = b""
     for face in parts_of(shape, TopAbs_FACE):

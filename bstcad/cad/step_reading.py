@@ -443,7 +443,7 @@ def points_on_edges(solid: TopoDS_Shape) -> np.ndarray:
 
 
 def edge_deviations(shape: TopoDS_Shape, lens: Lens) -> tuple[tuple[float, str], tuple[float, str]]:
-    """Return the largest distances (mm) of edges from the faces they bound, and from the wall, each with its place."""
+    """Return (largest distance (mm), place) of edges from the faces that they bound, and the same from the wall."""
     spans = max(max(lens.back_net.shape) - 2, math.ceil(2 * max(lens.outline.half_extent) / lens.front.detail))
     fractions = np.linspace(0.0, 1.0, POINTS_PER_SPAN * spans + 1)
     from_faces, from_wall = [], []

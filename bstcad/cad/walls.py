@@ -333,7 +333,7 @@ class LeaningPiece:
         return upper, np.column_stack([upper[:, :2] + depth[:, None] * m, upper[:, 2] - depth])
 
     def _depth(self, start: np.ndarray, inwards: np.ndarray, tangent: float, z: np.ndarray) -> np.ndarray:
-        """Return the depth (n,) (mm) below z where lines from `start` with inward slope `tangent` meet the front."""
+        """Return depths (n,) below z (mm) where lines from `start`, `tangent` mm `inwards` per mm, meet the front."""
         depth, smallest = np.zeros(len(start)), np.ones(len(start))
         for _ in range(MAX_NEWTON_STEPS):
             height, *slopes = sampled(self.front, *(start + tangent * depth[:, None] * inwards).T)

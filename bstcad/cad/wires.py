@@ -1,4 +1,4 @@
-"""Closed plane wires that cut a lens, divided into smooth pieces with one wall each, and splines over the pieces."""
+"""Loops, the closed plane wires that cut a lens, in smooth pieces with one wall each, and splines over the pieces."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def wire_loop(given: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list
 
 
 def shape_in(given: Any) -> tuple[Any, str]:
-    """Return (shape, name of its type), in a Workplane of one object too; else (None, number of objects as text)."""
+    """Return (shape, name of its type); for a Workplane, its only object or else (None, number of objects as text)."""
     values = given.vals() if hasattr(given, "vals") else [given]
     if len(values) != 1:
         return None, f"a Workplane of {len(values)} objects"
@@ -172,7 +172,7 @@ def _corners(loop: Sequence[LoopPiece]) -> np.ndarray:
 
 
 def fault(shape: shapely.Polygon) -> tuple[str, str] | None:
-    """Return the reason why a polygon does not bound a lens, and the position; None if it does.
+    """Return (reason why a polygon does not bound a lens, position), both as text; None if it does.
 
     Wires must neither cross nor touch themselves or each other.  Holes must lie inside the rim and outside each other.
     """
