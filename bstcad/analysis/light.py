@@ -49,7 +49,7 @@ def fan(source: Emitter, lens: Lens, plane: Receiver) -> np.ndarray:
 
 
 def bundle(source: Emitter, lens: Lens, plane: Receiver, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return polylines (rays, points, 3) in mm of rays, one per cell of n x n cells of the beam, and flux on arrival.
+    """Return polylines (rays, points, 3), mm, of one ray per cell of n x n cells of the beam, and the flux on arrival.
 
     Each ray starts with the flux of its cell; the total flux of the source is 1.  Rays that do not arrive are omitted.
     """

@@ -80,7 +80,7 @@ class Reference:
     ) -> Reference:
         """Trace light from FACE_POINTS x FACE_POINTS points of the lit part of the last face.
 
-        picture: see the field.  control_points: number of control points of the finished lens; None: that of `lens`.
+        picture: flux per pixel.  control_points: number of control points of the finished lens; None: that of `lens`.
         """
         half_x, half_y = lens.apertures[1].half_extent
         for few in (32, FACE_POINTS):  # the first grid finds the lit part

@@ -235,7 +235,7 @@ class Survey:
 
 
 def survey(lens: Lens, concave: float | None = None, convex: float | None = None, slope: float | None = None) -> Survey:
-    """Find the extremes of the back; concave, convex: smallest allowed radii (mm); slope: largest angle (degrees)."""
+    """Find the extremes of the back; concave, convex: smallest radii (mm), slope: largest angle (degrees) allowed."""
     lens = lens.plain()
     back = lens.back_net
     x, y, along_x, along_y = _grid(back)

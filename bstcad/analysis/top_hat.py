@@ -109,7 +109,7 @@ def plateau_uniformity(e: np.ndarray, maximum: float) -> float:
 
     The width of the bins is that of Freedman and Diaconis (1981) for the n pixels above E_max / 2, 2 IQR n^-1/3, and at
     least E_max / MAX_BINS.  From the fullest bin above E_max / 2 the half maximum is sought on each side, interpolated
-    between the centres of bins.  Without a plateau the number of pixels rises down to E = 0.
+    between the centres of bins.  Without a plateau the counts rise towards E = 0, to which the peak extends.
     """
     upper = e[e > PLATEAU_LEVEL * maximum]
     low, high = np.quantile(upper, (0.25, 0.75))

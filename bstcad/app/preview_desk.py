@@ -28,7 +28,7 @@ STAGES = ("preview", "settled", "effects", "predicted")  # names of the answers 
 MAX_PAGES = 32  # largest number of pages with a stored request
 IDLE_DELAY = 0.7  # pause (s) between the first preview of a request and its other answers, in case another change comes
 JOIN_TIMEOUT = 0.5  # time (s) that `end` waits for the thread
-PAGE_TIMEOUT = 60.0  # time (s) after a page's last poll until the thread stops working for it, up to its next poll
+PAGE_TIMEOUT = 60.0  # time (s) without a poll after which the thread stops its work for a page, until its next poll
 
 
 @dataclass(eq=False)

@@ -317,8 +317,8 @@ def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
     """Return the conic with the poles and weights of a patch of 3 x 3 (see patches.conic_net).
 
     Let Q = a² + b² for half widths a and b, and scale the weights at corner and centre to the mean 1.  They are then
-    w = 1 ± K Q / 4 with K = (1 + k) c², and the poles there have z = z0 ± c/2 Q / w.  The parabola that represents a
-    nearly flat sphere is read as the sphere.
+    w = 1 ± K Q / 4 (+ at the corner) with K = (1 + k) c², and the poles there have z = z0 ± c/2 Q / w.  The parabola
+    that represents a nearly flat sphere is read as the sphere.
     """
     net, weights = patches.net_of(patch), patches.weights_of(patch)
     if net.shape != (3, 3, 3) or (patch.UDegree(), patch.VDegree()) != (2, 2):
