@@ -362,7 +362,7 @@ def _encoded(name: str, text: str) -> bytes:
     try:
         return text.encode()
     except UnicodeEncodeError:
-        raise SceneError(f"{name}: contains half a character (a lone surrogate); delete this character") from None
+        raise SceneError(f"{name}: the last change contains half a character (a lone surrogate); undo it") from None
 
 
 def _with_unix_ends(text: str) -> str:
