@@ -103,7 +103,7 @@ class Workspace:
         try:
             return files.within(path, self.scenes, self.designs)
         except ValueError as error:
-            raise SceneError(f"{path.name}: {error}; replace the link by its target") from None
+            raise SceneError(f"{path.name}: {error}; replace the link by a file") from None
 
     def _is_own(self, path: Path) -> bool:
         """Return True if no link leads the path out of the workspace's folders."""

@@ -406,7 +406,7 @@ def read_stl(path: str | Path) -> Mesh:
         )
     corners = np.frombuffer(data, STL_TRIANGLE, offset=84)["corners"].reshape(-1, 3)
     if not np.isfinite(corners).all():
-        raise ValueError(f"{path.name}: a corner is not finite; write the file again")
+        raise ValueError(f"{path.name}: a corner of a triangle is not finite; write the file again")
     corners = np.ascontiguousarray(corners) + np.float32(0)  # -0 becomes 0
     bits = corners.view(np.uint32)
     first, same = _weld(bits)

@@ -69,7 +69,7 @@ def mounted(body: cadquery.Shape | cadquery.Workplane, lenses: Sequence[PlacedLe
     # tapers and chamfers by OCC have left-handed planes and cones; its STEP writer reverses these without their names
     rest = cadquery.Solid(TopoDS.Solid_s(ShapeCustom.DirectFaces_s(_solid(given, "the body").wrapped)))
     for opening in openings:
-        rest = _solid(rest.cut(opening.prism(rest)), "the rest of the body")
+        rest = _solid(rest.cut(opening.prism(rest)), "the body without the lenses")
     faces = rest.Faces()
     removed: set[int] = set()  # indices of the body's faces that walls of lenses replace
     replacements: dict[int, dict[int, list[Loop]]] = {}  # loops that replace a wire, by the indices of face and wire

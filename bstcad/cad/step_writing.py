@@ -267,7 +267,7 @@ def _measure(name: str, kind: str, value: float, exponent: float) -> StepRepr_Me
 
 
 def _label(model: StepData_StepModel, name: str, part: Part) -> None:
-    """Set the product's name and number, and the header (OCC adds a number to a name that it has used before)."""
+    """Set the product's name, to which OCC may have added a count, its part number, and the header of the file."""
     text = Text(part21_string(name))
     product = _first_entity(model, StepBasic_Product)
     product.SetId(text if part.number is None else Text(part21_string(part.number)))

@@ -74,5 +74,5 @@ def in_millimetres(points: np.ndarray, outline: Outline) -> tuple[np.ndarray, st
         return points * INCH, unit
     lens_width = f"and the lens is {width:.3g} mm wide"
     if unit:
-        raise ValueError(f"its points seem to be in {unit}: they cover {extent:.3g} {lens_width}; give them in mm")
-    raise ValueError(f"its points cover {extent:.3g} mm {lens_width}; give a cloud of the lens's back face, in mm")
+        raise ValueError(f"its points seem to be in {unit}: their extent is {extent:.6g} {lens_width}; give them in mm")
+    raise ValueError(f"its extent is {extent:.6g} mm {lens_width}; give a cloud of the lens's back face, in mm")

@@ -171,7 +171,7 @@ def predict(scene: Scene, pilots: Mapping[str, Pilot], gain: float = 1.0) -> dic
 
 
 def predicted_rrmsd(pilot: Pilot, quality: str) -> float:
-    """Return the RRMSD of a full design from the RRMSD of its pilot, and detail and blur that the pilot lacks."""
+    """Return the RRMSD of a full design: the scaled RRMSD of its pilot plus that of detail and blur it lacks."""
     by_pilot = (FINE_RATIO if quality == "fine" else 1.0) * pilot.factor**PILOT_EXPONENT * pilot.rrmsd
     return by_pilot + DETAIL_FACTORS[quality] * pilot.detail + REMAINING_BLUR * pilot.blur
 

@@ -120,9 +120,9 @@ def _restore_hit(net, faces, path, first, count, work):
 
 @njit(inline="always")
 def _at_level(faces, at, e, h, gx, gy):
-    """Return ∂L/∂(direction behind the face), ∂L/∂hit and ∂L/∂path of a landing on a level screen, at fixed slopes.
+    """Return ∂L/∂(direction behind the face, hit, path) of landings on a level screen, at fixed slopes; L: merit.
 
-    at: x and y of the hit (mm), 0, direction before the face; e: direction behind it; h: sag; gx, gy: ∂L/∂landing.
+    at: x and y of the hit (mm), a zero, direction before the face; e: direction behind it; h: sag; gx, gy: ∂L/∂landing.
     """
     ex, ey, ez = e
     ez = min(ez, -faces.rules.grazing) if faces.reflects else max(ez, faces.rules.grazing)
