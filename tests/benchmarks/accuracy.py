@@ -156,7 +156,7 @@ def designed(scene: str, quality: str, settings: Sequence[str] = ()) -> Record:
 
 
 def judged(lens: Lens, pixels: int) -> Record:
-    """Return the RRMSD by ray tubes, without noise, of a lens for PEER on a given number of pixels a side."""
+    """Return the RRMSD by `measure` of a lens for PEER, its standard error, and the light on the target."""
     scene = load(TEMPLATES / f"{PEER}.toml", {"target.pixels": pixels})
     light = measure(lens, scene.channels(), scene.target.screen, scene.target.irradiance(), REFERENCE_EFFORT)
     return {"rrmsd": light.rrmsd, "rrmsd_noise": light.standard_error, "on_target": light.flux["on target"]}
