@@ -46,7 +46,7 @@ GLASS_LINES = ("lost through the sides", "total internal reflection")  # lines o
 
 
 def counts(checks: Sequence[Check]) -> str:
-    """Return a phrase with the numbers of checks that meet a limit, that failed, and that have no limit."""
+    """Return a phrase with the numbers of checks that meet a limit, that fail, and that have no limit."""
     failed = sum(not check.passed for check in checks)
     unjudged = sum(check.passed and check.limit is None for check in checks)
     more = ((failed, "failed"), (unjudged, "without a limit (not judged)"))

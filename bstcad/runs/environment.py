@@ -62,7 +62,7 @@ def version() -> str:
 
 
 def _peak_memory() -> float | None:
-    """Return the peak memory of this process plus that of the second process (GB); None if one is unknown."""
+    """Return the peak memory (GB) of this process plus that of the second process (runs.processes); None: unknown."""
     try:
         first, second = processes.peak_memory(), processes.submit(processes.peak_memory).result()
     except BrokenExecutor:

@@ -119,9 +119,9 @@ def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
             yield f"{key}: {why}; remove the table"
         if not glass and getattr(effect, "coating", None) is not None:
             bare = "the face of a mirror (lens.back.reflect) is bare metal"
-            yield f"{key}.coating: {bare}; remove it, or set {key}.metal"
+            yield f"{key}.coating: {bare}; remove this key, or set {key}.metal"
         if not lens.passes.reflects and getattr(effect, "metal", None) is not None:
-            yield f"{key}.metal: only a mirror (lens.back.reflect, lens.front.reflect) has a metal; remove it"
+            yield f"{key}.metal: only a mirror (lens.back.reflect, lens.front.reflect) has a metal; remove this key"
         if effect.kind == "absorption" and effect.coefficient is None and lens.material is None:
             yield f"{key}.coefficient: missing, and so is lens.material; add it in 1/mm, or set lens.material"
 

@@ -14,7 +14,7 @@ from bstcad.scene.schema import OneOrTwo, Record
 
 COMMON_PRESET = {"method": "least-squares", "transport_iterations": 40, "stage1_iterations": 1000, "rounds": 10}
 OWN_PRESET = COMMON_PRESET | {"overshoot": 0.03, "precision": "float64"}  # settings of bstcad's own qualities
-# Settings of each quality; a setting of the scene replaces them.
+# Settings of each quality; a setting that the scene states has priority.
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": OWN_PRESET | {"transport_grid": 256, "rays": 512, "stage2_iterations": 8, "source_points": 16},
     "standard": OWN_PRESET | {"transport_grid": 512, "rays": 1536, "stage2_iterations": 98, "source_points": 64},
@@ -79,7 +79,7 @@ class Tailoring(Record):
     solution: Annotated[
         Literal["convex", "concave"] | None,
         Key(
-            "For two faces and two targets: between the targets no rays cross (convex), or all (concave).",
+            "For two faces and two targets: no rays cross between the targets (convex), or all do (concave).",
             example="concave",
         ),
     ] = None
@@ -132,16 +132,16 @@ class Tailoring(Record):
         who, other = BASELINES.get(self.chosen_method, ("", ""))
         for name in ("accuracy", "max_time"):
             if who and getattr(self, name) is not None:
-                yield f"tailoring.{name}: {who} cannot end early; remove it, or choose another {other}"
+                yield f"tailoring.{name}: {who} cannot end early; remove this key, or choose another {other}"
         if who and lens.bounded_by:
             yield f"lens.{lens.bounded_by[0]}: {who} has no such bounds; remove this key, or choose another {other}"
         if who and lens.front.is_tailored:
-            yield f"lens.front.optimise: {who} cannot tailor a freeform front; remove it, or choose another {other}"
+            yield f"lens.front.optimise: {who} cannot tailor the front; remove this key, or choose another {other}"
         if self.method == "integration" and lens.front.free:
-            fixed = "remove it and give the final front"
+            fixed = "remove this key and give the final front"
             yield f"lens.front.optimise: {who} cannot optimise a front; {fixed}, or choose another {other}"
         if self.method == "integration" and self.stage2_iterations:
-            yield f"tailoring.stage2_iterations: {who} has no stage 2; remove it, or choose another {other}"
+            yield f"tailoring.stage2_iterations: {who} has no stage 2; remove this key, or choose another {other}"
 
 
 class ResolvedTailoring(Tailoring):
