@@ -107,7 +107,7 @@ class TargetStudy:
 
 @dataclass(frozen=True)
 class WavefrontStudy:
-    """Results on the wavefront in the same trials: RMS error in waves, with piston and tilt removed."""
+    """Results on the wavefront in the trials of the study: RMS error in waves, with piston and tilt removed."""
 
     rms: Size  # RMS error of the design
     rms_trials: Spread  # RMS error of the trials by superposed wavefronts

@@ -404,7 +404,7 @@ FRONTS: dict[str, tuple[type[Any], Callable[..., Any]]] = {
 
 
 def as_front(value: Any, outline: Outline | None = None) -> Any:
-    """Return the front of a scene for a surface of optics; return any other value as it is.
+    """Return the front of a scene for a surface of bstcad.optics; return any other value as it is.
 
     outline: that of the lens, inside which a net is fitted to a surface not in FRONTS; None: ValueError instead.
     """

@@ -25,7 +25,7 @@ Step = tuple[str, int | None]
 
 
 def override(data: dict[str, Any], key: str, value: Any, shown: str) -> None:
-    """Set a dotted key of `data`, remove its alternatives (ONE_OF); value None removes it; shown: key in messages."""
+    """Set a dotted key of `data` (None removes it) and remove its alternatives (ONE_OF); shown: key in messages."""
     steps = []
     for part in key.split("."):
         if (match := STEP.fullmatch(part)) is None:

@@ -209,7 +209,7 @@ class Mount(Record):
         """Return the largest distance (mm) by which draft and bevel move the edge of the front inwards.
 
         From each point of the rim at z = top, a line of the wall goes down to the front, and inwards (direction m) by
-        tan(draft) per mm of depth.  A bevel at 45° replaces its lower end.  Compare cad.walls.LeaningPiece.ends.
+        tan(draft) per mm of depth.  A bevel at 45° replaces the line's lower end.  Compare cad.walls.LeaningPiece.ends.
         """
         (x, y), tangent = rim.rim_points(), math.tan(math.radians(self.draft))
         m_x, m_y = rim.inset_direction(x, y)
