@@ -223,9 +223,7 @@ SceneFile = argument(Path, "SCENE", "Scene file (TOML); see templates/.", parser
 Folder = argument(Path, "DIR", "Folder of a design.", parser=design_folder)
 Output = path_option("DIR", "Folder for the files (default: a folder in outputs/).", "--output", "-o")
 Settings = option(list[str] | None, "KEY=VALUE", "Replace one value of the scene: --set target.pixels=128.", "--set")
-Quality = option(
-    str | None, "Q", "Effort: draft, standard or fine (from fast to accurate), or paper (Wang et al. 2023)."
-)
+Quality = option(str | None, "Q", "Effort: draft, standard or fine (fast to accurate), or paper (Wang et al. 2023).")
 Verbose = option(bool, None, "List every check with its value and limit.", "--verbose")
 Workers = option(int | None, "N", "Distribute the work over N processes on this machine.")
 Scheduler = option(str | None, "URL", "Distribute the work over the workers of the dask scheduler at this address.")
@@ -250,9 +248,7 @@ Written = argument(Path, "DIR|STEP", "Folder of a design, or a single STEP file.
 Measured = path_option("CLOUD", "Measured points (CSV, PLY, STL) of a made part, which is also verified.")
 Report = path_option("DIR", "Write the report of the made part to this folder only.", "--output", "-o")
 Against = option(str | None, "NAMES", "Also trace the lens with other programs: batoid, mitsuba, or batoid,mitsuba.")
-Grade = option(
-    str | None, "G", "Grade of errors without a [\\[tolerance]] in the scene: moulded, diamond-turned or precise."
-)
+Grade = option(str | None, "G", "Grade of errors without a [\\[tolerance]]: moulded, diamond-turned or precise.")
 Yield = option(float | None, "P", "Find the loosest tolerances with this yield (percentage that passes).", "--yield")
 Seed = option(int, "N", "Seed of the random trials.", min=0)
 Trial = option(int | None, "N", "Write only the lens of this trial, as trial-N.step.", min=0)

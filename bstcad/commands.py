@@ -147,8 +147,7 @@ def output_folder(folder: Path, stopped: str) -> Path:
 def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), progress: Progress = no_progress) -> Report:
     """Write a design to `folder`, replacing an earlier design, and verify the written files.
 
-    If the design cannot be written or verified, design.npz and the scene are kept in another folder, which a note on
-    the error names.
+    If it cannot be written or verified, a note on the error names another folder with its design.npz and scene.
     """
     processes.begin()
     with (

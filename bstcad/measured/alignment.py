@@ -3,8 +3,7 @@
 The residuals are the signed distances d of all points except outliers, along the face's normals n.  A small motion,
 with translation τ and rotation ω about the pivot c, changes the distance of a point q by n · τ + ((q - c) × n) · ω.
 The factors of τ and ω are the six columns of the fit; rotations are in mm at the rim, to compare with translations.
-Motions that hardly change any distance (rotating a round face about its axis, shifting a plane along itself) are not
-determined and stay zero.
+Motions that hardly change any distance (a round face about its axis, a plane along itself) stay zero.
 
 The search starts from several poses, with a few thousand points and robust weights, so that points of the sides and of
 the front have little influence.  The pose as given is preferred unless another start is clearly better.  A cloud that

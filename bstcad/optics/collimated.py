@@ -33,9 +33,7 @@ class Collimated(Emitter):
     (d_x, d_y), whose range for a half angle α is an ellipse about cos α (n_x, n_y).
     """
 
-    aperture: Annotated[
-        Outline, Key("Outline of the beam, centred at source.centre.", example={"shape": "circle", "radius": 12.0})
-    ]
+    aperture: Annotated[Outline, Key("Beam outline about source.centre.", example={"shape": "circle", "radius": 12.0})]
     wavelength: WavelengthKey = 587.6
     profile: Annotated[Literal["uniform", "gaussian"], Key("Irradiance over the aperture.")] = "uniform"
     radius_1e2: Annotated[
@@ -47,9 +45,7 @@ class Collimated(Emitter):
         tuple[float, float] | None, Key("Centre of aperture and profile.", "mm", -1e8, 1e8, example=[2.0, 0.0])
     ] = None
     tilt: TiltKey = None
-    divergence: Annotated[
-        float | None, Key("Full angle of the cone of directions, simulated.", "degrees", 0.0, 179.0)
-    ] = None
+    divergence: Annotated[float | None, Key("Full angle of the cone of rays, simulated.", "degrees", 0.0, 179.0)] = None
     real_divergence: Annotated[
         float | None, Key("Full divergence angle of the real lamp, for estimates only.", "degrees", 0.0, 179.0)
     ] = None

@@ -48,8 +48,7 @@ def grazing_of(index: float, others: Iterable[float], spread: float = 0.0) -> fl
 def spread_at(source: Emitter, lens: Lens) -> float:
     """Return half the angle (rad) that a source subtends at the last freeform face, in the medium before it.
 
-    It is the largest angle at the face's centre between light from the source's centre and from the ends of its axes;
-    0 for a point.
+    It is the largest angle at the face's centre between light from the source's centre and its axes' ends (point: 0).
     """
     if source.extent is None:
         return 0.0

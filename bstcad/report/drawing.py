@@ -1,7 +1,6 @@
 """Drawing of the figures of a report: one style, and PNG files of limited size.
 
-Figures use the object interface of matplotlib (no window, no global state) and colours that colour-blind readers can
-distinguish.
+Figures use the object interface of matplotlib (no window, no global state) and colours for colour-blind readers.
 """
 
 from __future__ import annotations

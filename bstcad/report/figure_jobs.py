@@ -27,18 +27,7 @@ from bstcad.optics.surfaces import Surface
 from bstcad.optics.wavefront_error import WavefrontError
 from bstcad.report import data_sheet, light_figures, rendering
 from bstcad.report.data_sheet import DataSheet
-from bstcad.report.drawing import (
-    BLUE,
-    GLASS,
-    GREY,
-    VERMILION,
-    footnote,
-    new_figure,
-    png,
-    round_up,
-    steps,
-    styled,
-)
+from bstcad.report.drawing import BLUE, GLASS, GREY, VERMILION, footnote, new_figure, png, round_up, steps, styled
 from bstcad.report.light_figures import View, plain_ticks
 from bstcad.report.record import Contents, CurvePoint, StageRecord
 from bstcad.report.rendering import LightPath

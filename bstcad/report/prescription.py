@@ -6,9 +6,8 @@ from the scene, since tailoring may change a free radius and move the back.
     lens:    front, glass, back; the vertex of a face is its intersection with the axis
     signs:   light leaves along +z; a radius is positive if the centre of curvature is on the +z side of the vertex
 
-The order is one record for datasheet.pdf, report.html and report.json.  Its sizes, volume and mass are those of the
-file for the shop, as it was read back: part.step for a scene with a mount.  Lengths in mm, angles in degrees,
-wavelengths in nm.
+The order is one record for datasheet.pdf, report.html and report.json.  Its sizes, volume and mass are those read
+back from the shop's file (with a mount: part.step).  Lengths in mm, angles in degrees, wavelengths in nm.
 """
 
 from __future__ import annotations

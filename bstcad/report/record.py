@@ -520,8 +520,7 @@ def _block(value: Any) -> str:
 class Report:
     """Result of a verification, traced through the geometry of lens.step or, with a mount, of part.step.
 
-    Every key of report.json is an attribute, such as `rrmsd`, `checks` or `flux` (fields of Contents); `facts` are all
-    of them as plain values.
+    Every key of report.json is an attribute, such as `rrmsd` or `flux` (fields of Contents); `facts` are plain values.
     """
 
     contents: Contents

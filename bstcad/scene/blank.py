@@ -333,22 +333,12 @@ class NetFront(_Front):
     z: Annotated[float, VERTEX_Z]
     file: Annotated[
         FrontFile | None,
-        Key(
-            "Earlier design whose back becomes this front: its folder, design.npz or lens.step.",
-            example="outputs/earlier",
-        ),
+        Key("Design whose back becomes this front: its folder, design.npz or lens.step.", example="outputs/earlier"),
     ] = None
-    optimise: Annotated[
-        bool, Key("Tailor the front; tailoring starts with the net of file, or with a plane.", example=True)
-    ] = False
+    optimise: Annotated[bool, Key("Tailor the front, from the net of file or from a plane.", example=True)] = False
     control_points: Annotated[
         OneOrTwo | None,
-        Key(
-            "Control points per side, or [along x, along y]; as many as the back has, if absent.",
-            "",
-            *NET_SIZES,
-            example=513,
-        ),
+        Key("Control points per side, or [along x, along y]; as for the back if absent.", "", *NET_SIZES, example=513),
         BeforeValidator(lambda given: tuple(given) if isinstance(given, list) else given),  # strict: a tuple
     ] = None
     reflect: Annotated[bool, Key("Mirror behind glass: light enters and leaves via the back.", example=True)] = False
@@ -487,12 +477,7 @@ class Back(Record):
     z: Annotated[float, Key("Position of the flat face before tailoring.", "mm", *COORDINATES, example=20.0)]
     control_points: Annotated[
         OneOrTwo | None,
-        Key(
-            "Control points per side, or [along x, along y]; bstcad chooses them if absent.",
-            "",
-            *NET_SIZES,
-            example=257,
-        ),
+        Key("Control points per side, or [along x, along y]; chosen by bstcad if absent.", "", *NET_SIZES, example=257),
     ] = None
     reflect: Annotated[bool, Key("A mirror: light comes along -z and goes back along +z.")] = False
     optimise: Annotated[bool, Key("Tailor the back; if false it stays flat.", example=False)] = True
@@ -529,29 +514,18 @@ class LensBlank(Record):
     reflects, light crosses the back before and after the front.
     """
 
-    material: Annotated[str | None, Key("Name of the material on refractiveindex.info; or give the index instead.")] = (
-        None
-    )
+    material: Annotated[str | None, Key("Name of the material on refractiveindex.info; or give the index.")] = None
     index: Annotated[float | None, Key("Refractive index, in place of material.", "", *INDICES, example=1.49)] = None
     outline: Annotated[Outlined, Key("Rim of the lens.", example={"shape": "rectangle", "width": 24.0, "height": 24.0})]
-    front: Annotated[
-        Front,
-        Key("The face with the smaller z, through which light enters a lens.", example={"kind": "plane", "z": 8.0}),
-    ]
+    front: Annotated[Front, Key("Face at smaller z, where light enters a lens.", example={"kind": "plane", "z": 8.0})]
     back: Annotated[
         Back,
-        Key(
-            "The face with the larger z; tailored unless optimise = false.",
-            example={"kind": "bspline", "z": 20.0, "control_points": 257},
-        ),
+        Key("Face at larger z, tailored by default.", example={"kind": "bspline", "z": 20.0, "control_points": 257}),
     ]
     tool_radius: Annotated[
-        float | None,
-        Key("Radius of the tool: minimum radius of the valleys of tailored faces.", "mm", 1e-6, 1e9),
+        float | None, Key("Radius of the tool: minimum radius of the valleys of tailored faces.", "mm", 1e-6, 1e9)
     ] = None
-    mould: Annotated[
-        bool, Key("True: the tool cuts a mould, so that tool_radius bounds the ridges, not the valleys.", example=True)
-    ] = False
+    mould: Annotated[bool, Key("True: the tool cuts a mould, and tool_radius bounds the ridges.", example=True)] = False
     max_slope: Annotated[float | None, Key("Maximum slope of a tailored face.", "degrees", 1e-3, 89.0)] = None
     min_thickness: Annotated[float, Key("Minimum thickness along z; faces move to keep it.", "mm", *LENGTHS)] = 0.5
     max_thickness: Annotated[float | None, Key("Maximum thickness along z.", "mm", *LENGTHS)] = None

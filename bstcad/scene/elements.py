@@ -37,14 +37,11 @@ class Window(Record):
     kind: Annotated[Literal["window"], Key("A plate that transmits light.")]
     z: Annotated[float, Key("Position of the face with the lower z.", "mm", *COORDINATES, example=40.0)]
     thickness: Annotated[float, Key("Thickness on the axis.", "mm", *LENGTHS, example=3.0)]
-    material: Annotated[
-        str | None, Key("Name of the material on refractiveindex.info; or give the index instead.", example="N-BK7")
-    ] = None
+    material: Annotated[str | None, Key("Material on refractiveindex.info; or give the index.", example="N-BK7")] = None
     index: Annotated[float | None, Key("Refractive index.", "", *INDICES, example=1.5168)] = None
     outline: Annotated[Outlined, RIM]
     curvature: Annotated[
-        tuple[float, float],
-        Key("Curvatures of the lower face (smaller z) and the upper face.", "1/mm", *CURVATURES, example=[0.01, 0.011]),
+        tuple[float, float], Key("Curvature of each face, smaller z first.", "1/mm", *CURVATURES, example=[0.01, 0.011])
     ] = (0.0, 0.0)
     tilt: Annotated[tuple[float, float] | None, TILT] = None
 
@@ -141,8 +138,7 @@ def reversal(elements: Sequence[Window | Mirror]) -> int:
 def interfaces(elements: Sequence[Window | Mirror], sense: int, wavelength: float) -> tuple[Interface, ...]:
     """Return the interfaces of the elements for light that starts along sense · z (sense 1 or -1); wavelength in nm.
 
-    The status of light outside their outlines is BLOCKED, which `Scene.around` changes to MISSED_FRONT for elements
-    before the lens.
+    The status of light outside their outlines is BLOCKED; `Scene.around` makes it MISSED_FRONT before the lens.
     """
     found: list[Interface] = []
     for element in elements:

@@ -39,9 +39,7 @@ class Part:
     author: Annotated[str | None, Key("Author of the file.")] = None
     organisation: Annotated[str | None, Key("Organisation of the author.")] = None
     material: Annotated[str | None, Key("Material as the drawing names it; lens.material if absent.")] = None
-    density: Annotated[
-        float | None, Key("Density of the material; that of lens.material if absent.", "g/cm³", 1e-3, 30.0)
-    ] = None
+    density: Annotated[float | None, Key("Density; that of lens.material if absent.", "g/cm³", 1e-3, 30.0)] = None
     colour: Annotated[str | None, Key('Colour "#rrggbb", or "#rrggbbaa" with opacity.', example="#9ed3f580")] = None
     surface_profile: Annotated[float | None, Key("Width of the tolerance zone of the back.", "mm", 1e-6, 10.0)] = None
     front_profile: Annotated[float | None, Key("Width of the tolerance zone of the front.", "mm", 1e-6, 10.0)] = None

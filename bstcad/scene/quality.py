@@ -36,56 +36,37 @@ class Tailoring(Record):
     """The effort of tailoring; a setting that is None has the value of PRESETS[quality], if any (see `resolved`)."""
 
     quality: Annotated[
-        Literal["draft", "standard", "fine", "paper"],
-        Key("Effort: draft is fast, fine has the smallest error, paper is Wang et al. 2023."),
+        Literal["draft", "standard", "fine", "paper"], Key("Effort: draft is the fastest; paper is Wang et al. 2023.")
     ] = "standard"
     seed: Annotated[int, Key("Seed of all random numbers.", "", 0, 2**63 - 1)] = 0
     method: Annotated[
         Literal["least-squares", "adam", "integration"] | None,
-        Key(
-            "Method: least squares, adam as in the paper, or point-by-point integration; see quality if absent.",
-            example="least-squares",
-        ),
+        Key("Method: least squares, adam (paper) or integration; that of quality if absent.", example="least-squares"),
     ] = None
     levels: Annotated[
-        tuple[OneOrTwo, ...] | None,
-        Key("Control points per side of the nets, from coarse to fine.", "", *NET_SIZES, example=[129, 257]),
+        tuple[OneOrTwo, ...] | None, Key("Control points per side, coarse to fine.", "", *NET_SIZES, example=[129, 257])
     ] = None
-    transport_grid: Annotated[
-        int | None, Key("Cells per side of the grid of the transport map.", "", 16, 2049, example=512)
-    ] = None
+    transport_grid: Annotated[int | None, Key("Cells per side of the transport map.", "", 16, 2049, example=512)] = None
     transport_iterations: Annotated[
         int | None, Key("Maximum number of iterations of the transport map.", "", 1, 100_000, example=100)
     ] = None
-    rays: Annotated[int | None, Key("Flux tubes (with method adam: rays) per side of their grid.", "", 16, 16_384)] = (
-        None
-    )
+    rays: Annotated[int | None, Key("Flux tubes (method adam: rays) per side of their grid.", "", 16, 16_384)] = None
     stage1_iterations: Annotated[
         int | None, Key("Steps of stage 1 for each net, with method adam.", "", 0, 1_000_000, example=300)
     ] = None
-    rounds: Annotated[
-        int | None, Key("Maximum number of rounds of transport map and slope fit in stage 1.", "", 1, 100, example=10)
-    ] = None
+    rounds: Annotated[int | None, Key("Maximum rounds of map and slope fit in stage 1.", "", 1, 100, example=10)] = None
     stage2_iterations: Annotated[
-        int | None,
-        Key("Maximum number of evaluations of the merit function in stage 2 or 3.", "", 0, 1_000_000, example=120),
+        int | None, Key("Maximum number of evaluations of the merit in stage 2 or 3.", "", 0, 1_000_000, example=120)
     ] = None
     overshoot: Annotated[
         float | None, Key("Weight of light beside the target, per pixel² of distance.", "", 0.0, 1e3, example=0.03)
     ] = None
-    source_points: Annotated[
-        int | None, Key("Number of points that represent an extended source in tailoring.", "", 2, 4096)
-    ] = None
+    source_points: Annotated[int | None, Key("Number of points that represent an extended source.", "", 2, 4096)] = None
     solution: Annotated[
         Literal["convex", "concave"] | None,
-        Key(
-            "For two faces and two targets: no rays cross between the targets (convex), or all do (concave).",
-            example="concave",
-        ),
+        Key("For two faces and two targets: no rays (convex) or all (concave) cross between them.", example="concave"),
     ] = None
-    precision: Annotated[
-        Literal["float32", "float64"] | None, Key("Precision of the numbers in tailoring.", example="float64")
-    ] = None
+    precision: Annotated[Literal["float32", "float64"] | None, Key("Precision in tailoring.", example="float64")] = None
     accuracy: Annotated[float | None, Key("RRMSD at which tailoring ends.", "", 1e-6, 10.0, example=0.05)] = None
     max_time: Annotated[
         float | None, Key("Maximum time, report included; stage 1 is always completed.", "s", 1.0, 1e7, example=60.0)
@@ -194,16 +175,11 @@ NONE = "none"  # grade of an error that is always zero
 class Tolerance(Record):
     """The tolerance of one error or several; a key that is None has the value of an earlier table or of the grade."""
 
-    name: Annotated[
-        Name | None, Key("Name of the error (lens.decentre: along x and along y); all errors if absent.")
-    ] = None
+    name: Annotated[Name | None, Key("Name of the error (lens.decentre: along x and y); all errors if absent.")] = None
     grade: Annotated[
-        Literal["moulded", "diamond-turned", "precise", "none"] | None,
-        Key("Grade of manufacture that gives the limit; none: the error is always zero."),
+        Literal["moulded", "diamond-turned", "precise", "none"] | None, Key("Grade of manufacture; none: error is 0.")
     ] = None
-    limit: Annotated[
-        float | None, Key("Limit (±) in the unit of the error; for a form error or a ripple, its RMS.", "", 1e-12, 1e4)
-    ] = None
+    limit: Annotated[float | None, Key("Limit (±) in the error's unit; form and ripple: RMS.", "", 1e-12, 1e4)] = None
     distribution: Annotated[
         Literal["normal", "uniform"] | None, Key("Distribution; normal: truncated at ±2 σ, and 2 σ is the limit.")
     ] = None

@@ -59,27 +59,15 @@ class Accept(Record):
     """Limits of the checks in the report; with None the check only states its value."""
 
     rrmsd: Annotated[float | None, Key("Maximum RRMSD of light on a target.", "", 1e-6, 10.0, of_light=True)] = None
-    form: Annotated[
-        float, Key("Maximum deviation of the faces in lens.step from the tailored faces.", "mm", 1e-12, 1.0)
-    ] = 1e-6
+    form: Annotated[float, Key("Maximum deviation of lens.step from the tailored faces.", "mm", 1e-12, 1.0)] = 1e-6
     efficiency: Annotated[
-        float | None,
-        Key(
-            "Minimum flux on the target, as a fraction of the flux behind the lens.",
-            "",
-            0.0,
-            1.0,
-            example=0.9,
-            of_light=True,
-        ),
+        float | None, Key("Minimum flux on target / flux behind the lens.", "", 0.0, 1.0, example=0.9, of_light=True)
     ] = None
     light_on_target: Annotated[
-        float | None,
-        Key("Minimum flux on the target, as a fraction of the flux that meets the lens.", "", 0.0, 1.0, of_light=True),
+        float | None, Key("Minimum flux on the target / flux that meets the lens.", "", 0.0, 1.0, of_light=True)
     ] = None
     leak: Annotated[
-        float | None,
-        Key("Maximum flux on dark pixels, as a fraction of the flux on the target.", "", 0.0, 1.0, of_light=True),
+        float | None, Key("Maximum flux on dark pixels / flux on the target.", "", 0.0, 1.0, of_light=True)
     ] = None
     decentre: Annotated[float | None, Key("Maximum decentre of a measured part.", "mm", 1e-6, 1e3)] = None
     wavefront: Annotated[
@@ -108,9 +96,7 @@ class Scene(Record):
     targets: Annotated[Targets, Field(alias="target"), Key("Picture and its position; several: [[target]] tables.")]
     before: Annotated[Elements, Key("Windows and mirrors that light meets before the lens: [[before]] tables.")] = ()
     behind: Annotated[Elements, Key("Windows and mirrors that light meets behind the lens: [[behind]] tables.")] = ()
-    wavefront: Annotated[
-        Annotated[Wave, Field(discriminator="kind")] | None, Key("Required wavefront behind the lens.")
-    ] = None
+    wavefront: Annotated[Annotated[Wave, Field(discriminator="kind")] | None, Key("Wavefront behind the lens.")] = None
     tailoring: Annotated[Tailoring, Key("Effort and settings of tailoring.")] = Tailoring()
     effects: Annotated[Effects, Key("Effects simulated besides refraction: [[effects]] tables.")] = ()
     accept: Annotated[Accept, Key("The limits of the checks in the report.")] = Accept()

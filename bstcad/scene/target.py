@@ -71,44 +71,19 @@ class Target(Record):
         Profile | None, Key("Irradiance of this shape instead of a picture.", example={"shape": "disc", "radius": 6.0})
     ] = None
     gamma: Annotated[
-        float | None,
-        Key(
-            "Irradiance = (pixel value)^gamma; if absent, the file's profile or sRGB applies.",
-            "",
-            0.1,
-            10.0,
-            example=1.0,
-        ),
+        float | None, Key("Irradiance = value^gamma; the file's profile or sRGB if absent.", "", 0.1, 10.0, example=1.0)
     ] = None
     invert: Annotated[bool, Key("Negative of the picture.", example=True)] = False
-    seen_from: Annotated[
-        Literal["lens", "behind"], Key("Side from which a viewer sees the picture as it is in its file, not mirrored.")
-    ] = "lens"
+    seen_from: Annotated[Literal["lens", "behind"], Key("Side from which the picture is seen as in its file.")] = "lens"
     rotate: Annotated[Literal[0, 90, 180, 270], Key("Rotation of the picture, counterclockwise.", "degrees")] = 0
     mirror: Annotated[bool, Key("Exchange left and right, after the rotation.")] = False
-    fit: Annotated[
-        Literal["crop", "pad", "stretch"],
-        Key("What to do with a picture whose proportions differ from the target's.", example="pad"),
-    ] = "crop"
+    fit: Annotated[Literal["crop", "pad", "stretch"], Key("What to do if proportions differ.", example="pad")] = "crop"
     crop: Annotated[
-        Crop | None,
-        Key(
-            "Part of the picture to use: [left, top, right, bottom], as fractions of its sides.",
-            "",
-            0.0,
-            1.0,
-            example=[0.1, 0.0, 0.9, 1.0],
-        ),
+        Crop | None, Key("Part used: fractions [left, top, right, bottom].", "", 0.0, 1.0, example=[0.1, 0.0, 0.9, 1.0])
     ] = None
-    outline: Annotated[
-        Outlined | None, Key("Outline around the centre of the target, outside which the picture is dark.")
-    ] = None
-    unreachable: Annotated[
-        Literal["dark", "refuse"], Key("Parts that light cannot reach: leave them dark, or refuse the scene.")
-    ] = "dark"
-    weight: Annotated[
-        float, Key("Weight of this target's squared error among several targets.", "", 1e-6, 1e6, example=2.0)
-    ] = 1.0
+    outline: Annotated[Outlined | None, Key("Outline around the target's centre; the picture is dark outside.")] = None
+    unreachable: Annotated[Literal["dark", "refuse"], Key("Parts that light cannot reach: dark, or refused.")] = "dark"
+    weight: Annotated[float, Key("Weight of its squared error among the targets.", "", 1e-6, 1e6, example=2.0)] = 1.0
 
     written = leaving_out(weight=1.0)
 
@@ -494,8 +469,7 @@ def _fit_remark(shown: Pixels, target: Target) -> str:
 def average(light: Callable[[PixelBox], np.ndarray], size: Pixels, window: Window, pixels: Pixels) -> np.ndarray:
     """Return the exact means (rows, columns) of a picture, dark outside its edges, over the pixels of a window.
 
-    light: function that returns the values in a box.  size: of the picture, which is read in strips.  pixels: columns
-    and rows of the window.
+    light: function that returns the values in a box.  size: of the picture, read in strips.  pixels: of the window.
     """
     left, top = (max(int(start), 0) for start in window[:2])
     right, bottom = (min(math.ceil(stop), side) for stop, side in zip(window[2:], size, strict=True))

@@ -3,8 +3,7 @@
 It reads the entities that the checks need: control nets, knots and multiplicities of the freeform faces, the product's
 name, the units, the number of solids, the uses of each edge, profile tolerances, and the stated area, volume, centroid
 and material, by their names in "Recommended Practices for Geometric and Assembly Validation Properties" of the CAx
-Interoperability Forum.  Damage to these entities is refused in one sentence.  OCC reads the whole file, in a second
-process.
+Interoperability Forum.  Damage to these entities is refused in one sentence.  OCC, in a second process, reads it all.
 
 Matching takes a time proportional to the length of the text: a repeated group ends at a character that it cannot
 contain, and the text is split into statements before they are matched.

@@ -98,8 +98,7 @@ class BatchScene:
 def design(contents: SceneFiles, folder: Path, variables: Mapping[str, str], tick: Tick = lambda: None) -> ExitStatus:
     """Design a scene into a folder, from a checkpoint of this design if there is one; return how the process ended.
 
-    contents: the scene's files.  variables: additional environment variables of the process.  A process that was killed
-    is started a second time.
+    contents: the scene's files.  variables: additional environment variables.  A killed process is started again, once.
     """
     with tempfile.TemporaryDirectory(prefix="bstcad-") as place:
         scene = unpack_scene(contents, Path(place))

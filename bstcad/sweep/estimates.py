@@ -203,8 +203,7 @@ SIZE_STAGE_PREFIX = "stage 3, "  # beginning of the names of the rounds of stage
 def diagnosis(scene: Scene, making: DesignCourse, proof: Proof, target: np.ndarray) -> dict[str, Any]:
     """Return the entries convergence, remaining_error and bounds of report.json (record.Contents).
 
-    scene: scene with only the target of the largest RRMSD in the proof.  target: picture of this target (rows,
-    columns).
+    scene: scene with only the target of the largest RRMSD in the proof.  target: its picture (rows, columns).
     """
     sizes = [k for k, stage in enumerate(making.stages) if stage.name.startswith(SIZE_STAGE_PREFIX)]
     curve = ending(

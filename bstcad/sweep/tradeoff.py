@@ -1,9 +1,8 @@
 """Command `bstcad tradeoff`: measure what accuracy costs in time for a scene, by runs within a budget of seconds.
 
 A run is a design of the base scene with changed settings (its point).  One knob (setting) is varied at a time, then
-pairs.  The budget limits the sum of the times of all runs by this version of bstcad in a folder, on any machine.  A run
-that is predicted to exceed it is not started, and a run that exceeds it by MAX_OVERRUN is stopped; the first run has no
-limit.
+pairs.  The budget limits the sum of the times of all runs by this version of bstcad in a folder, on any machine.  A
+run other than the first is not started if predicted to exceed it, and stopped when it exceeds it by MAX_OVERRUN.
 
 The folder contains the base scene (scene/), the record of each run (runs/), and the results (results.py).  A run with a
 record is not repeated, so an interrupted sweep continues, and a larger budget adds runs.

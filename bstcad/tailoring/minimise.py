@@ -158,8 +158,7 @@ def lbfgs(start: list[Tensor], evaluations: int, state: LbfgsState | None = None
 
     Returns "plateau" if no step lowers the merit.  Also returns it if PLATEAU_STEPS steps lowered the merit by less
     than the fraction PLATEAU_GAIN while more than PLATEAU_STEPS of the `evaluations` are left.  A run resumed from a
-    state has the result of an uninterrupted run.  (torch.optim's L-BFGS loads a compiler, which takes longer than a
-    draft design.)
+    state has the result of an uninterrupted run.  (torch.optim's would load a compiler for longer than a draft takes.)
     """
     sizes, best, resumable = [p.numel() for p in start], Best(), state
 

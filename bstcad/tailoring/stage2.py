@@ -177,8 +177,7 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
     """Return rounds with few pixels, tubes and variables; () if the light is nearly in place or for several goals.
 
     If the map has not settled, as for a lamp or a wall close to the lens, light has to move far.  This needs many
-    evaluations, but each takes a thirtieth of the time of a full one, and the tubes need not resolve the cells of the
-    full net.
+    evaluations, each in a thirtieth of the time of a full one; the tubes need not resolve the full net's cells.
     """
     limit = min(max(task.goals[0].receiver.shape) - 1, task.knobs.side // 2)  # pixels that the net can resolve
     rounds = [TubeRound(task, tubes, count, pixels=pixels) for pixels, tubes, count in COARSE_ROUNDS if pixels <= limit]

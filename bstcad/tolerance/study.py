@@ -322,8 +322,7 @@ def estimate_yield(good: np.ndarray) -> Yield:
 def worst_of(studies: Sequence[Study]) -> Study:
     """Combine studies of several targets with equal trials and limit: each figure is that of the worst target.
 
-    The contribution of an error (`share`) is a fraction of the mean square change of all pictures, each divided by the
-    norm of its target.
+    The `share` of an error is its fraction of the mean square change of all pictures, each over its target's norm.
     """
     first, *others = studies
     if not others:
@@ -342,9 +341,8 @@ def worst_of(studies: Sequence[Study]) -> Study:
 def study(pictures: TracedGoal, limit: float, rrmsd: float, settings: StudySettings) -> Study:
     """Return sensitivities and trials of a setup with errors.
 
-    limit: maximum figure of merit (RRMSD, or RMS in waves).  rrmsd: figure of the design by independent rays.  The
-    square of the numerical error of the tubes is subtracted from each RRMSD², so that trials and `rrmsd` are
-    comparable.
+    limit: maximum figure of merit (RRMSD, or RMS in waves).  rrmsd: figure of the design by independent rays.  To make
+    the trials comparable with it, the square of the tubes' numerical error is subtracted from each RRMSD².
     """
     perturbations = pictures.perturbations
     with_adjustments = (*perturbations, *adjustments(pictures.setup, perturbations))

@@ -1,7 +1,6 @@
 """Densities on the unit square, source and target of a transport, and their pushforward under a gradient map.
 
-Compiled loops over a grid are divided into BLOCKS, and a compiled sum replaces BLAS, so that results do not depend on
-the number of threads.
+So that results do not depend on the number of threads, loops are divided into BLOCKS, and no sum is left to BLAS.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Fused CPU kernels (numba) behind `tubes.collect`: triangles of light, clipped exactly at the pixel borders.
 
-A triangle of flux F and signed area A has the density F / A.  By Green's theorem its flux in pixel (i, j) is a line
-integral along its edges,
+A triangle of flux F and signed area A has the density F / A.  By Green's theorem its flux in pixel (i, j) is
 
     I_ij = F / A ∮ clip(j + 1 - y, 0, 1) dx   over the parts of the edges in column i,
 
