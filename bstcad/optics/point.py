@@ -277,7 +277,7 @@ class Point(Emitter):
     def _cone_slopes(self, z: float) -> tuple[float, float]:
         """Return the largest |dx/dz| and |dy/dz| of the cone's rays to the plane z; inf if a ray is parallel to it.
 
-        At limits X of dx/dz the plane of X touches the cone about n: (1 + X²) sin² θ_max = (n_x - n_z X)².
+        At limits X of dx/dz the plane dx/dz = X touches the cone about n: (1 + X²) sin² θ_max = (n_x - n_z X)².
         """
         edge = self.edge
         if not self.tilted:

@@ -520,7 +520,7 @@ def _block(value: Any) -> str:
 class Report:
     """Result of a verification, traced through the geometry of lens.step or, with a mount, of part.step.
 
-    Every key of report.json is an attribute, such as `rrmsd` or `flux` (fields of Contents); `facts` are plain values.
+    Every key of report.json is an attribute, such as `rrmsd` (a field of Contents); `facts` has all as plain values.
     """
 
     contents: Contents

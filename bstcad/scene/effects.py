@@ -45,7 +45,7 @@ class Absorption(Record):
     """Beer-Lambert absorption along the path in the glass, in tailoring and verification."""
 
     kind: Annotated[Literal["absorption"], Key("Absorption along the path in the glass.")]
-    coefficient: Annotated[float | None, Key("Absorption; that of the material if absent.", "1/mm", 0.0, 1e3)] = None
+    coefficient: Annotated[float | None, Key("Absorption coefficient (default: material's).", "1/mm", 0.0, 1e3)] = None
 
 
 class Ghost(Record):

@@ -36,7 +36,7 @@ class Tailoring(Record):
     """The effort of tailoring; a setting that is None has the value of PRESETS[quality], if any (see `resolved`)."""
 
     quality: Annotated[
-        Literal["draft", "standard", "fine", "paper"], Key("Effort: draft is the fastest; paper is Wang et al. 2023.")
+        Literal["draft", "standard", "fine", "paper"], Key("Effort: fast to accurate, or paper (Wang et al. 2023).")
     ] = "standard"
     seed: Annotated[int, Key("Seed of all random numbers.", "", 0, 2**63 - 1)] = 0
     method: Annotated[
