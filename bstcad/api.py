@@ -400,7 +400,7 @@ def _adapted(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
 
 
 def _on_net(face: BSplineSurface, net: BSplineSurface, name: str) -> BSplineSurface:
-    """Return a face with exactly the ranges x, y of `net`; SceneError for heights not finite or other ranges."""
+    """Return a face with the ranges x, y of `net`, equal but for rounding; SceneError if not, or if not finite."""
     if not bool(torch.isfinite(face.heights).all()) or not math.isfinite(face.z):
         raise SceneError(f"with_lens: the {name} has heights that are not finite; give finite numbers in mm")
     for axis, own, theirs in (("x", face.x, net.x), ("y", face.y, net.y)):

@@ -3,8 +3,8 @@
 All views have one scale of the standard series (ISO 5455), in first-angle projection (ISO 128-30): the plan, which is
 the view along -z, lies to the left of the section that is seen along +x with z to the right.  Inside the rim the plan
 is a contour map of the back; flange and holes surround it.  Lines, arrows and dimensions follow ISO 128 and ISO 129-1;
-edges and dimensions are black, so that a copy of a copy is legible.  matplotlib draws them: the add-on of ezdxf 1.4.5
-fills the hole of "Ø" and converts text to curves, so that the page cannot be searched, nor the SHA-256 copied from it.
+edges and dimensions are black, so that a copy of a copy is legible.  matplotlib draws them.  (The drawing add-on of
+ezdxf 1.4.5 would fill the hole of "Ø" and make curves of text, so that nobody could search the page or copy from it.)
 """
 
 from __future__ import annotations

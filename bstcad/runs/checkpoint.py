@@ -142,7 +142,7 @@ class Keeper:
         self._due = time.monotonic() + self.interval
 
     def __call__(self, state: Any) -> None:
-        """Store a state from which the design can continue; the caller must not change it afterwards."""
+        """Keep a state to continue from, and write it if `interval` has passed; the caller must not change it later."""
         self.latest = state
         if time.monotonic() >= self._due:
             self.flush()
@@ -188,7 +188,7 @@ class Keeper:
         for key, then, now in _differences(purpose, self.purpose):
             raise SceneError(
                 f"{self.path}: is of another design ({key} was {then}, now it is {now}); "
-                "use the original scene, or start without --resume"
+                "restore this value, or start without --resume"
             )
         self.latest = self._written = state
         return state

@@ -102,7 +102,7 @@ class Tailoring(Record):
         return ResolvedTailoring.model_validate(preset | given)
 
     def complaints(self, lens: LensBlank) -> Iterator[str]:
-        """Yield the faults: levels that do not end with the net, and keys that the method does not support."""
+        """Yield the faults: levels that do not rise to those of the net, and keys that the method does not support."""
         levels, stated = self.levels or (), lens.back.control_points is not None
         net = lens.back.net if stated else (levels or (MIN_SIDE,))[-1]
         points = max(as_pair(net))

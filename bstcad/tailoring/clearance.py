@@ -69,9 +69,9 @@ def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], flo
 
 
 def _points_near_bounds(lens: Lens, bounds: Bounds, margin: float) -> Iterator[tuple[Tensor, Tensor, float, float]]:
-    """Yield (x, y, weight of each point, minimum thickness): all points whose thickness is near a bound, and others.
+    """Yield (x, y, weight of each point, minimum thickness) of the points in cells with a thickness near a bound.
 
-    Near: within `margin` (mm).  The points along the rim come last; their weights sum to 1.
+    Near: within `margin` (mm).  With `bounds.edge`, all points along the rim follow; their weights sum to 1.
     """
     grid = CellGrid.over(lens)
     for x, y in grid.near(lens, bounds, margin):

@@ -275,7 +275,7 @@ def _zoom(along: Along, start: LinePoint, low: LinePoint, high: LinePoint) -> Li
 
 
 def _cubic_minimum(a: LinePoint, b: LinePoint) -> float:
-    """Return the step that minimises the cubic through values and slopes at two points (Eq. 3.59), or the midpoint."""
+    """Return the minimum of the cubic through two values and slopes (Eq. 3.59 of `lbfgs`'s source), or the midpoint."""
     halfway, distance = (a.step + b.step) / 2, a.step - b.step
     if not all(map(math.isfinite, (a.value, b.value, a.slope, b.slope))):
         return halfway

@@ -120,9 +120,10 @@ def _restore_hit(net, faces, path, first, count, work):
 
 @njit(inline="always")
 def _at_level(faces, at, e, h, gx, gy):
-    """Return ∂L/∂(direction behind the face, hit, path) of landings on a level screen, at fixed slopes; L: merit.
+    """Return the gradients of the merit in (direction behind the face, hit, path) for rays that land on a level screen.
 
-    at: x and y of the hit (mm), a zero, direction before the face; e: direction behind it; h: sag; gx, gy: ∂L/∂landing.
+    The slopes of the face are constant; the path moves the hit along the ray.  at: x and y of the hit (mm), a zero, and
+    direction before the face; e: direction behind it; h: sag (mm); gx, gy: gradient in the landing point.
     """
     ex, ey, ez = e
     ez = min(ez, -faces.rules.grazing) if faces.reflects else max(ez, faces.rules.grazing)
