@@ -198,7 +198,7 @@ def task_of(scene: Scene, goals: Sequence[Goal], knobs: ResolvedTailoring, edge:
 def with_solution(scene: Scene, task: Task) -> Task:
     """Return the task with the solution (convex or concave) of the scene, or else the better one, by `find_demand`.
 
-    Only a task with two freeform faces and several goals has a solution; others are returned unchanged.
+    There is a choice only for two freeform faces and several goals; other tasks are returned unchanged.
     `task.progress` reports the angles and limits of the faces.  SceneError if the faces cannot make the pictures.
     """
     lens = scene.flat_lens(REACH_NET)
@@ -207,7 +207,7 @@ def with_solution(scene: Scene, task: Task) -> Task:
     demand = find_demand(task, task.heaviest.through(lens))
     sentences = tuple(demand.sentences(scene.lens.back.z - scene.lens.front.z))
     if is_infeasible(demand):
-        raise SceneError(f"target: {'; '.join(sentences[1:])}")
+        raise SceneError(f"target: no lens makes these pictures: {'; '.join(sentences[1:])}")
     for sentence in sentences:
         task.progress("reach", 0, 0, sentence)
     return replace(task, solution=demand.solution, floor=demand.floor)
@@ -491,5 +491,5 @@ def check_thickness(lens: Lens, scene: Scene) -> None:
     if not room > 0:
         raise SceneError(
             f"{key}: the back that the target needs would reach this position, as it extends to z = {reach:.4g} mm; "
-            f"increase {key}, or lower lens.front.z"
+            f"increase {key}, or lower lens.front.z and lens.back.z"
         )

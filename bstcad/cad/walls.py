@@ -353,7 +353,7 @@ class LeaningPiece:
         return depth
 
     def lower_edge(self) -> LoopPiece:
-        """Return the lower edge of the wall or, if there is one, of its bevel: on the front, projected along z."""
+        """Return x and y of the edge in which the wall, or its bevel if there is one, meets the front."""
         straight = self.piece.straight and _is_level_on(self.front, self.piece)
         return replace(self.piece, points=lambda t: self.ends(t)[1][:, :2], straight=straight)  # `left` is unused
 

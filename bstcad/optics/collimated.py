@@ -122,7 +122,7 @@ class Collimated(Emitter):
         return replace(self, divergence=None, tilt=tilt_of(direction))
 
     def irradiance(self, x: Tensor, y: Tensor, z: float) -> Tensor:
-        """Return E(x, y) (1/mm²) on any plane z; the flux through the aperture is 1."""
+        """Return E(x, y) (1/mm²) of the mean direction on any plane z; the flux through the aperture is 1."""
         if (shift := self.shift(z)) != (0.0, 0.0):
             x, y = x - shift[0], y - shift[1]
         inside = self.aperture.contains(x, y)

@@ -44,7 +44,7 @@ from bstcad.optics.trace import UNDERSIDE, GhostImage, Simulation, simulate, thr
 
 SETS = 8  # number of independent sets of rays: the relative uncertainty of a standard error is a quarter
 PILOT_DIVISOR = 5  # maximum rays per side divided by those of the first sets, which predict the number needed
-PICTURE_NOISE = 0.45  # largest noise of the mean picture / RRMSD, at the default accuracy; it adds 10 % to the RRMSD
+PICTURE_NOISE = 0.45  # largest noise of the mean picture / RRMSD by default: RRMSD of this picture is 10 % larger
 RESOLVED = 5.0  # smallest ratio of an RRMSD to its standard error at which it counts as resolved
 # Tolerances of the difference between the pictures by rays and by tubes: relative to the smaller RRMSD, and absolute.
 WITNESS_RELATIVE_TOLERANCE, WITNESS_TOLERANCE = 0.5, 0.002

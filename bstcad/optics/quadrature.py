@@ -155,7 +155,7 @@ def _chords(face: Surface, x: np.ndarray, y: np.ndarray, dx: np.ndarray) -> tupl
 
 
 def _chord_ends(face: Surface, y: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return (y (mm) of the ends of each chord's parts, some of which are empty, (n, parts + 1); points per part)."""
+    """Return y (mm) of the ends of each chord's parts, (n, parts + 1), and the points per part; parts may be empty."""
     low, high = np.minimum(y, 0.0)[:, None], np.maximum(y, 0.0)[:, None]
     if not is_net(face):
         return np.hstack([low, high]), CHORD_POINTS

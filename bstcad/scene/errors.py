@@ -19,7 +19,7 @@ KEY_NAME = r"""[\w-]+|"[^"\n]*"|'[^'\n]*'"""  # pattern of a name between the do
 DOTTED = rf"(?:{KEY_NAME})(?:\s*\.\s*(?:{KEY_NAME}))*"
 HEADER, KEY = re.compile(rf"\s*(\[\[?)\s*({DOTTED})\s*\]"), re.compile(rf"\s*({DOTTED})\s*=")
 
-NOT_BUILT = {  # unknown word for a feature that bstcad does not have yet: beginning of a sentence about the feature
+NOT_BUILT = {  # beginnings of sentences about features that bstcad does not have yet, by a word for the feature
     **dict.fromkeys(("ies", "ldt", "eulumdat", "intensity"), "files of luminous intensity (IES, EULUMDAT) are"),
     **dict.fromkeys(("rayfile", "ray_file", "rayset", "ray_set"), "files of measured rays are"),
     **dict.fromkeys(("diffraction", "coherent", "interference"), "wave optics is"),

@@ -72,10 +72,10 @@ class Demand:
                 f"irradiance, so that the front deflects light by at most {self.lifted_deflection:.3g} degrees"
             )
         if self.crossed > REPORTED_FRACTION:
+            result = "" if is_infeasible(self) else ", so the other pictures or the wavefront are only approximate"
             yield (
                 f"rays of {100 * self.crossed:.3g} % of the light would have to cross between the lens and the nearest "
-                "target, so the lens makes the further pictures or the wavefront only approximately; bring the nearest "
-                "target closer to the lens, or move the others further away"
+                f"target{result}; bring the nearest target closer to the lens, or move the others further away"
             )
         if self.outside > REPORTED_FRACTION:
             yield (

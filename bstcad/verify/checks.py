@@ -319,7 +319,7 @@ def _ripple_checks(shape: Mapping[str, float | None]) -> list[Check]:
 
 
 def _ripple_rrmsd(lens: Lens, nominal: Nominal) -> dict[str, float]:
-    """Return the RRMSD due to the ripple of each tailored face alone, by keys of Proof.shape."""
+    """Return the RRMSD due to the ripple of the back alone, and of a tailored front alone, by keys of Proof.shape."""
     light = nominal.heaviest
     channel = replace(light, source=light.source.central, weight=1.0)
     faces: dict[Face, str] = {"back": "", "front": "front_"} if lens.shapes("front") else {"back": ""}

@@ -106,7 +106,7 @@ def first_root(net, faces, x, y, z, dx, dy, dz):
 
 @njit(error_model="numpy")
 def start_search(net, faces, count, work):
-    """Store the start of the search as path from the net's plane: zero, except for rays that are steep to the net."""
+    """Store the start of the search as path from the net's plane: 0, or near the first root of a ray with several."""
     for r in range(count):
         work[S + r] = 0.0
     for r in range(count):
