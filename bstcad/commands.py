@@ -289,7 +289,7 @@ def verify(
             raise SceneError(f"{path}: a STEP file is no design, which --against and --measured need; give its folder")
         return examine(path)
     if place is not None and measured is None:
-        raise SceneError(f"{place}: only a made part's report can go there; give the part's points with --measured")
+        raise SceneError(f"{place}: -o is only for the report of a made part; give its points with --measured")
     with folders.amending(path, place) as amended:
         made = read(path)
         with scene_errors():  # reads the cloud first, since the next steps are slow
