@@ -88,7 +88,7 @@ def _span_points(m: int) -> np.ndarray:
 def without_reflection(lens: Lens, edge: Edge) -> Lens:
     """Return the lens with its last net changed just enough that no light undergoes total internal reflection there.
 
-    The penalty alone is minimised; here it begins at u = PENALTY_START, so that it concerns only a little light.
+    It runs after stage 2 and minimises the penalty alone, which begins here at u = PENALTY_START: for little light.
     """
     net, limit = lens.nets[-1], math.sin(edge.angle) ** 2
     penalty = replace(Grazing.of(edge, lens), angle=math.asin(math.sqrt(limit + PENALTY_START * (1 - limit))))

@@ -50,8 +50,8 @@ MAP_ROUNDS, COARSE_DIVISOR, MIN_COARSE_CELLS = 3, 4, 64  # rounds; all but the l
 MAX_WAVE_ITERATIONS = 40  # largest number of iterations for the point of a wave that sends a ray to a given point
 WAVE_TOLERANCE = 1e-9  # change (mm) below which the iterations for a point of the wave have converged
 SOURCE_FLOOR = 0.02  # smallest irradiance of the picture where a map begins / its mean: black would leave holes
-# Standard deviations (pixels) of the blur of the picture where a map begins, in the order of the maps.  For a portrait
-# with dark parts beside bright ones, Newton's method ends at a mass error of 0.003, and without blur at 0.06 to 0.25.
+# Standard deviations (pixels) of the blur of the picture where a map begins; the last map uses all in turn.  For a
+# portrait with dark beside bright parts, Newton's method ends at a mass error of 0.003, without blur at 0.06 to 0.25.
 SOURCE_BLURS = (4.0, 2.0, 1.0)
 FINE_FACTOR = 2  # cells per side of the last map, relative to the transport grid: few cells light a thin letter
 # Solver with floors under the picture where a map ends, relative to its mean, used one after another

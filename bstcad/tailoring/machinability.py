@@ -6,8 +6,8 @@ picture.  Then the minimum thickness is a bound like the others (clearance.py), 
 back is shifted only if changes of both faces do not suffice.
 
 Stage 2 adds to its merit the mean squared excess over the bounds, on a grid four times finer than the knot spans.  Few
-spans are near a bound; differences of control points show which, and only these are evaluated.  The remaining excess
-after stage 2 is removed by minimising this penalty alone, which hardly changes the picture (`enforce_bounds`).
+spans are near a bound; differences of control points show which, and only these are evaluated.  Excess that is left
+after stages 1 and 2 is removed by minimising this penalty alone, which hardly changes the picture (`enforce_bounds`).
 """
 
 from __future__ import annotations

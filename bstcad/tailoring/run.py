@@ -171,7 +171,7 @@ class Task:
             rays = STAGE_EFFORT.rays * (pixels / STAGE_EFFORT_PIXELS**2) ** (1 / 3)
             effort = replace(STAGE_EFFORT, rays=round(rays))
         sources = () if self.sampled_sources else self.extended_sources  # centre alone before stage 3
-        draw = sources[-1].draw if sources else None  # samples the source at full size
+        draw = sources[-1].draw if sources else None  # samples the task's last source
         lens = lens.plain()
         values = [rrmsd_by_rays(lens, self.channels, goal, effort, draw=draw) for goal in self.goals]
         return math.nan if any(map(math.isnan, values)) else max(values)

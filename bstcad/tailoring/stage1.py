@@ -4,8 +4,8 @@ In Wang et al. 2023 the optimal transport map φ carries points S_i of the sourc
 target, and the surface minimises Σ |P_i^t - P_i|² (Eq. 14), where rays through S_i land at P_i.  Here each round solves
 the transport problem from points of the face to the slopes that send their light to the target (slope_map.py), and fits
 the surface to these slopes by linear least squares (slope_fit.py).  The next round starts from the sag and the map of
-this round; the last rounds use finer grids and nets.  If the result is poor, the map of the paper is tried too, with
-slope fits to its fixed target points (`follow_aims`).
+this round; the last rounds use finer grids and nets.  If the result is poor, the map of the paper is tried too, in
+rounds of a new map and slope fits to its target points (`follow_aims`).
 
 Free parameters of the front (curvature, conic constant) are optimised before the first round; for each candidate the
 back is fitted to the same target points.
@@ -53,9 +53,9 @@ RETRY_RRMSD, RETRY_CHANGE = 0.25, 0.025
 SETTLED_CHANGE = 0.01  # RMS change of the map, in the unit of RETRY_CHANGE, below which coarse rounds end
 MAX_RAY_CELLS = 1026  # largest number of rays per side for the slope fit; further points are interpolated between them
 MIN_FLUX_RATIO = 0.9  # smallest accepted flux on the target after `follow_aims`, relative to the flux after the rounds
-AIM_ROUNDS = 5  # number of rounds of `follow_aims`
+AIM_ROUNDS = 5  # number of rounds of `follow_aims`, each with a new map
 SCALAR_EVALUATIONS = 8  # evaluations of the merit in the search for one parameter of the front
-SIMPLEX_EVALUATIONS = 40  # evaluations of the merit in the search for curvature and conic constant together
+SIMPLEX_EVALUATIONS = 40  # evaluations of the merit in the search for both parameters, after that for one
 MAX_RIM_SINE = 0.5  # sine of the largest slope angle of the front at the rim
 MAX_ELLIPSE, MAX_HYPERBOLA = 0.8, 6.0  # largest (1 + k) c² r² and -(1 + k) c² r²: conic constant, curvature, rim radius
 UNBOUNDED = (-math.inf, math.inf)
@@ -78,7 +78,7 @@ class FrontSearch:
     """Effort of `shaped_front`."""
 
     cells: int = COARSEST_GRID  # cells per side of the transport map
-    iterations: int = 100  # iterations of the map
+    iterations: int = 100  # iterations of the map; stage 1 states its own number
     repeats: int = 3  # slope fits of the back for each front
 
 
@@ -179,11 +179,11 @@ def _round(task: Task, lens: Lens, previous: SlopeMap | None, number: int) -> tu
 
 
 def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
-    """Return the lens fitted to the map of the paper (`slope_map.map_to_target`), and this map.
+    """Return the given lens fitted to maps of the paper (`slope_map.map_to_target`) in rounds, and the last map.
 
-    The face is fitted to slopes, while the paper minimises |P_i^t - P_i|².  A ray keeps its aim while the sag changes.
-    So these slope fits converge even if the slopes needed at fixed points of the back depend strongly on the sag: in
-    strong lenses near the source, and in glass of low index.  The part of these slopes that is not a gradient is lost.
+    The face is fitted to slopes, while the paper minimises |P_i^t - P_i|².  In a round a ray keeps its aim.  So these
+    slope fits converge even if the slopes needed at fixed points of the back depend strongly on the sag: in strong
+    lenses near the source, and in glass of low index.  The part of these slopes that is not a gradient is lost.
     """
     knobs, goal, z = task.knobs, task.goals[0], lens.back.z
     for number in range(AIM_ROUNDS):
@@ -226,7 +226,7 @@ def shaped_front(
 
 
 def best_front(merit: FrontMerit, lens: Lens, free: tuple[str, ...], rim_sags: Range = UNBOUNDED) -> Lens:
-    """Return the lens whose front minimises `merit` in its free parameters; each evaluation refits the back.
+    """Return the lens whose front minimises `merit`: in the curvature, then with the conic constant if it is free.
 
     Bounds: at the rim the slope angle of the front is at most 30°, the sag is at most half of the blank's thickness,
     and the sag (mm) lies in `rim_sags`, (low, high).
