@@ -161,9 +161,9 @@ class Design:
 
         trim: closed plane cadquery.Wire inside the lens, to which the lens is cut; the z of the wire is ignored.
         holes: such wires, or (x, y, diameter) in mm.  Trim and holes only change the boundaries of the designed faces,
-        which takes a second; a boolean operation on a large net would take half a minute.  body: cadquery solid, such
-        as a flange, that is joined to the lens, see bstcad.mounted.  draft: angle (degrees) by which the outer walls
-        lean inwards to the front, from the body or from at most 0.1 mm below the back's rim; holes stay along z.
+        which takes a second; a boolean operation on a large net would take half a minute.  body: cadquery solid,
+        such as a flange, that is joined to the lens, see bstcad.mounted.  draft: angle (degrees) by which the outer
+        walls lean inwards to the front, from the body or from at most 0.1 mm below the back's rim; holes stay along z.
         bevel: height along z (mm) of a bevel at 45 degrees on the edge between walls and front.  SceneError if a wire
         is open, crosses itself or another wire, or leaves the lens, if the body does not fit, or if walls would meet.
         """

@@ -273,11 +273,11 @@ def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) 
 
     irradiances: traced irradiance (rows, columns) per target; () if not traced.  The arrays of the second target are
     target_2, irradiance_2, reachable_2, and so on.  reachable (rows, columns) is 1 in the pixels that light can reach;
-    it is absent if light can reach all bright pixels.
-    Transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), the positions of c columns and r rows
-    of points on the target (unit of the receiver), and transport_back or transport_entrance (c, r, 2), x and y (mm) of
-    the light for each point: transport_back on the last tailored face (the back; the front if only the front is
-    tailored, or for a mirror behind glass), transport_entrance in the plane z = const of the first face's vertex.
+    it is absent if light can reach all bright pixels.  Transport map, if known (TransportMap): transport_x (c,) and
+    transport_y (r,), the positions of c columns and r rows of points on the target (unit of the receiver), and
+    transport_back or transport_entrance (c, r, 2), x and y (mm) of the light for each point: transport_back on the last
+    tailored face (the back; the front if only the front is tailored, or for a mirror behind glass), transport_entrance
+    in the plane z = const of the first face's vertex.
     """
     lens, sent = design.lens, design.transport
     (m, n), front = lens.back_net.shape, lens.front

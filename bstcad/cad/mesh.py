@@ -122,8 +122,8 @@ def _cell_corners(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 def _diagonals(outline: Outline, surface: Surface, points: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
     """Choose the diagonal of each cell that is nearer to the face: True (n, n) for the diagonal from the first corner.
 
-    points: x, y and z of the nodes.  A diagonal along a ridge has at most half the error of a diagonal across it, so
-    that fewer triangles suffice.  On a disc, cells on the grid's diagonals are divided towards the centre, because
+    points: x, y and z of the nodes.  A diagonal along a ridge has at most half the error of a diagonal across it,
+    so that fewer triangles suffice.  On a disc, cells on the grid's diagonals are divided towards the centre, because
     their outer corners lie on a circle and the other diagonal would make degenerate triangles.
     """
     k = np.arange(len(points[0]) - 1)

@@ -101,8 +101,8 @@ def _sphere_patch(front: Sphere, outline: Outline) -> Patch:
     """Return a sphere with polar axis ±x and u = π at the vertex, so that no pole (x = ±R) or seam is on the patch.
 
     With s = sign(c) and R = 1/|c| for curvature c, x = s R sin v, y = -R cos v sin u, z - z_centre = s R cos v cos u.
-    The normal points away from the centre.  With a centre 10⁵ mm away, digits would be lost.  Such a sphere is written
-    as the parabola z0 + c r²/2 if it deviates from the parabola, at the rim r, by c³ r⁴/8 < PARABOLA_TOLERANCE.
+    The normal points away from the centre.  With a centre 10⁵ mm away, digits would be lost.  Such a sphere is
+    written as the parabola z0 + c r²/2 if it deviates from the parabola, at the rim r, by c³ r⁴/8 < PARABOLA_TOLERANCE.
     """
     (c, _), r = front.conic(), float(np.hypot(*outline.farthest))
     if abs(c) * r >= 1:

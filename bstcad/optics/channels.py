@@ -43,8 +43,8 @@ class Channel:
 def channels_of(source: Emitter, index: Callable[[float], float], points: int, draw: int = 0) -> tuple[Channel, ...]:
     """Return the channels of a source; index(nm) is the refractive index of the lens.
 
-    points: number of sample points of an extended source, all lines together, but at least two per line.  draw: number
-    that selects the points.  A point or parallel beam of one wavelength gives one channel, with `source` itself.
+    points: number of sample points of an extended source, all lines together, but at least two per line.  draw:
+    number that selects the points.  A point or parallel beam of one wavelength gives one channel, with `source` itself.
     """
     extent = source.extent
     if extent is None:

@@ -78,8 +78,8 @@ def slopes_towards(at_face: Rays, out: Tensor, law: Law) -> tuple[Tensor, Tensor
     """Return the slopes (∂z/∂x, ∂z/∂y) that deflect each ray into the direction d' of `out`, unit vectors (3, …).
 
     By the laws of refraction and reflection the normal (-z_x, -z_y, 1) is parallel to ±(η d - d') (`normal_towards`).
-    If no face can deflect a ray by so large an angle, the slope deflects it to the same side by the largest angle: that
-    of a ray which meets or leaves the face at MAX_EXIT_ANGLE.  No slope is steeper than MAX_SLOPE.
+    If no face can deflect a ray by so large an angle, the slope deflects it to the same side by the largest
+    angle: that of a ray which meets or leaves the face at MAX_EXIT_ANGLE.  No slope is steeper than MAX_SLOPE.
     """
     d = at_face.direction
     along = dot(d, out)

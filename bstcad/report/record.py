@@ -187,8 +187,9 @@ class Contents:
     contrast: Size | None = None  # mean irradiance of lit divided by dark pixels; None: no dark pixels, or no leak
     optic: Literal["lens", "mirror"] = "lens"  # kind of the design
     quality: str | None = None  # tailoring.quality of the scene
-    # transport map: grid (cells per side), iterations, mass_error, stopped (reason of its end), steep_share (fraction
-    # of the light that would need a slope above 70°), steepest_deg (steepest slope it would need).  None: no map
+    # transport map: grid (cells per side), iterations, mass_error, stopped (reason of its end), steep_share
+    # (fraction of the light that would need a slope above 70°), steepest_deg (steepest slope it would need).  None: no
+    # map
     transport: Mapping[str, Scalar] | None = None
     # number of steps that tailoring skipped, since merit or gradient was not finite; None: unknown
     skipped_steps: Annotated[int, Field(ge=0)] | None = None

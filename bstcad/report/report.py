@@ -164,8 +164,8 @@ def base64_images(pictures: Mapping[str, bytes | None]) -> dict[str, str]:
 def junit(report: Contents) -> bytes:
     """Return the checks of a design as a JUnit suite, one test case per check.
 
-    A check without a limit counts as passed, or as skipped if the verdict is NO_LIMIT.  The time of the suite is that
-    of the verification, and its output contains the remarks.
+    A check without a limit counts as passed, or as skipped if the verdict is NO_LIMIT.  The time of the suite
+    is that of the verification, and its output contains the remarks.
     """
     unjudged = [check for check in report.checks if report.verdict == NO_LIMIT and check.limit is None]
     text = environment().get_template("junit.xml.j2").render(report=report, unjudged=unjudged)

@@ -270,10 +270,10 @@ class Scene(Record):
     def flat_lens(self, net: Sides, as_wide_as: Sides | None = None) -> Lens:
         """Return the lens before tailoring, with a flat net as its back.
 
-        net: control points per side of the back's net, or (along x, along y).  A tailored front is a net too, flat or
-        as in its file; its control points have the ratio to the back's that the scene states.
-        as_wide_as: the finest net to which `net` will be refined (default: `net`), whose spans determine how far the
-        nets extend past the rim.
+        net: control points per side of the back's net, or (along x, along y).  A tailored front is a net too, flat
+        or as in its file; its control points have the ratio to the back's that the scene states.  as_wide_as: the
+        finest net to which `net` will be refined (default: `net`), whose spans determine how far the nets extend past
+        the rim.
         """
         from bstcad.optics.bspline import BSplineSurface  # loads numba, which a scene alone does not need
 

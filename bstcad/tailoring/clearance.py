@@ -3,10 +3,10 @@
 If the front is tailored, a lens that is too thin cannot be corrected by a shift of the back along z: each face shapes
 the light, and a shift changes where the light from the front meets the back.  So the penalty changes both faces.
 
-In a cell of a grid no coarser than either net, each face depends on at most 4 x 4 control points, and lies between
-the lowest and the highest of them.  These extremes often show for whole tiles of cells that the thickness is nowhere
-near a bound; if not, they exclude single cells.  In the remaining cells the thickness is computed at points a quarter
-of a cell apart.  (The extremes are computed by numpy in one thread: the work is too small for several threads.)
+In a cell of a grid no coarser than either net, each face depends on at most 4 x 4 control points, and lies between the
+lowest and the highest of them.  These extremes often show for whole tiles of cells that the thickness is nowhere near a
+bound; if not, they exclude single cells.  In the remaining cells the thickness is computed at points a quarter of a
+cell apart.  (The extremes are computed by numpy in one thread: the work is too small for several threads.)
 """
 
 from __future__ import annotations

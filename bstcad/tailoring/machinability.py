@@ -112,9 +112,10 @@ def excess(lens: Lens, bounds: Bounds) -> Excess:
     """Return the excess of curvature, slope and thickness everywhere inside the outline.
 
     The penalty is E = Σ mean max(q_f / b_f - 1 + m, 0)², m = PENALTY_MARGIN, over the tailored faces f and the bounds
-    b_f > 0 on their quantities q_f, plus the penalty on the thickness.  A tool reaches the back from +z, where a valley
-    of radius R has the curvature κ = 1 / R of z.  It reaches the front from -z, from where the heights are -z and the
-    curvatures have the opposite sign: a valley of the front is a ridge of z, with κ = -1 / R.  |∇z| stays the same.
+    b_f > 0 on their quantities q_f, plus the penalty on the thickness.  A tool reaches the back from +z, where a
+    valley of radius R has the curvature κ = 1 / R of z.  It reaches the front from -z, from where the heights are -z
+    and the curvatures have the opposite sign: a valley of the front is a ridge of z, with κ = -1 / R.  |∇z| stays the
+    same.
 
     Sums have fixed parts, so that no bit depends on the number of threads.
     """

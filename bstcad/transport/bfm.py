@@ -64,8 +64,8 @@ def legendre(v: np.ndarray) -> np.ndarray:
 def _line(v, out, hull, slope, first):
     """Compute out[i] = max_j (i + 1/2)(j + 1/2) - v[j]; hull, slope (n) and first (n + 1) are scratch.
 
-    hull: vertices of the lower hull; slope: slope of the edge before each vertex; first[i]: number of the last vertex
-    that becomes the maximiser at i, or 0.
+    hull: vertices of the lower hull; slope: slope of the edge before each vertex; first[i]: number of the last
+    vertex that becomes the maximiser at i, or 0.
     """
     n = v.size
     top = 0

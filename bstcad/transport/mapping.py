@@ -44,8 +44,9 @@ class Frame:
 class Mapping:
     """The optimal map T and its inverse S = ∇v (monge_ampere.py), stored as S at the pixel corners of the target.
 
-    S is bilinear inside a pixel, and T(x) is the solution y of S(y) = x, to rounding (`solve_point`).  T sends the flux
-    of a tube, the image of a pixel under S, exactly into this pixel.  Points outside a frame are moved to its border.
+    S is bilinear inside a pixel, and T(x) is the solution y of S(y) = x, to rounding (`solve_point`).  T sends the
+    flux of a tube, the image of a pixel under S, exactly into this pixel.  Points outside a frame are moved to its
+    border.
     """
 
     x: np.ndarray  # (n + 1, n + 1), x of S at pixel corners, cell units of the source frame

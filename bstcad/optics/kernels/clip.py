@@ -14,8 +14,8 @@ With L the merit function, G = ∂L/∂I and H(x, y) = ∫_y^∞ G dy, the adjoi
 and ∫ (1 - s) G ds, ∫ s G ds, s = 0 … 1 along the edge (an edge that moves by δ sweeps the area δ · n ds, n its normal).
 They are computed once for the two triangles beside the edge.
 
-All lengths are in pixels, x across the columns, y down the rows.  Columns are the first index of the sums, as x is
-that of the tubes: so the rows of tubes of one part, which one thread computes, reach few columns.
+All lengths are in pixels, x across the columns, y down the rows.  Columns are the first index of the sums, as x
+is that of the tubes: so the rows of tubes of one part, which one thread computes, reach few columns.
 """
 
 from __future__ import annotations

@@ -350,8 +350,8 @@ def _across(rays: Rays, interface: Interface, plane: Receiver | None) -> tuple[T
 def _start_below_net(rays: Rays, interface: Interface) -> Rays:
     """Move the start of light along the axis to a plane before the whole net.
 
-    The start of such a beam is arbitrary, and interfaces.intersect does not use it.  The kernels only find roots ahead
-    of the start, and would lose light where a deep net reaches back beyond this start.
+    The start of such a beam is arbitrary, and interfaces.intersect does not use it.  The kernels only find roots
+    ahead of the start, and would lose light where a deep net reaches back beyond this start.
     """
     surface, sense = interface.net, rays.sense
     lowest = net_bounds(surface, torch.float64, sense).lowest
