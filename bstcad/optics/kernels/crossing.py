@@ -27,7 +27,7 @@ from bstcad.optics.kernels import forward, kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.forward import BLOCK, DX, DY, DZ, FATE, FLUX, SAG, SLOPE_X, SLOPE_Y, WORK, S, U, V, X, Y, Z
 from bstcad.optics.kernels.records import Faces, TiltedScreen
-from bstcad.optics.kernels.spline import curved, net_of, scatter
+from bstcad.optics.kernels.spline import curved, net_of, sag, scatter
 from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.receivers import Receiver
 
@@ -46,8 +46,21 @@ def _load(position, direction, status, first, count, work):
         work[FATE + r], work[FLUX + r] = status[at], 1.0
 
 
+@njit(error_model="numpy")
+def _start_beside(width, first, begin, count, status, path, work):
+    """Start the search of a ray at the path extrapolated from the same column of the two rows of rays before.
+
+    Newton's method then needs two steps instead of four.  Rows of `width` rays begin at `first`, rays of this block at
+    `begin`.  Steep rays have a start already.
+    """
+    for r in range(count):
+        one, two = begin + r - width, begin + r - 2 * width
+        if two >= first and work[S + r] == 0.0 and status[one] == 0 and status[two] == 0:
+            work[S + r] = 2.0 * path[one] - path[two] - work[Z + r]
+
+
 @compiled()
-def _cross(net, faces, tilted, lands, position, direction, status, out, path, cosine, first, last):
+def _cross(net, faces, tilted, lands, width, position, direction, status, out, path, cosine, first, last):
     """Trace rays first … last - 1 to the face and refract or reflect them.
 
     If lands is True, out (2, n) receives the landing points (mm); if None, out (6, n) receives hit (mm) and direction
@@ -60,6 +73,8 @@ def _cross(net, faces, tilted, lands, position, direction, status, out, path, co
         _load(position, direction, status, begin, count, work)
         forward.start_search(net, faces, count, work)
         forward.to_net(faces, count, work)
+        if width >= BLOCK:  # the rows before are in earlier blocks
+            _start_beside(width, first, begin, count, status, path, work)
         forward.search(net, faces, count, work, active)
         forward.at_back(faces, count, work)
         for r in range(count):
@@ -101,8 +116,8 @@ def _store_directions(count, work, first, direction, out):
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _restore_hit(net, faces, path, first, count, work):
-    """Compute the hit from the path, and there sag, slopes and second derivatives of the face."""
+def _restore_hit(net, faces, flat, path, first, count, work):
+    """Compute the hit from the path, and there sag, slopes and second derivatives (0 if `flat`) of the face."""
     last_u, last_v = faces.m - 1.0, faces.n - 1.0
     for r in range(count):
         x, y = work[X + r] + path[first + r] * work[DX + r], work[Y + r] + path[first + r] * work[DY + r]
@@ -112,6 +127,13 @@ def _restore_hit(net, faces, path, first, count, work):
     for r in range(count):
         if work[FATE + r] != 0.0:
             work[U + r] = work[V + r] = 0.0
+    if flat:
+        for r in range(count):
+            h, p, q = sag(net, faces.m, faces.n, work[U + r], work[V + r])
+            work[SAG + r], work[SLOPE_X + r], work[SLOPE_Y + r] = h, p * faces.per_x, q * faces.per_y
+            work[H_XX + r] = work[H_XY + r] = work[H_YY + r] = 0.0
+        return
+    for r in range(count):
         h, p, q, hxx, hxy, hyy = curved(net, faces.m, faces.n, work[U + r], work[V + r])
         work[SAG + r], work[SLOPE_X + r], work[SLOPE_Y + r] = h, p * faces.per_x, q * faces.per_y
         work[H_XX + r], work[H_XY + r] = hxx * faces.per_x * faces.per_x, hxy * faces.per_x * faces.per_y
@@ -246,12 +268,14 @@ def _cross_adjoint(
         count = min(BLOCK, last - begin)
         _load(position, direction, status, begin, count, work)
         _load_gradient(lands, g, more, begin, count, work)
-        _restore_hit(net, faces, path, begin, count, work)
+        flat = d_rays is None and forward.are_axial(count, work)  # the slopes at the hit do not change with the path
+        _restore_hit(net, faces, flat, path, begin, count, work)
         _chain(faces, tilted, lands, count, work, path, d_rays, begin)
         for r in range(count):
-            g_h, g_u, g_v = work[Z + r], work[SLOPE_X + r], work[SLOPE_Y + r]
-            if work[FATE + r] == 0.0 and (g_h != 0.0 or g_u != 0.0 or g_v != 0.0):
-                scatter(own, touched, work[U + r], work[V + r], g_h, g_u, g_v)
+            if work[FATE + r] != 0.0:
+                work[Z + r] = work[SLOPE_X + r] = work[SLOPE_Y + r] = 0.0
+        u, v, g_h = work[U : U + count], work[V : V + count], work[Z : Z + count]
+        scatter(own, touched, u, v, g_h, work[SLOPE_X : SLOPE_X + count], work[SLOPE_Y : SLOPE_Y + count])
 
 
 class Crossing(NamedTuple):
@@ -261,6 +285,7 @@ class Crossing(NamedTuple):
     tilted: TiltedScreen | None  # tilted screen; None: a level screen, or none
     lands: bool  # True if rays land on the screen, False if they go on behind the face
     lossy: bool  # True if the face has losses, which need path and angle of incidence
+    width: int  # number of rays in a row of the grid of rays
 
     @property
     def arguments(self) -> tuple[Faces, TiltedScreen | None, bool | None]:
@@ -284,7 +309,8 @@ class Cross(torch.autograd.Function):
         out = torch.empty((2 if crossing.lands else 6, n), dtype=position.dtype)
         path, cosine = torch.empty(n, dtype=torch.float64), torch.ones(n if crossing.lossy else 0, dtype=torch.float64)
         fate = status.clone()
-        inputs = [net_of(heights), *crossing.arguments, *(t.numpy() for t in (position.detach(), direction.detach()))]
+        inputs = [net_of(heights), *crossing.arguments, crossing.width]
+        inputs += [t.detach().numpy() for t in (position, direction)]
         results = [t.numpy() for t in (fate, out, path, cosine)]
         reductions.on_threads(lambda first, last: _cross(*inputs, *results, first, last), reductions.shares(n, BLOCK))
         ctx.save_for_backward(heights, position, direction, fate, path)
@@ -336,7 +362,8 @@ def _across(rays: Rays, interface: Interface, plane: Receiver | None) -> tuple[T
     if rays.axial and interface.status_if_missed == Status.MISSED_FRONT:
         rays = _start_below_net(rays, interface)
     vectors = (reflect_z(t, rays.sense).reshape(3, -1).contiguous() for t in (rays.position, rays.direction))
-    crossing = Crossing(*kernel_arguments.faces(interface, plane, rays.sense, rays.z), plane is not None, lossy)
+    faces, width = kernel_arguments.faces(interface, plane, rays.sense, rays.z), shape[-1]
+    crossing = Crossing(*faces, plane is not None, lossy, width)
     out, status, path, cos_in = Cross.apply(
         -heights if rays.sense < 0 else heights, *vectors, rays.status.reshape(-1), crossing
     )

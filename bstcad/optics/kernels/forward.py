@@ -131,6 +131,12 @@ def to_net(faces, count, work):
         work[U_S + r], work[V_S + r] = dx * faces.per_x, dy * faces.per_y
 
 
+@njit(error_model="numpy")
+def are_axial(count, work):
+    """Return True if all rays are along the axis: x and y are constant, so that one Newton step is exact."""
+    return not (work[DX : DX + count].any() or work[DY : DY + count].any())
+
+
 @njit(error_model="numpy", fastmath={"contract"})
 def search(net, faces, count, work, active):
     """Find path s from the net's plane to the back by Newton steps of all rays in turn, as `interfaces._newton` does.
@@ -138,6 +144,15 @@ def search(net, faces, count, work, active):
     On return `work` contains s after a ray's last step, and sag and slopes (in u and v) before that step.
     """
     last_u, last_v, floor = faces.m - 1.0, faces.n - 1.0, faces.rules.min_derivative
+    if are_axial(count, work):
+        for r in range(count):
+            u, v = work[U + r], work[V + r]
+            u, v = (u if u > 0.0 else 0.0), (v if v > 0.0 else 0.0)  # 0 if it is not a number
+            work[SAG + r], work[SLOPE_X + r], work[SLOPE_Y + r] = sag(
+                net, faces.m, faces.n, min(u, last_u), min(v, last_v)
+            )
+            work[S + r] = work[SAG + r] / work[DZ + r]
+        return
     searching = 0
     for r in range(count):
         active[searching] = r
@@ -160,8 +175,7 @@ def search(net, faces, count, work, active):
             work[S + r] = s - residual / slope
             work[SAG + r], work[SLOPE_X + r], work[SLOPE_Y + r] = h, h_u, h_v
             active[remaining] = r
-            # for light along the axis one step is exact, since x and y are constant
-            remaining += not (abs(residual) <= faces.tolerance or (u_s == 0.0 and v_s == 0.0))
+            remaining += not abs(residual) <= faces.tolerance
         searching = remaining
     for a in range(searching):
         work[FATE + active[a]] = faces.fates.missed_back

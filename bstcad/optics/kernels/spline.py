@@ -105,25 +105,61 @@ def curved(net, m, n, u, v):
 
 
 @njit(inline="always")
+def _added(column, flat, tilt, b, q):
+    """Return column + b flat + q tilt, each three numbers."""
+    return (
+        column[0] + (flat[0] * b + tilt[0] * q),
+        column[1] + (flat[1] * b + tilt[1] * q),
+        column[2] + (flat[2] * b + tilt[2] * q),
+    )
+
+
+@njit(inline="always")
+def _add_column(own, i, j, column):
+    """Add three numbers to the control points (i, j), (i + 1, j) and (i + 2, j)."""
+    own[i, j] += column[0]
+    own[i + 1, j] += column[1]
+    own[i + 2, j] += column[2]
+
+
+@njit(error_model="numpy", fastmath={"contract"})
 def scatter(own, touched, u, v, g, g_u, g_v):
-    """Add g, g_u, g_v of a point to its nine control points, the transpose of `sag`; own (m, n): see reductions.py."""
+    """Add g, g_u, g_v of points (n,) to their nine control points, the transpose of `sag`; own: see reductions.py.
+
+    Sums over consecutive points with the same control points stay in registers: a processor waits some ten cycles to
+    read a number that it has just written.  If v moves to the next span, two of the three columns stay.
+    """
     m, n = own.shape
-    i, a0, a2, p0, p2 = basis(u, m)
-    j, b0, b2, q0, q2 = basis(v, n)
-    b1, q1 = 1.0 - b0 - b2, q0 - q2
-    reductions.clear(own, touched, i, i + 3)
-    flat, tilt = a0 * g - p0 * g_u, a0 * g_v
-    own[i, j] += flat * b0 - tilt * q0
-    own[i, j + 1] += flat * b1 + tilt * q1
-    own[i, j + 2] += flat * b2 + tilt * q2
-    flat, tilt = (1.0 - a0 - a2) * g + (p0 - p2) * g_u, (1.0 - a0 - a2) * g_v
-    own[i + 1, j] += flat * b0 - tilt * q0
-    own[i + 1, j + 1] += flat * b1 + tilt * q1
-    own[i + 1, j + 2] += flat * b2 + tilt * q2
-    flat, tilt = a2 * g + p2 * g_u, a2 * g_v
-    own[i + 2, j] += flat * b0 - tilt * q0
-    own[i + 2, j + 1] += flat * b1 + tilt * q1
-    own[i + 2, j + 2] += flat * b2 + tilt * q2
+    i = j = -1
+    zero = (0.0, 0.0, 0.0)
+    left, middle, right = zero, zero, zero  # sums for the control points i … i + 2 in columns j, j + 1 and j + 2
+    for r in range(u.size):
+        h, h_u, h_v = float(g[r]), float(g_u[r]), float(g_v[r])
+        if h == 0.0 and h_u == 0.0 and h_v == 0.0:
+            continue
+        k, a0, a2, p0, p2 = basis(float(u[r]), m)
+        c, b0, b2, q0, q2 = basis(float(v[r]), n)
+        if k != i or c != j:
+            if k == i and c == j + 1:
+                _add_column(own, i, j, left)
+                left, middle, right = middle, right, zero
+            else:
+                if i >= 0:
+                    _add_column(own, i, j, left)
+                    _add_column(own, i, j + 1, middle)
+                    _add_column(own, i, j + 2, right)
+                reductions.clear(own, touched, k, k + 3)
+                left, middle, right = zero, zero, zero
+            i, j = k, c
+        a1, p1, b1, q1 = 1.0 - a0 - a2, p0 - p2, 1.0 - b0 - b2, q0 - q2
+        flat, tilt = (a0 * h - p0 * h_u, a1 * h + p1 * h_u, a2 * h + p2 * h_u), (a0 * h_v, a1 * h_v, a2 * h_v)
+        left = _added(left, flat, tilt, b0, -q0)
+        middle = _added(middle, flat, tilt, b1, q1)
+        right = _added(right, flat, tilt, b2, q2)
+    if i >= 0:
+        _add_column(own, i, j, left)
+        _add_column(own, i, j + 1, middle)
+        _add_column(own, i, j + 2, right)
 
 
 @njit(error_model="numpy", inline="always")
@@ -152,9 +188,8 @@ def _adjoint_in_net(u, v, g, g_u, g_v, d_net, touched):
     count = d_net.shape[0]
     share = (n + count - 1) // count
     for c in prange(count):
-        own, rows = d_net[c], touched[c]
-        for r in range(c * share, min(n, (c + 1) * share)):
-            scatter(own, rows, float(u[r]), float(v[r]), float(g[r]), float(g_u[r]), float(g_v[r]))
+        part = slice(c * share, min(n, (c + 1) * share))
+        scatter(d_net[c], touched[c], u[part], v[part], g[part], g_u[part], g_v[part])
 
 
 @compiled(parallel=True)

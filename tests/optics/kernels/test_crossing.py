@@ -61,6 +61,20 @@ def test_landings_and_their_gradient(scene, dtype):
     close(g, g_plain, dtype, float(g_plain.abs().max()), roundings=1e4 if dtype == torch.float64 else 10)
 
 
+@pytest.mark.parametrize("scene", ["point", "collimated"])
+def test_a_grid_of_rays_is_traced_as_its_rays_are(scene):
+    """The search for a ray of a grid begins beside the hits of two rows before; that of a listed ray, at the plane."""
+    source, front, outline, fates = SCENES[scene]
+    lens, z = Lens(front, deep(), outline, 1.6), LevelPlane(400.0)
+    x, y = torch.meshgrid(*(torch.linspace(-11.5, 11.5, n, dtype=torch.float64) for n in (70, 300)), indexing="ij")
+    grid = trace.to_first_net(source.rays(x, y, 15.0, 1.0), lens)
+    listed = trace.to_first_net(source.rays(x.reshape(-1), y.reshape(-1), 15.0, 1.0), lens)
+    one, other = trace.from_first_net(grid, lens, z), trace.from_first_net(listed, lens, z)
+    assert torch.equal(one.status.reshape(-1), other.status) and set(other.status.unique().tolist()) == fates
+    error = (one.position.reshape(2, -1) - other.position).abs() / (1 + other.position.abs())
+    assert float(error.max()) < 1e-11
+
+
 def test_a_beam_meets_a_front_that_reaches_beyond_where_it_begins():
     """12 mm before the front of a lens 20 mm wide: where a beam begins is a convention, to the closed form none."""
     front = replace(deep(depth=-30.0), z=15.0)
@@ -128,14 +142,15 @@ def test_the_gradient_in_the_rays_is_finite_differences():
 
 
 @pytest.mark.parametrize("form", [trace.from_first_net, from_first_net_plain])
-def test_a_ray_of_no_number_is_lost_alone(form):
+@pytest.mark.parametrize(("source", "name"), [(Point(), "direction"), (Collimated(Circle(12.0)), "position")])
+def test_a_ray_of_no_number_is_lost_alone(form, source, name):
     """An index made from it must not be out of range: on a GPU that would end the whole process."""
     lens = Lens(Plane(15.0), deep(), Rectangle(20.0, 20.0), 1.5)
     x, y = sampling.grid(Rectangle(10.0, 10.0), 4)
-    in_glass = trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens)
-    direction = in_glass.direction.clone()
-    direction[:, 2, 1] = torch.nan
-    landed = form(replace(in_glass, direction=direction), lens, LevelPlane(400.0))
+    in_glass = trace.to_first_net(source.rays(x, y, 15.0, 1.0), lens)
+    wrong = getattr(in_glass, name).clone()
+    wrong[:, 2, 1] = torch.nan
+    landed = form(replace(in_glass, **{name: wrong}), lens, LevelPlane(400.0))
     expected = torch.ones_like(landed.alive)
     expected[2, 1] = False
     assert torch.equal(landed.alive, expected) and torch.isfinite(landed.position[:, expected]).all()
