@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bstcad.optics.kernels.reductions import dot, total
+from bstcad.optics.kernels.reductions import dot, shift, total
 
 Objective = Callable[[list[Tensor]], tuple[float, list[Tensor], float]]  # parameters -> (merit, gradients, figure)
 
@@ -209,16 +209,25 @@ def _step(at: Callable[[Tensor], Values], search: LbfgsState) -> Generator[Query
 
 
 def _inverse_hessian_times(g: Tensor, pairs: Sequence[tuple[Tensor, Tensor, float]]) -> Tensor:
-    """Return H g, H the inverse Hessian, by the two-loop recursion (algorithm 7.4); pairs: as in `LbfgsState`."""
+    """Return H g, H the inverse Hessian, by the two-loop recursion (algorithm 7.4); pairs: as in `LbfgsState`.
+
+    Each pass over the vectors also computes the product that the next pass needs, since memory limits the speed.
+    """
     q, alphas = g.clone(), []
-    for s, y, curvature in reversed(pairs):
-        alphas.append(dot(s, q) / curvature)
-        q += -alphas[-1] * y
-    if pairs:
-        _, y, curvature = pairs[-1]
-        q *= curvature / dot(y, y)
-    for (s, y, curvature), alpha in zip(pairs, reversed(alphas), strict=True):
-        q += (alpha - dot(y, q) / curvature) * s
+    if not pairs:
+        return q
+    y_last, curvature = pairs[-1][1:]
+    scale, product = curvature / dot(y_last, y_last), dot(pairs[-1][0], q)
+    for number in range(len(pairs) - 1, -1, -1):
+        _, y, curvature = pairs[number]
+        alphas.append(product / curvature)
+        if number:
+            product = shift(q, y, -alphas[-1], along=pairs[number - 1][0])
+        else:
+            product = shift(q, y, -alphas[-1] * scale, along=y, scale=scale)
+    for number, (s, _, curvature) in enumerate(pairs):
+        following = pairs[min(number + 1, len(pairs) - 1)][1]
+        product = shift(q, s, alphas.pop() - product / curvature, along=following)
     return q
 
 

@@ -36,6 +36,23 @@ def test_lbfgs_finds_the_bottom_of_a_bowl():
     assert best.evaluations <= 60
 
 
+@pytest.mark.parametrize("count", [0, 1, 2, 5])
+def test_the_two_loops_apply_the_inverse_hessian_of_bfgs(count):
+    """H is updated pair by pair: H' = (I - s yᵀ / sᵀy) H (I - y sᵀ / sᵀy) + s sᵀ / sᵀy (Nocedal and Wright, 6.17)."""
+    random = torch.Generator().manual_seed(count)
+    s, y = (torch.randn((count, 7), generator=random, dtype=torch.float64) for _ in range(2))
+    y = y * torch.sign((s * y).sum(1))[:, None]
+    pairs = [(a, b, float((a * b).sum())) for a, b in zip(s, y, strict=True)]
+    inverse, unit = torch.eye(7, dtype=torch.float64), torch.eye(7, dtype=torch.float64)
+    if pairs:
+        inverse = inverse * pairs[-1][2] / float((y[-1] ** 2).sum())
+    for a, b, curvature in pairs:
+        left = unit - torch.outer(a, b) / curvature
+        inverse = left @ inverse @ left.T + torch.outer(a, a) / curvature
+    g = torch.randn(7, generator=random, dtype=torch.float64)
+    torch.testing.assert_close(of_lbfgs._inverse_hessian_times(g, pairs), inverse @ g, rtol=1e-10, atol=1e-10)
+
+
 def rosenbrock(parameters):
     """Σ 100 (x_{i+1} - x_i²)² + (1 - x_i)²: a curved valley, its bottom at (1, …, 1)."""
     x = parameters[0].detach().requires_grad_()

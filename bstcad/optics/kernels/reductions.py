@@ -91,6 +91,27 @@ def _dot(a, b, sums):
         sums[c] = part
 
 
+def shift(q: Tensor, y: Tensor, factor: float, along: Tensor, scale: float = 1.0) -> float:
+    """Replace q by scale q + factor y, in place, and return its `dot` with `along`; vectors without gradient."""
+    if ops.kernel("reductions.dot", q, y, along):
+        sums = np.empty(MAX_PARTS)
+        _shift(q.numpy(), y.numpy(), factor, along.numpy(), scale, sums)
+        return float(sums.sum())
+    q.mul_(scale).add_(factor * y)
+    return dot(q, along)
+
+
+@compiled(parallel=True, fastmath={"reassoc", "contract"})
+def _shift(q, y, factor, along, scale, sums):
+    for c in prange(sums.size):
+        part = 0.0
+        for k in range(c * q.size // sums.size, (c + 1) * q.size // sums.size):
+            value = np.float64(scale) * np.float64(q[k]) + np.float64(factor) * np.float64(y[k])
+            q[k] = value
+            part += value * np.float64(along[k])
+        sums[c] = part
+
+
 @njit(inline="always")
 def clear(own, touched, first, last):
     """Clear the rows first … last - 1 of a part that lie outside the range `touched` (2,), and extend the range."""

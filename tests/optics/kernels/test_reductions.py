@@ -46,6 +46,20 @@ def test_no_bit_depends_on_the_number_of_threads(threads, dtype):
     assert reductions.dot(a, b) == pytest.approx(exact, abs=1e-14 * float((a.double() * b.double()).abs().sum()))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_shift_adds_and_tells_the_next_product(threads, dtype):
+    q, y, along = (noise(*shape, dtype=dtype).reshape(-1) for shape in ((70_001,), (70_001, 1), (1, 70_001, 1)))
+    wanted = 0.7 * q.double() - 1.3 * y.double()
+    found = []
+    for _ in threads():
+        moved = q.clone()
+        found.append((reductions.shift(moved, y, -1.3, along, scale=0.7), moved))
+    assert all(product == found[0][0] and torch.equal(moved, found[0][1]) for product, moved in found)
+    terms = 0.7 * q.double().abs() + 1.3 * y.double().abs()
+    assert bool(((found[0][1].double() - wanted).abs() <= 2 * torch.finfo(dtype).eps * terms).all())
+    assert found[0][0] == pytest.approx(float((wanted * along.double()).sum()), rel=1e-6)
+
+
 def test_a_quotient_has_the_gradient_of_torchs_own_from_any_number_of_threads(threads):
     t, weight = noise(700, 600), noise(600, 700).T
     whole = torch.tensor(1.3, dtype=torch.float64)
