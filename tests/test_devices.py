@@ -154,7 +154,7 @@ def test_resume_brings_everything_back_to_the_device(quality, tmp_path):
 
 
 def test_auto_is_the_cpu_also_where_there_is_a_gpu(monkeypatch):
-    """Until somebody has measured that it is right and faster there."""
+    """A GPU is not faster for every scene (docs/explanation/decisions/no-gpu-by-default.md)."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     wanted = scene(TEMPLATES[0], "draft")
     with SecondDevice() as second:

@@ -138,17 +138,18 @@ def _tubes(source: Emitter, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tube
     x, y = x.to(like), y.to(like)
     light, lit = source.rays(x, y, z, 1.0), None
     light = replace(light, flux=torch.ones_like(light.flux))
-    inside, rays = source.irradiance(x, y, z) > 0, [light]  # rays: in front of each interface
+    rays = [light]  # in front of each interface
     interfaces = lens.unbounded().interfaces
-    edges = lens.with_apertures_scaled(1 + RIM_SHRINK).interfaces  # margin for rounding
     first, back = lens.freeform[0], lens.number_of("back")
     end = lens.solid.stop if lens.solid.stop > back + 1 else back  # faces behind the back: in a second-surface mirror
     for k in range(max(first, end)):
         rays.append(cross(rays[k], interfaces[k]).rays)
-        if k < end and k != back:  # the sheet itself ends at the back's rim
-            inside = inside & edges[k].outline.contains(*rays[-1].position[:2])
     if cut:
-        lit = inside & rays[end].alive
+        lit = (source.irradiance(x, y, z) > 0) & rays[end].alive
+        edges = lens.with_apertures_scaled(1 + RIM_SHRINK).interfaces  # margin for rounding
+        for k in range(end):
+            if k != back:  # the sheet itself ends at the back's rim
+                lit = lit & edges[k].outline.contains(*rays[k + 1].position[:2])
     return Tubes(rays[first], _density(source, lens, x=x, y=y, lit=lit) * area)
 
 
@@ -391,19 +392,24 @@ def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple
     sums = torch.zeros(rows * (columns + 1), dtype=corner.dtype, device=corner.device)
 
     column, row = ((first + second + third) / 3).detach().floor()
-    on_screen = whole & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-    index = (row * (columns + 1) + column)[on_screen].long()
-    sums = sums.index_add(0, index, flux[on_screen]).index_add(0, index + 1, -flux[on_screen])
+    on_screen = (whole & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)).nonzero()[:, 0]
+    index, inside = (row * (columns + 1) + column)[on_screen].long(), flux.index_select(0, on_screen)
+    sums = sums.index_add(0, index, inside).index_add(0, index + 1, -inside)
 
-    weight = -(flux / torch.where(whole, torch.ones_like(area), area))[~whole]
+    # index_select, whose gradient needs no sorting, instead of a mask: half the time of an evaluation on a GPU
+    clipped = (~whole).nonzero()[:, 0]
+    weight = -(flux.index_select(0, clipped) / area.index_select(0, clipped))
+    first, second, third = (p.index_select(1, clipped) for p in (first, second, third))
     for start, end in ((first, second), (second, third), (third, first)):
-        edge, s_0, s_1, column, row = _pieces(start[:, ~whole], end[:, ~whole], (columns, rows))
-        a, d = start[:, ~whole][:, edge], (end - start)[:, ~whole][:, edge]
+        edge, s_0, s_1, column, row = _pieces(start, end, (columns, rows))
+        a, d = start.index_select(1, edge), (end - start).index_select(1, edge)
         middle_x = a[0] + (s_0 + s_1) / 2 * d[0]
-        share = weight[edge] * (s_1 - s_0) * d[1]
-        counted = (row >= 0) & (row < rows) & (column < columns)
-        share, offset = share[counted], torch.where(column < 0, torch.zeros_like(middle_x), middle_x - column)[counted]
-        index = (row * (columns + 1) + column.clamp(min=0))[counted].long()
+        share = weight.index_select(0, edge) * (s_1 - s_0) * d[1]
+        counted = ((row >= 0) & (row < rows) & (column < columns)).nonzero()[:, 0]
+        column, row = column[counted], row[counted]
+        share, middle_x = share.index_select(0, counted), middle_x.index_select(0, counted)
+        offset = torch.where(column < 0, torch.zeros_like(middle_x), middle_x - column)
+        index = (row * (columns + 1) + column.clamp(min=0)).long()
         sums = sums.index_add(0, index, share * (1 - offset)).index_add(0, index + 1, share * offset)
     return sums.view(rows, columns + 1).cumsum(1)[:, :columns], outside
 
@@ -434,14 +440,14 @@ def _pieces(start: Tensor, end: Tensor, sizes: tuple[int, int]) -> tuple[Tensor,
         low, count = torch.minimum(first, last), (last - first).abs().long()
         which = edges.repeat_interleave(count)
         nth = torch.arange(len(which), device=start.device) - (count.cumsum(0) - count)[which]
-        at = ((low[which] + 1 + nth - a[which]) / (b - a)[which]).clamp(0, 1)
+        at = ((low[which] + 1 + nth - a.index_select(0, which)) / (b - a).index_select(0, which)).clamp(0, 1)
         parts.append((which, at, torch.full_like(which, axis)))
         cells.append(first)
         senses.append(torch.sign(last - first))
     edge, s, kind = (torch.cat(part) for part in zip(*parts, strict=True))
     order = torch.argsort(s.detach(), stable=True)
     order = order[torch.argsort(edge[order], stable=True)]
-    edge, s, kind = edge[order], s[order], kind[order]
+    edge, s, kind = edge[order], s.index_select(0, order), kind[order]
     begins = (kind == -1).nonzero(as_tuple=True)[0]  # first piece of each edge, sorted first at s = 0
     pixel = []
     for axis in (0, 1):
