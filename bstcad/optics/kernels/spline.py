@@ -115,11 +115,12 @@ def _added(column, flat, tilt, b, q):
 
 
 @njit(inline="always")
-def _add_column(own, i, j, column):
-    """Add three numbers to the control points (i, j), (i + 1, j) and (i + 2, j)."""
-    own[i, j] += column[0]
-    own[i + 1, j] += column[1]
-    own[i + 2, j] += column[2]
+def _add_columns(own, i, j, columns):
+    """Add three numbers each to the control points i … i + 2 of columns j, j + 1, …"""
+    for number, column in enumerate(columns):
+        own[i, j + number] += column[0]
+        own[i + 1, j + number] += column[1]
+        own[i + 2, j + number] += column[2]
 
 
 @njit(error_model="numpy", fastmath={"contract"})
@@ -141,13 +142,11 @@ def scatter(own, touched, u, v, g, g_u, g_v):
         c, b0, b2, q0, q2 = basis(float(v[r]), n)
         if k != i or c != j:
             if k == i and c == j + 1:
-                _add_column(own, i, j, left)
+                _add_columns(own, i, j, (left,))
                 left, middle, right = middle, right, zero
             else:
                 if i >= 0:
-                    _add_column(own, i, j, left)
-                    _add_column(own, i, j + 1, middle)
-                    _add_column(own, i, j + 2, right)
+                    _add_columns(own, i, j, (left, middle, right))
                 reductions.clear(own, touched, k, k + 3)
                 left, middle, right = zero, zero, zero
             i, j = k, c
@@ -157,9 +156,7 @@ def scatter(own, touched, u, v, g, g_u, g_v):
         middle = _added(middle, flat, tilt, b1, q1)
         right = _added(right, flat, tilt, b2, q2)
     if i >= 0:
-        _add_column(own, i, j, left)
-        _add_column(own, i, j + 1, middle)
-        _add_column(own, i, j + 2, right)
+        _add_columns(own, i, j, (left, middle, right))
 
 
 @njit(error_model="numpy", inline="always")
