@@ -191,6 +191,11 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
         return replace(rays, position=torch.stack([x, y, h]), z=surface.z, status=status), z_x, z_y
 
     start, s, meets = _plane_and_root(surface, rays)
+    before = torch.stack([*rays.position[:2], rays.above(surface.z)])
+    if surface.level:  # the root lies on the base plane
+        met = meets & outline.contains(start[0], start[1])
+        at = replace(rays, position=torch.where(meets, start, before), z=surface.z, status=rays.lose(~met, missed))
+        return at, torch.zeros_like(s), torch.zeros_like(s)
     # double where: a ray without a root takes no step, and its values reach no gradient of other rays
     x, y, z = torch.where(meets, start + s * rays.direction, torch.zeros_like(start))
     h, z_x, z_y = surface.relative_sag_and_slope(x, y)
@@ -200,7 +205,6 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
     rise_x, rise_y = slopes_beyond(net, x, y, z_x=z_x, z_y=z_y) if net else (z_x, z_y)
     slope = dz - rise_x.detach() * dx - rise_y.detach() * dy
     step = torch.where(ok, z - h, torch.zeros_like(h)) / torch.where(ok, slope, torch.ones_like(slope))
-    before = torch.stack([*rays.position[:2], rays.above(surface.z)])
     position = torch.where(ok, torch.stack([x, y, z]) - step * rays.direction, before)
     x, y = (torch.where(ok, p, torch.zeros_like(p)) for p in position[:2])
     _, z_x, z_y = surface.relative_sag_and_slope(x, y)  # slopes as differentiable functions of the hit

@@ -36,7 +36,7 @@ MAX_BAND_TUBES = 1 << 19  # maximum tubes traced at a time for a picture, which 
 MAX_RAYS_PER_BAND = 1 << 17  # maximum rays traced at a time in plain torch, a megabyte per coordinate
 PARTS_PER_SIDE = 4  # parts per side into which a partly lit tube is divided
 MIN_TRIANGLE_AREA = 1e-9  # smallest area of a triangle that is clipped (pixel²); smaller triangles count in one pixel
-COARSE_GRID_POINTS = 65  # points per side of the coarse grid on which `rays_to` solves first
+COARSE_GRID_POINTS = 33  # points per side of the coarse grid on which `rays_to` solves first
 MAX_BROYDEN_STEPS = 30  # maximum number of Broyden steps of `rays_to`
 RAY_TOLERANCE = 1e-8  # distance of rays from their points at which the search ends, as a fraction of the grid's extent
 RELATIVE_DIFFERENCE_STEP = 1e-6  # step of the difference quotients of `rays_to`, as a fraction of the grid's extent
@@ -308,8 +308,8 @@ def rays_to(
     if max(x.shape) > 2 * COARSE_GRID_POINTS and not arrive(x[:1, :1], y[:1, :1], z[:1, :1]).axial:
         lines = tuple(torch.linspace(0, n - 1, min(n, COARSE_GRID_POINTS)).round().long() for n in x.shape)
         coarse = torch.meshgrid(*lines, indexing="ij")
-        c_p, c_q, _ = rays_to(source, lens, x=x[coarse], y=y[coarse], number=number)
-        inverse = [_interpolate(lines, x.shape, t) for t in jacobian(c_p, c_q, z[coarse])]
+        c_p, c_q, c_hit = rays_to(source, lens, x=x[coarse], y=y[coarse], number=number)
+        inverse = [_interpolate(lines, x.shape, t) for t in jacobian(c_hit, c_p, c_q, z[coarse])]
         p, q = (_interpolate(lines, x.shape, t) for t in (c_p, c_q))
     for _ in range(MAX_BROYDEN_STEPS):
         hit = arrive(p, q, z)
@@ -320,7 +320,7 @@ def rays_to(
         if last is not None and inverse is not None:
             step, (last_x, last_y) = last
             inverse = _broyden_update(inverse, step, (last_x - off_x, last_y - off_y))
-        xx, xy, yx, yy = inverse = inverse or jacobian(p, q, z)
+        xx, xy, yx, yy = inverse = inverse or jacobian(hit, p, q, z)
         step = xx * off_x + xy * off_y, yx * off_x + yy * off_y
         p, q, last = p + step[0], q + step[1], (step, (off_x, off_y))
         if float(error.max()) <= RAY_TOLERANCE * extent:
@@ -330,12 +330,13 @@ def rays_to(
     return p, q, replace(hit, position=position, z=face.z, status=status)
 
 
-def _inverse_jacobian(arrive: Callable[..., Rays], step: float, p: Tensor, q: Tensor, height: Tensor) -> list[Tensor]:
+def _inverse_jacobian(
+    arrive: Callable[..., Rays], step: float, hit: Rays, p: Tensor, q: Tensor, height: Tensor
+) -> list[Tensor]:
     """Return [xx, xy, yx, yy], the inverse of ∂(hit of `arrive`) / ∂(p, q) by difference quotients of `step` (mm)."""
-    shifted_p, shifted_q = torch.cat((p + step, p - step, p, p)), torch.cat((q, q, q + step, q - step))
-    right, left, above, below = arrive(shifted_p, shifted_q, height.repeat(4, 1)).position.chunk(4, dim=1)
-    one, two = right - left, above - below
-    xx, yx, xy, yy = (d / (2 * step) for d in (one[0], one[1], two[0], two[1]))
+    shifted = arrive(torch.cat((p + step, p)), torch.cat((q, q + step)), height.repeat(2, 1))
+    one, two = ((moved - hit.position)[:2] / step for moved in shifted.position.chunk(2, dim=1))
+    (xx, yx), (xy, yy) = one, two
     det = xx * yy - xy * yx
     det = torch.where(det.abs() > 1e-6, det, torch.ones_like(det))
     return [yy / det, -xy / det, -yx / det, xx / det]
