@@ -193,8 +193,9 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
     start, s, meets = _plane_and_root(surface, rays)
     before = torch.stack([*rays.position[:2], rays.above(surface.z)])
     if surface.level:  # the root lies on the base plane
-        met = meets & outline.contains(start[0], start[1])
-        at = replace(rays, position=torch.where(meets, start, before), z=surface.z, status=rays.lose(~met, missed))
+        ok = meets & (rays.direction[2].abs() > TANGENCY_TOLERANCE)
+        status = rays.lose(~(ok & outline.contains(start[0], start[1])), missed)
+        at = replace(rays, position=torch.where(ok, start, before), z=surface.z, status=status)
         return at, torch.zeros_like(s), torch.zeros_like(s)
     # double where: a ray without a root takes no step, and its values reach no gradient of other rays
     x, y, z = torch.where(meets, start + s * rays.direction, torch.zeros_like(start))

@@ -26,6 +26,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import groupby
 
 import numpy as np
 import torch
@@ -58,6 +59,7 @@ MIN_TUBES = 513  # minimum tubes per side (`tubes_of`): fewer do not resolve pix
 COARSE_SHEET = 64  # tubes per side of the grid from which finer ones are interpolated, with 1e-6 of the light misplaced
 PASS_SEEDS = 1 << 20  # difference between the seeds of successive passes of rays from an extended source
 GHOST_DIVISOR = 4  # rays per side divided by those of the ghost, which is about a thousandth of the light
+MAX_IMAGE_RAYS = 1 << 17  # maximum rays of the images of a source that are traced at a time, which limits the memory
 IMAGE_POINTS_PER_SIDE = 48  # number of points per side of the back face through which the source is imaged
 # Largest distance of landing light from the screen's centre, divided by (longer side of the screen + median distance).
 # Light farther out grazes a tilted plane and does not belong to the image.
@@ -585,21 +587,28 @@ def landing_pixels(channels: Sequence[Channel], lens: Lens, screen: Screen, n: i
     pixel: column and row at which each channel's light lands, meaningless where the flux is zero.
     """
     x, y = tubes.corners(lens.apertures[1], n)
-    landed = [_through(channel, lens, screen, x=x, y=y) for channel in channels]
-    position, flux = (torch.stack([getattr(each, name) for each in landed], dim=-2) for name in ("position", "flux"))
+    lines = groupby(channels, key=lambda channel: (channel.index, channel.losses, channel.around))
+    count, parts = max(1, MAX_IMAGE_RAYS // x.numel()), []
+    for line in (list(members) for _, members in lines):
+        parts += [_through(line[k : k + count], lens, screen, x=x, y=y) for k in range(0, len(line), count)]
+    position, flux = (torch.cat(part, dim=-2) for part in zip(*parts, strict=True))
     return screen.pixels_of(position), flux
 
 
-def _through(channel: Channel, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Landed:
-    """Trace the light of one channel through the cells between the points (x, y) (mm) of the back face."""
-    lens = channel.through(lens)
-    p, q, rays = tubes.rays_to(channel.source, lens, x, y)
+def _through(channels: Sequence[Channel], lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Trace light of one index through the cells between the points (x, y) (mm) of the back; return (landing, flux).
+
+    landing: points (2, channels, cells) in the receiver's unit.  flux: (channels, cells), zero for light that is lost.
+    """
+    lens = channels[0].through(lens)
+    p, q, rays = tubes.rays_to([channel.source for channel in channels], lens, x, y)
     behind = replace(lens.unbounded(), losses=None).interfaces[lens.number_of("back") :]
     landed = through(rays, behind, screen.plane)
     centre = tubes.middle(p), tubes.middle(q)
-    flux = channel.weight * channel.source.irradiance(*centre, lens.entrance.z) * tubes.area_of(p, q)
+    cells = zip(channels, *centre, strict=True)
+    density = [each.weight * each.source.irradiance(x, y, lens.entrance.z) for each, x, y in cells]
+    flux = torch.stack(density) * tubes.area_of(p, q)
     if lens.passes.sense > 0:  # light comes to the front
         flux = torch.where(lens.apertures[0].contains(*centre), flux, torch.zeros_like(flux))
     flux = tubes.arriving_flux(flux, landed).double()
-    position = torch.stack([tubes.middle(c) for c in landed.position])
-    return Landed(position.reshape(2, -1), flux.reshape(-1), landed.status[1:, 1:].reshape(-1))
+    return tubes.middle(landed.position).flatten(-2), flux.flatten(-2)

@@ -6,7 +6,7 @@ A bundle keeps its size: a lost ray keeps its place in the tensors, and `status`
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from types import MappingProxyType
@@ -75,6 +75,17 @@ def joined(bands: Iterable[Rays], rows: int, shared: int = 0) -> Rays:
         done += band.status.shape[-2] - shared
     position, direction, flux, status = map(whole.pop, TENSORS)
     return replace(band, position=position, direction=direction, flux=flux, status=status, taken=whole)
+
+
+def stacked(bundles: Sequence[Rays]) -> Rays:
+    """Return one bundle (…, k, rows, columns) of k bundles (…, rows, columns) of one sense, without losses."""
+    first = bundles[0]
+    position = torch.stack([torch.stack([*each.position[:2], each.above(first.z)]) for each in bundles], dim=1)
+    direction = torch.stack([each.direction.expand_as(each.position) for each in bundles], dim=1)
+    flux, status = (torch.stack(same) for same in zip(*((each.flux, each.status) for each in bundles), strict=True))
+    return replace(
+        first, position=position, direction=direction, flux=flux, status=status, axial=all(b.axial for b in bundles)
+    )
 
 
 @dataclass(frozen=True)

@@ -54,10 +54,8 @@ def spread_at(source: Emitter, lens: Lens) -> float:
         return 0.0
     a, b = source.extent.half_extent
     x, y = torch.meshgrid(*[torch.tensor([-1e-3, 1e-3], dtype=torch.float64)] * 2, indexing="ij")
-    middle, *ends = (
-        rays_to(source.element(a * u, b * v).central, lens, x, y, number=lens.freeform[-1])[2].direction[:, 0, 0]
-        for u, v in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
-    )
+    points = [source.element(a * u, b * v).central for u, v in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))]
+    middle, *ends = rays_to(points, lens, x, y, number=lens.freeform[-1])[2].direction[:, :, 0, 0].T
     return max(math.acos(min(float(total(middle * end)), 1.0)) for end in ends)
 
 

@@ -23,7 +23,7 @@ from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.rays import Landed, Rays, Status, joined
+from bstcad.optics.rays import Landed, Rays, Status, joined, stacked
 from bstcad.optics.receivers import LevelPlane, Receiver
 from bstcad.optics.sides import Sides, as_pair, spread
 from bstcad.optics.trace import behind, from_first_net, is_transmitted, whole_kernel
@@ -260,24 +260,25 @@ def arriving_flux(flux: Tensor, corners: Landed) -> Tensor:
     alive = corners.alive
     if bool(alive.all()):
         return flux
-    whole = alive[1:, 1:] & alive[1:, :-1] & alive[:-1, 1:] & alive[:-1, :-1]
+    whole = alive[..., 1:, 1:] & alive[..., 1:, :-1] & alive[..., :-1, 1:] & alive[..., :-1, :-1]
     return torch.where(whole, flux, torch.zeros_like(flux))
 
 
 def area_of(x: Tensor, y: Tensor) -> Tensor:
     """Return the area of each quad: half the cross product of its diagonals a and b."""
-    (a_x, b_x), (a_y, b_y) = ((p[1:, 1:] - p[:-1, :-1], p[:-1, 1:] - p[1:, :-1]) for p in (x, y))
+    (a_x, b_x), (a_y, b_y) = ((p[..., 1:, 1:] - p[..., :-1, :-1], p[..., :-1, 1:] - p[..., 1:, :-1]) for p in (x, y))
     return (a_x * b_y - b_x * a_y).abs() / 2
 
 
 @torch.no_grad()
 def rays_to(
-    source: Emitter, lens: Lens, x: Tensor, y: Tensor, number: int | None = None
+    source: Emitter | Sequence[Emitter], lens: Lens, x: Tensor, y: Tensor, number: int | None = None
 ) -> tuple[Tensor, Tensor, Rays]:
     """Find the rays that meet an interface of the lens at the points (x, y), a grid (rows, columns) in mm.
 
-    number: number of the interface; None: the back.  Returns x and y (mm) at which the rays cross the vertex plane of
-    the first surface, and the rays at the interface, not yet deflected; rays that are not found there are lost.
+    source: one source, or k sources, whose results have the shape (k, rows, columns).  number: number of the interface;
+    None: the back.  Returns x and y (mm) at which the rays cross the vertex plane of the first surface, and the rays at
+    the interface, not yet deflected; rays that are not found there are lost.
 
     Broyden's method starts from a Jacobian of difference quotients.  On a fine grid the initial points and Jacobian
     are interpolated from the solution on a coarse grid.
@@ -286,16 +287,19 @@ def rays_to(
     number = lens.number_of("back") if number is None else number
     face = lens.interfaces[number].surface
     z = face.relative_sag_and_slope(x.to(lens.like), y.to(lens.like))[0].double()
+    if not isinstance(source, Emitter):
+        x, y, z = (t.expand(len(source), *t.shape[-2:]) for t in (x, y, z))
     extent = float(torch.maximum(x.max() - x.min(), y.max() - y.min()))
     path = replace(lens.to(x.dtype).unbounded(), losses=None)  # in the precision of x and y
     before = path.interfaces[:number]
 
     def arrive(p: Tensor, q: Tensor, height: Tensor) -> Rays:
-        bands = range(0, len(p), rows := _rows_at_a_time(p.shape[1]))
-        return joined((arrive_band(*(t[first : first + rows] for t in (p, q, height))) for first in bands), len(p))
+        bands = range(0, p.shape[-2], rows := _rows_at_a_time(p[..., 0, :].numel()))
+        parts = (tuple(t[..., first : first + rows, :] for t in (p, q, height)) for first in bands)
+        return joined((arrive_band(*part) for part in parts), p.shape[-2])
 
     def arrive_band(p: Tensor, q: Tensor, height: Tensor) -> Rays:
-        rays = functools.reduce(behind, before, source.rays(p, q, lens.entrance.z, 1.0))
+        rays = functools.reduce(behind, before, _launched(source, p, q, lens.entrance.z))
         ahead = (rays.sense * rays.direction[2]).clamp(min=1e-3)
         s = rays.sense * (height - rays.above(face.z)) / ahead
         return replace(rays, position=rays.position + s * rays.direction)
@@ -305,12 +309,13 @@ def rays_to(
     inverse: list[Tensor] | None = None
     last: tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]] | None = None  # step, and distance left before it
     # for light along the axis, x and y are the solution
-    if max(x.shape) > 2 * COARSE_GRID_POINTS and not arrive(x[:1, :1], y[:1, :1], z[:1, :1]).axial:
-        lines = tuple(torch.linspace(0, n - 1, min(n, COARSE_GRID_POINTS)).round().long() for n in x.shape)
-        coarse = torch.meshgrid(*lines, indexing="ij")
-        c_p, c_q, c_hit = rays_to(source, lens, x=x[coarse], y=y[coarse], number=number)
-        inverse = [_interpolate(lines, x.shape, t) for t in jacobian(c_hit, c_p, c_q, z[coarse])]
-        p, q = (_interpolate(lines, x.shape, t) for t in (c_p, c_q))
+    sides = x.shape[-2:]
+    if max(sides) > 2 * COARSE_GRID_POINTS and not arrive(*(t[..., :1, :1] for t in (x, y, z))).axial:
+        lines = tuple(torch.linspace(0, n - 1, min(n, COARSE_GRID_POINTS)).round().long() for n in sides)
+        c_x, c_y, c_z = (t[..., lines[0][:, None], lines[1]] for t in (x, y, z))
+        c_p, c_q, c_hit = rays_to(source, lens, x=c_x, y=c_y, number=number)
+        inverse = [_interpolate(lines, sides, t) for t in jacobian(c_hit, c_p, c_q, c_z)]
+        p, q = (_interpolate(lines, sides, t) for t in (c_p, c_q))
     for _ in range(MAX_BROYDEN_STEPS):
         hit = arrive(p, q, z)
         off_x, off_y = x - hit.position[0], y - hit.position[1]
@@ -330,12 +335,19 @@ def rays_to(
     return p, q, replace(hit, position=position, z=face.z, status=status)
 
 
+def _launched(source: Emitter | Sequence[Emitter], p: Tensor, q: Tensor, z: float) -> Rays:
+    """Return the rays of a source through points (p, q) of the plane z (mm), or those of each of k sources."""
+    if isinstance(source, Emitter):
+        return source.rays(p, q, z, 1.0)
+    return stacked([each.rays(x, y, z, 1.0) for each, x, y in zip(source, p, q, strict=True)])
+
+
 def _inverse_jacobian(
     arrive: Callable[..., Rays], step: float, hit: Rays, p: Tensor, q: Tensor, height: Tensor
 ) -> list[Tensor]:
     """Return [xx, xy, yx, yy], the inverse of ∂(hit of `arrive`) / ∂(p, q) by difference quotients of `step` (mm)."""
-    shifted = arrive(torch.cat((p + step, p)), torch.cat((q, q + step)), height.repeat(2, 1))
-    one, two = ((moved - hit.position)[:2] / step for moved in shifted.position.chunk(2, dim=1))
+    shifted = arrive(*(torch.cat(pair, dim=-2) for pair in ((p + step, p), (q, q + step), (height, height))))
+    one, two = ((moved - hit.position)[:2] / step for moved in shifted.position.chunk(2, dim=-2))
     (xx, yx), (xy, yy) = one, two
     det = xx * yy - xy * yx
     det = torch.where(det.abs() > 1e-6, det, torch.ones_like(det))
@@ -356,13 +368,13 @@ def _broyden_update(inverse: list[Tensor], step: tuple[Tensor, Tensor], shift: t
 
 
 def _interpolate(lines: Sequence[Tensor], shape: Sequence[int], t: Tensor) -> Tensor:
-    """Interpolate t linearly along the two axes to (rows, columns); lines: rows and columns at which t is given."""
+    """Interpolate t linearly along the last two axes to (…, rows, columns); lines: rows and columns of the values t."""
     for known, n in zip(lines, shape, strict=True):  # each iteration interpolates along one axis and transposes t
         index = torch.arange(n)
         right = torch.searchsorted(known, index, right=True).clamp(1, len(known) - 1)
         fraction = ((index - known[right - 1]).double() / (known[right] - known[right - 1])).to(t)
         right = right.to(t.device)
-        t = (torch.lerp(t[right - 1], t[right], fraction[:, None])).T
+        t = torch.lerp(t[..., right - 1, :], t[..., right, :], fraction[:, None]).transpose(-1, -2)
     return t.contiguous()
 
 
@@ -460,4 +472,5 @@ def _pieces(start: Tensor, end: Tensor, sizes: tuple[int, int]) -> tuple[Tensor,
 
 def middle(corner: Tensor) -> Tensor:
     """Return the mean of the four corners of each quad."""
-    return (corner[1:, 1:] + corner[1:, :-1] + corner[:-1, 1:] + corner[:-1, :-1]) / 4
+    low, high = corner[..., :-1, :], corner[..., 1:, :]
+    return (high[..., 1:] + high[..., :-1] + low[..., 1:] + low[..., :-1]) / 4

@@ -159,6 +159,22 @@ def test_rays_meet_the_back_where_they_are_sent(name):
     torch.testing.assert_close(hit.direction.expand_as(at_back.direction), at_back.direction, rtol=0, atol=3e-8)
 
 
+@pytest.mark.parametrize("n", [20, 100])  # the finer grid starts from a coarse one
+@pytest.mark.parametrize("front", [Plane(15.0), Sphere(15.0, 0.03)], ids=("plane", "sphere"))
+def test_rays_of_several_sources_are_those_of_each(front, n):
+    """A tilted chip, whose points lie at different heights."""
+    chip = Point((1.0, -0.5, 2.0), width=2.0, height=1.0, tilt=(20.0, 30.0))
+    sources = [chip.element(x, y) for x, y in ((0.0, 0.0), (1.0, 0.5), (-1.0, 0.25))]
+    lens, places = lens_behind(front, Circle(9.0)), tubes.corners(Circle(8.0), n)
+    *points, rays = tubes.rays_to(sources, lens, *places)
+    for k, source in enumerate(sources):
+        *own, alone = tubes.rays_to(source, lens, *places)
+        assert bool(rays.alive[k].all()) and float(alone.direction[0].std()) > 0.1
+        torch.testing.assert_close(torch.stack([p[k] for p in points]), torch.stack(own), rtol=0, atol=3e-7)
+        torch.testing.assert_close(rays.direction[:, k], alone.direction, rtol=0, atol=3e-8)
+        torch.testing.assert_close(rays.position[:, k], alone.position, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("pixels", [(7, 11), (11, 7), (24, 5)])
 def test_an_even_beam_gives_each_pixel_its_area(pixels):
     """Through a plate a rectangular beam lands as it is, cut by two sides of the screen: areas known by hand."""
