@@ -135,7 +135,9 @@ def design(
     knobs = scene.tailoring.resolved(scene.lens.back.net)
     later = options.compare_later and knobs.max_time is None
     task = replace(task_of(scene, goals, knobs, edge), progress=hooks.progress, merit=merit, preview=options.preview)
-    task = with_solution(scene, replace(task, tidy=processes.return_freed))
+    if not task.preview:  # a preview is so small that the return of its memory takes longer than it helps
+        task = replace(task, tidy=processes.return_freed)
+    task = with_solution(scene, task)
     fresh, start = start is None, start or DesignState(DesignRecord())
     limit, reserved = math.inf if knobs.max_time is None else knobs.max_time, reserve(scene) + RRMSD_SECONDS
     driver = Driver(hooks, began, limit=limit, reserve=reserved, record=start.record)

@@ -294,9 +294,11 @@ def rays_to(
     before = path.interfaces[:number]
 
     def arrive(p: Tensor, q: Tensor, height: Tensor) -> Rays:
-        bands = range(0, p.shape[-2], rows := _rows_at_a_time(p[..., 0, :].numel()))
-        parts = (tuple(t[..., first : first + rows, :] for t in (p, q, height)) for first in bands)
-        return joined((arrive_band(*part) for part in parts), p.shape[-2])
+        rows = _rows_at_a_time(p[..., 0, :].numel())
+        if p.shape[-2] <= rows:
+            return arrive_band(p, q, height)
+        bands = (slice(first, first + rows) for first in range(0, p.shape[-2], rows))
+        return joined((arrive_band(*(t[..., band, :] for t in (p, q, height))) for band in bands), p.shape[-2])
 
     def arrive_band(p: Tensor, q: Tensor, height: Tensor) -> Rays:
         rays = functools.reduce(behind, before, _launched(source, p, q, lens.entrance.z))

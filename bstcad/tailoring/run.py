@@ -161,9 +161,11 @@ class Task:
     def rrmsd(self, lens: Lens, effort: Effort | None = None) -> float:
         """Return the largest RRMSD over the goals from independent rays, on the CPU; NaN without light on a target.
 
-        The flux tubes used for tailoring would underestimate the RRMSD.  effort: rays to use; None: FINE_EFFORT for a
-        scene with an accuracy or bounds, else STAGE_EFFORT, scaled to the number of pixels.
+        The flux tubes used for tailoring would underestimate the RRMSD.  effort: rays to use; None: FLUX_EFFORT for a
+        preview, FINE_EFFORT for a scene with an accuracy or bounds, else STAGE_EFFORT, scaled to the number of pixels.
         """
+        if effort is None and self.preview:  # only the light on the target counts
+            effort = FLUX_EFFORT
         if effort is None and (self.knobs.accuracy is not None or self.bounds is not None):
             effort = FINE_EFFORT
         if effort is None:

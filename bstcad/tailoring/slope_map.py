@@ -34,7 +34,6 @@ from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
-from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
@@ -42,7 +41,7 @@ from bstcad.optics.rays import Rays
 from bstcad.optics.reach import MAX_EXIT_ANGLE, limit_refraction, reach_margin, wanted_slopes
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.sides import Sides, as_pair
-from bstcad.optics.trace import across, clear_window, is_transmitted
+from bstcad.optics.trace import across, behind, clear_window, is_transmitted
 from bstcad.optics.tubes import rays_to
 from bstcad.optics.unfolding import image_screen
 from bstcad.scene.errors import SceneError
@@ -101,7 +100,7 @@ def face_grid(source: Emitter, lens: Lens, window: Rectangle, cells: Sides) -> F
     yx, yy = torch.gradient(q_y, spacing=steps)
     through = lens.last_freeform.outline.contains(x, y) & coming.alive & at_face.alive
     lossless = lens.losses is None
-    density = source.irradiance(q_x, q_y, lens.entrance.z) if lossless else cross(coming, lens.last_freeform).rays.flux
+    density = source.irradiance(q_x, q_y, lens.entrance.z) if lossless else behind(coming, lens.last_freeform).flux
     density = density * (xx * yy - xy * yx).abs() * through
     return FaceGrid(window, at_face, density)
 
