@@ -152,7 +152,7 @@ def scene_value(value: Any) -> str:
 # --- templates --------------------------------------------------------------------------------------------------------
 
 
-@cache  # compiling the templates takes 0.6 s of CPU time
+@cache  # compiling the templates takes 0.3 s of CPU time
 def environment() -> Environment:
     """Return the templates of this folder; they escape all text for HTML, since titles and scenes come from users."""
     import jinja2
@@ -174,9 +174,9 @@ def _plain_text() -> Environment:
 
 def prepare() -> None:
     """Compile all templates before they are needed; called in a thread of its own, during verification."""
-    for templates in (environment(), _plain_text()):
-        for name in templates.list_templates(extensions=["j2"]):
-            templates.get_template(name)
+    for name in environment().list_templates(extensions=["j2"]):
+        templates = _plain_text() if name.endswith(".txt.j2") else environment()
+        templates.get_template(name)
 
 
 def tables(template: str, **values: Any) -> dict[str, Rows]:
