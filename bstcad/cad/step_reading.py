@@ -353,16 +353,16 @@ def sample(step_lens: StepLens, x: np.ndarray, y: np.ndarray, *, of: str = "back
 def points_and_tangents(surface: Any, u: Sequence[float], v: Sequence[float]) -> np.ndarray:
     """Return the point (mm) and the derivatives in u and v of an OCC surface at each (u, v), (n, 3, 3)."""
 
-    def evaluated() -> Iterator[tuple[float, ...]]:
+    def evaluated() -> Iterator[float]:
         p, du, dv = gp_Pnt(), gp_Vec(), gp_Vec()
         evaluate, point, along_u, along_v = surface.D1, p.Coord, du.Coord, dv.Coord
         for s, t in zip(u, v, strict=True):
             evaluate(s, t, p, du, dv)
-            yield point()
-            yield along_u()
-            yield along_v()
+            yield from point()
+            yield from along_u()
+            yield from along_v()
 
-    return np.fromiter(evaluated(), np.dtype((float, 3)), 3 * len(u)).reshape(-1, 3, 3)
+    return np.fromiter(evaluated(), float, 9 * len(u)).reshape(-1, 3, 3)
 
 
 # ---- outlines ------------------------------------------------------------------------------------------------------
@@ -460,8 +460,9 @@ def edge_deviations(shape: TopoDS_Shape, lens: Lens) -> tuple[tuple[float, str],
 def _curve_points(curve: BRepAdaptor_Curve, fractions: np.ndarray) -> np.ndarray:
     """Return points (n, 3) of a curve, in space or on a face, at fractions of its parameter interval."""
     first, last = curve.FirstParameter(), curve.LastParameter()
-    points = (curve.Value(t).Coord() for t in (first + fractions * (last - first)).tolist())
-    return np.fromiter(points, np.dtype((float, 3)), len(fractions))
+    parameters = (first + fractions * (last - first)).tolist()
+    coordinates = (coordinate for t in parameters for coordinate in curve.Value(t).Coord())
+    return np.fromiter(coordinates, float, 3 * len(fractions)).reshape(-1, 3)
 
 
 def _largest(distance: np.ndarray, points: np.ndarray) -> tuple[float, str]:
