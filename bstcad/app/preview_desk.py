@@ -141,7 +141,7 @@ class PreviewDesk:
             return
         except Exception as fault:  # a failing preview must not end the thread
             found = fault
-        processes.return_freed()  # arrays change in size between previews: freed memory would fragment
+        processes.return_freed(allowed=0)  # arrays change in size between previews: freed memory would fragment
         with self._news:
             failed = stage == "preview" and isinstance(found, Exception)
             request.preview_time = min(request.preview_time, time.monotonic())
