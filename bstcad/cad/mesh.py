@@ -37,6 +37,7 @@ MIN_MESH_CELLS = 16  # number of grid cells per side of the first mesh that `fit
 DEFAULT_MAX_TRIANGLES = 2_000_000  # largest number of triangles by default: 100 MB of STL
 MAX_TRIANGLES = 32_000_000  # largest number of triangles if a scene states a tolerance: 1.6 GB of STL
 GOAL_FRACTION = 0.95  # largest goal of the chordal error, relative to the tolerance: float32 rounding needs a margin
+STEP_MARGIN = 1.01  # ratio of tried to estimated cells per side, so that the next mesh meets the goal
 CELL_MARGIN = 1.1  # ratio of estimated to allowed cells per side above which no finer mesh is tried; estimates err
 WALL_NORMAL_Z = 1e-6  # largest |z| component of the unit normal of a facet of the wall
 MAX_FACET_SAMPLES = 100_000_000  # largest number of points at which the facets of a mesh are compared with the lens
@@ -79,8 +80,8 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
         front_rim = border + x.size
         front_faces = _triangles(grid + x.size, _diagonals(lens.outline, lens.front, (x, y, low)))[:, ::-1]
     back_faces = _triangles(grid, _diagonals(lens.outline, lens.back, (x, y, z)))
-    triangles = np.concatenate([back_faces, front_faces, _wall_triangles(front_rim, border)])
-    return Mesh(np.concatenate([back, front]), triangles.astype(np.int32, copy=False))
+    triangles = [back_faces, front_faces, _wall_triangles(front_rim, border)]
+    return Mesh(np.concatenate([back, front]), np.concatenate(triangles, dtype=np.int32, casting="same_kind"))
 
 
 def _recessed_front(front: Recess, around: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -109,10 +110,10 @@ def nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:
 def _triangles(grid: np.ndarray, rising: np.ndarray) -> np.ndarray:
     """Return the nodes of two triangles per cell of `grid`, (2 n², 3), counterclockwise.  rising: from `_diagonals`."""
     a, b, c, d = _cell_corners(grid)
-    rising = rising[..., None]
-    first = np.where(rising, np.stack([a, b, c], axis=-1), np.stack([a, b, d], axis=-1))
-    second = np.where(rising, np.stack([a, c, d], axis=-1), np.stack([b, c, d], axis=-1))
-    return np.concatenate([first.reshape(-1, 3), second.reshape(-1, 3)])
+    first, second = triangles = np.empty((2, *a.shape, 3), grid.dtype)
+    first[..., 0], first[..., 1], first[..., 2] = a, b, np.where(rising, c, d)
+    second[..., 0], second[..., 1], second[..., 2] = np.where(rising, a, b), c, d
+    return triangles.reshape(-1, 3)
 
 
 def _cell_corners(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -167,14 +168,16 @@ def fit_mesh(lens: Lens, tolerance: float, max_triangles: int | None = None) -> 
     """
     allowed = DEFAULT_MAX_TRIANGLES if max_triangles is None else max_triangles
     cells, last, goal = MIN_MESH_CELLS, max_cells(lens, allowed), chordal_error_goal(lens, tolerance)
+    limit = CELL_MARGIN * last if allowed > DEFAULT_MAX_TRIANGLES else last
     while cells < last or (cells == last and allowed > DEFAULT_MAX_TRIANGLES):
         mesh = lens_mesh(lens, cells)
-        error = chordal_error(mesh, lens)
+        at_limit = goal * (limit / (STEP_MARGIN * cells)) ** 2  # error for which `limit` cells are needed
+        error = chordal_error(mesh, lens, enough=max(at_limit, math.nextafter(goal, math.inf)))
         if error <= goal:
             return cells, mesh
         # the error falls with the square of the spacing, but more slowly while cells are larger than the relief
-        needed = 2 * math.ceil(0.505 * cells * (error / goal) ** 0.5)
-        if cells == last or (allowed > DEFAULT_MAX_TRIANGLES and needed > CELL_MARGIN * last):
+        needed = 2 * math.ceil(STEP_MARGIN / 2 * cells * (error / goal) ** 0.5)
+        if cells == last or (allowed > DEFAULT_MAX_TRIANGLES and needed >= limit):
             break
         cells = min(last, needed)
     last = max_cells(lens, min(allowed, DEFAULT_MAX_TRIANGLES))
@@ -224,10 +227,11 @@ def volume_and_area(mesh: Mesh) -> tuple[float, float]:
     return math.fsum(volumes) / 6, math.fsum(areas) / 2
 
 
-def chordal_error(mesh: Mesh, lens: Lens) -> float:
+def chordal_error(mesh: Mesh, lens: Lens, enough: float = math.inf) -> float:
     """Return the largest distance (mm) between the lens and the facets, at points other than the facets' corners.
 
     Since a net may bend in each knot span, facets are sampled twice per span (at most MAX_FACET_SAMPLES points in all).
+    enough: error (mm) at which the search ends; the result is then a lower bound.
     """
     max_parts = max(1, int((MAX_FACET_SAMPLES / 2 / max(len(mesh.faces), 1)) ** 0.5))
     radius = float(lens.outline.radius) if isinstance(lens.outline, Circle) else 0.0
@@ -236,8 +240,13 @@ def chordal_error(mesh: Mesh, lens: Lens) -> float:
     def largest_error(faces: np.ndarray) -> float:
         return _chordal_error(mesh.vertices, faces, max_parts, radius, back, front)
 
+    error = 0.0
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
-        return float(max(threads.map(largest_error, np.array_split(mesh.faces, 16))))
+        for part in threads.map(largest_error, np.array_split(mesh.faces, 16)):
+            error = max(error, part)
+            if error >= enough:
+                break  # cancels the other parts
+    return error
 
 
 def vertex_error(mesh: Mesh, lens: Lens) -> float:

@@ -82,6 +82,24 @@ def test_what_so_many_triangles_cannot_do_is_not_tried(make_lens, monkeypatch):
     assert chordal_error(made, lens) <= 1.1 * reached
 
 
+@pytest.mark.parametrize("allowed", [None, 4_000, 20_000])
+def test_an_error_that_is_only_known_to_be_too_large_leads_to_the_same_grid(make_lens, monkeypatch, allowed):
+    monkeypatch.setattr(mesh, "DEFAULT_MAX_TRIANGLES", 5_000)
+    lens, ended = make_lens(m=33), []
+
+    def error(made, lens, enough=np.inf):
+        whole = chordal_error(made, lens)
+        ended.append(chordal_error(made, lens, enough) < whole)
+        return whole
+
+    for tolerance in np.geomspace(1e-4, 1e-1, 40):
+        cells, _ = mesh.fit_mesh(lens, tolerance, allowed)
+        with monkeypatch.context() as patched:
+            patched.setattr(mesh, "chordal_error", error)
+            assert mesh.fit_mesh(lens, tolerance, allowed)[0] == cells
+    assert any(ended)
+
+
 def test_facets_larger_than_what_they_have_to_follow_are_seen_to_miss_it():
     """A net that goes up and down from point to point by 1 µm, under facets of eight spans."""
     ripple = 5e-4 * (-1.0) ** torch.arange(129)
