@@ -54,8 +54,7 @@ class Mesh:
     def facets(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield corners (n, 3, 3) and normals (n, 3; length: twice the area) of facets, FACETS_PER_BLOCK at a time."""
         for first in range(0, len(self.faces), FACETS_PER_BLOCK):
-            corners = self.vertices[self.faces[first : first + FACETS_PER_BLOCK]]
-            yield corners, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            yield _corners_and_normals(self.vertices, self.faces[first : first + FACETS_PER_BLOCK])
 
 
 def lens_mesh(lens: Lens, cells: int) -> Mesh:
@@ -294,6 +293,25 @@ class FaceNumbers(NamedTuple):
 
 
 @njit(inline="always")
+def _normal(a, b, c):
+    """Return (b - a) x (c - a)."""
+    p, q, r, s, t, u = b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    return q * u - r * t, r * s - p * u, p * t - q * s
+
+
+@njit(cache=True, nogil=True)
+def _corners_and_normals(vertices, faces):
+    """Return corners (n, 3, 3) of triangles and their normals (n, 3), of twice the triangle's area."""
+    corners, normals = np.empty((len(faces), 3, 3)), np.empty((len(faces), 3))
+    for k in range(len(faces)):
+        for i in range(3):
+            for axis in range(3):
+                corners[k, i, axis] = vertices[faces[k, i], axis]
+        normals[k, 0], normals[k, 1], normals[k, 2] = _normal(corners[k, 0], corners[k, 1], corners[k, 2])
+    return corners, normals
+
+
+@njit(inline="always")
 def _basis(u, m):
     """Return (k, B_k, B_{k+1}, B_{k+2}) at u (pitches), m control points: bspline.basis, copied for numba's cache."""
     if u < 1.5:
@@ -348,10 +366,10 @@ def _chordal_error(vertices, faces, max_parts, radius, back, front):
     worst = 0.0
     for k in range(len(faces)):
         a, b, c = vertices[faces[k, 0]], vertices[faces[k, 1]], vertices[faces[k, 2]]
-        p, q, r, s, t, u = b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - a[0], c[1] - a[1], c[2] - a[2]
-        n_z = p * t - q * s
-        length = math.sqrt((q * u - r * t) ** 2 + (r * s - p * u) ** 2 + n_z * n_z)
+        n_x, n_y, n_z = _normal(a, b, c)
+        length = math.sqrt(n_x**2 + n_y**2 + n_z**2)
         if abs(n_z) > WALL_NORMAL_Z * length:
+            p, q, s, t = b[0] - a[0], b[1] - a[1], c[0] - a[0], c[1] - a[1]
             extent = max(abs(p), abs(q), abs(s), abs(t), abs(p - s), abs(q - t))
             face = back if n_z > 0.0 else front
             parts = min(max_parts, max(1, math.ceil(extent * face.per_detail)))
