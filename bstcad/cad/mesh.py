@@ -5,7 +5,7 @@ The chordal error falls with the square of the node spacing; the grid is refined
 
 Files: STL, which states no unit (its user must set mm), 3MF, which states millimetres, and previews for web pages and
 slicers.  CPU seconds for two million triangles, with those of this module in parentheses: trimesh writes STL in 2
-(0.3), reads it in 8 (1) and tests in 2 (0.7) whether the mesh is closed; lib3mf writes 3MF in 2.3 (2).
+(0.1), reads it in 8 (0.2) and tests in 2 (0.1) whether the mesh is closed; lib3mf writes 3MF in 2.3 (1.7).
 """
 
 from __future__ import annotations
@@ -387,7 +387,7 @@ METRES_PER_MM = 1e-3  # unit conversion for glTF, which is in metres
 VERTEX_XML = b'<vertex x="%.10g" y="%.10g" z="%.10g"/>\n'
 TRIANGLE_XML = b'<triangle v1="%.10g" v2="%.10g" v3="%.10g"/>\n'
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-MAX_PROBES = 4096  # largest number of occupied slots that a corner may meet in the hash table (at least half is free)
+MAX_PROBES = 4096  # largest number of occupied slots that a corner may meet in the hash table (a fifth or more is free)
 STL_HEADER = b"bstcad, binary STL, lengths in mm"  # header, which must not start with "solid"
 MAX_LINE_BYTES = 90  # upper bound of the length of a line of a 3MF model (bytes)
 CLEAR_RGBA, MIRROR_RGBA = "#A9D3EE80", "#C9CED4FF"  # sRGB and opacity of clear material and of a mirror
@@ -432,10 +432,10 @@ def read_stl(path: str | Path) -> Mesh:
             f"{path.name}: is empty or not a complete binary STL: it states {max(count, 0)} triangles and has "
             f"{len(data)} bytes; write it again"
         )
-    corners = np.frombuffer(data, STL_TRIANGLE, offset=84)["corners"].reshape(-1, 3)
+    corners = np.array(np.frombuffer(data, STL_TRIANGLE, offset=84)["corners"]).reshape(-1, 3)
     if not np.isfinite(corners).all():
         raise ValueError(f"{path.name}: a corner of a triangle is not finite; write the file again")
-    corners = np.ascontiguousarray(corners) + np.float32(0)  # -0 becomes 0
+    corners += np.float32(0)  # -0 becomes 0
     bits = corners.view(np.uint32)
     first, same = _weld(bits)
     if not len(same):  # sort instead: 2 s for two million triangles, the hash table 0.2 s
@@ -450,7 +450,7 @@ def _weld(bits):
     The two arrays are empty if a corner meets MAX_PROBES occupied slots, which no real surface causes.
     """
     size = 1 << 16
-    while size < 2 * len(bits):
+    while 4 * size < 5 * len(bits):
         size *= 2
     table, first, same = np.full(size, -1, np.int32), np.empty(len(bits), np.int32), np.empty(len(bits), np.int32)
     count = 0
@@ -462,16 +462,16 @@ def _weld(bits):
         for probe in range(MAX_PROBES + 1):
             if probe == MAX_PROBES:
                 return first[:0], same[:0]
-            group = table[slot]
-            if group < 0:
-                group = table[slot] = count
-                first[count] = k
+            other = table[slot]
+            if other < 0:
+                table[slot] = first[count] = k
+                same[k] = count
                 count += 1
-            other = first[group]
+                break
             if bits[other, 0] == x and bits[other, 1] == y and bits[other, 2] == z:
+                same[k] = same[other]
                 break
             slot = (slot + 1) & (size - 1)
-        same[k] = group
     return first[:count].copy(), same
 
 
