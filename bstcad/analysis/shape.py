@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -162,6 +163,7 @@ def slope_octaves(face: BSplineSurface) -> np.ndarray:
     return np.array([energy[octave == k].sum() for k in reversed(range(int(np.log2(max(face.shape)))))])
 
 
+@lru_cache(maxsize=2)  # a verification needs it three times for each of up to two faces
 def _without_cubic(face: BSplineSurface) -> np.ndarray:
     """Return the heights (m, n) of the control points minus their best cubic polynomial (mm)."""
     u, v = (np.linspace(-1, 1, count) for count in face.shape)
