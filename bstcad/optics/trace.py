@@ -105,8 +105,8 @@ def trace(rays: Rays, lens: Lens, plane: Receiver) -> Landed:
 def is_transmitted(rays: Rays, lens: Lens) -> Tensor:
     """Return True for rays from the source that meet all surfaces inside their clear apertures."""
     *others, last = lens.interfaces
-    met, _, _ = intersect(last.surface, across(rays, others), last.outline, last.status_if_missed)
-    return met.alive
+    coming = across(rays, others)
+    return coming.alive & (behind(coming, replace(last, losses=())).status != last.status_if_missed)
 
 
 # --- many rays from a source ------------------------------------------------------------------------------------------
