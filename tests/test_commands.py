@@ -154,7 +154,7 @@ class TestGenerate:
         assert irradiance.sum() == pytest.approx(target.sum(), rel=1e-12) and irradiance.min() >= 0
         off = np.linalg.norm(irradiance - target) / np.linalg.norm(target)
         noise = proof.light.picture_error  # the picture has noise and is smoothed, RRMSD neither
-        assert off == pytest.approx(math.hypot(small_design.report["rrmsd"], noise), rel=0.1) and noise < 0.01
+        assert off == pytest.approx(math.hypot(small_design.report["rrmsd"], noise), rel=0.2) and noise < 0.01
         assert str(arrays["scene"]) == (small_design.folder / "scene.toml").read_text() == small_scene.toml()
         assert load(small_design.folder / "scene.toml") == small_scene
 

@@ -255,7 +255,7 @@ class TestVerify:
         assert np.array_equal(report.irradiance, arrays(small_design.folder)["irradiance"])
         off = np.linalg.norm(report.irradiance - fresh.target) / np.linalg.norm(fresh.target)
         noise = kept[0].light.picture_error  # the picture has noise and is smoothed, RRMSD neither
-        assert off == pytest.approx(math.hypot(report.rrmsd, noise), rel=0.1) and noise < 0.01
+        assert off == pytest.approx(math.hypot(report.rrmsd, noise), rel=0.2) and noise < 0.01
         assert sum(report.flux.values()) == pytest.approx(1.0, abs=1e-11)
         assert all(isinstance(check.passed, bool) and check.name for check in report.checks) and len(report.checks) > 15
         assert report.given_up == tuple(report.facts["given_up"])

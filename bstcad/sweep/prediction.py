@@ -246,7 +246,9 @@ def search_rounds(scene: Scene) -> tuple[tuple[int, int], ...]:
     if scene.source.extent is not None:
         columns, rows = zip(*(target.columns_rows for target in scene.targets), strict=True)
         return tuple(stage3_sheet_sizes(knobs, (max(columns), max(rows))))
-    return tuple(sheet_sizes(knobs, round_shares(Task((), scene.goals, knobs, wave=scene.wavefront))))
+    return tuple(
+        sheet_sizes(knobs, round_shares(Task((), scene.goals, knobs, bounds=scene.lens.bounds, wave=scene.wavefront)))
+    )
 
 
 def memory_gb(scene: Scene) -> float:

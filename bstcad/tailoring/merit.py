@@ -25,8 +25,10 @@ The light of an area dA_b of the face falls on the area dA_t = (e / E) dA_b of t
 
 As a quadratic form in δz this is the operator Δ e E Δ.  In the variable c with δz = Δ^-1 E^-1/2 c it becomes e, a
 constant for a uniform beam.  Detail finer than a pixel does not change the merit, so the true Hessian grows more slowly
-with frequency.  `SobolevVariable` therefore has a smaller power, δz = Δ^-q E^-1/2 c, q = 0.5 by measurement (the best
-power is smaller for letters, larger for portraits).  The weight E^-1/2 halves the number of evaluations for pictures
+with frequency, and falls again for the shortest waves.  `SobolevVariable` therefore has a smaller power, q = 0.5, which
+ends at waves of four control points, δz = (Δ^-2 + Δ_0^-2)^(q/2) E^-1/2 c.  (Measured Rayleigh quotients of the Hessian
+for Δ^-q alone, by eigenvalue of Δ on the net: 0.1 at 0.02, 0.4 at 0.35, 0.8 at 1.4, 0.6 at 3 and 0.2 at 5.5 for a
+portrait; 0.4, 1.1, 0.8, 0.2 and 0.04 for letters.)  The weight E^-1/2 halves the number of evaluations for pictures
 with dark parts.  Δ is diagonal in the cosine transform of the net.
 
 Near the critical angle L is not constant: dθ' = η cos θ / cos θ' dθ grows without bound, and some points of the face
@@ -68,6 +70,7 @@ from bstcad.optics.wavefront_error import path_from_reference
 from bstcad.tailoring.source_image import BlurOperator, ExtendedSource, blur_error, blurred, blurs, with_border
 
 LAPLACIAN_POWER = 0.5  # power of the Laplacian in `SobolevVariable`
+FOUR_POINTS = 2.0  # eigenvalue of the Laplacian for waves of four control points along one axis, 2 - 2 cos(π / 2)
 COARSE_LAPLACIAN_POWER = 0.75  # power of the Laplacian in `CoarseVariable`, whose net has about one cell per pixel
 TARGET_BLUR = 1.0  # standard deviation (pixels) of the blur of the target before the local weight is computed
 WEIGHT_SMOOTHING = 1.5  # standard deviation (control points) of the smoothing of the weight's logarithm
@@ -258,23 +261,27 @@ def _corner_flux(flux: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class SobolevVariable:
-    """Sobolev variable c (m, n): the changes (mm) of a net's heights are h (m, n) = p C^T (λ^-q · C (w c) C^T) C.
+    """Sobolev variable c (m, n): the changes (mm) of a net's heights are h (m, n) = p C^T (f(λ) · C (w c) C^T) C.
 
-    C is the orthonormal cosine transform, p the geometric mean spacing of control points (mm), w the local weight, q
-    the exponent.  λ_ij = 4 - 2 cos(π i/m) - 2 cos(π j/n) are eigenvalues of the negative Laplacian; 0 replaces λ_00^-q.
+    C is the orthonormal cosine transform, p the geometric mean spacing of control points (mm), w the local weight,
+    f(λ) = (λ^-2 + λ_0^-2)^(q/2), q the exponent.  λ_ij = 4 - 2 cos(π i/m) - 2 cos(π j/n) are eigenvalues of the
+    negative Laplacian; f(λ_00) is 0.  f is λ^-q for long waves, and about λ_0^-q for waves of λ above λ_0.
     """
 
     weight: Tensor  # local weight w, (m, n)
-    scale: Tensor  # p λ^-q, (m, n)
+    scale: Tensor  # p f(λ), (m, n)
 
     @classmethod
-    def of(cls, surface: BSplineSurface, weight: Tensor, exponent: float = LAPLACIAN_POWER) -> SobolevVariable:
-        """Make the variable for the net of a surface; exponent: q."""
+    def of(
+        cls, surface: BSplineSurface, weight: Tensor, exponent: float = LAPLACIAN_POWER, level: float = math.inf
+    ) -> SobolevVariable:
+        """Make the variable for the net of a surface; exponent: q; level: λ_0."""
         x, y = map(laplacian, surface.shape)
-        energy = x[:, None] + y
+        energy = (x[:, None] + y).numpy()
         # numpy, since the rounding of torch's powers depends on how the work is divided among threads
-        power = torch.from_numpy(np.power(torch.where(energy > 0, energy, math.inf).numpy(), -exponent))
-        scale = math.sqrt(math.prod(surface.pitch)) * power
+        inverse = np.divide(1.0, energy, out=np.zeros_like(energy), where=energy > 0)
+        power = np.where(energy > 0, np.power(inverse**2 + level**-2.0, exponent / 2), 0.0)
+        scale = math.sqrt(math.prod(surface.pitch)) * torch.from_numpy(power)
         return cls(weight.to(surface.heights), scale.to(surface.heights))
 
     def zero(self) -> Tensor:

@@ -8,9 +8,9 @@ state after each evaluation; to stop, a caller ends its loop over these states.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -133,12 +133,21 @@ def adam(start: list[Tensor], rates: list[float], steps: int, state: AdamState |
 
 
 LBFGS_MEMORY = 12  # number of steps whose changes of x and gradient L-BFGS keeps
-PLATEAU_STEPS = 10  # number of steps between two checks for a plateau
-PLATEAU_GAIN = 0.005  # relative decrease of the merit in PLATEAU_STEPS steps below which the search is on a plateau
 ARMIJO, WOLFE = 1e-4, 0.9  # constants c1 and c2 of the strong Wolfe conditions
 MAX_LINE_TRIALS = 20  # largest number of trials along a line
 
+Pairs = tuple[tuple[Tensor, Tensor, float], ...]  # (s, y, s · y): s change of x, y of gradient; oldest first
 Values = Generator[Query, Evaluation, tuple[float, Tensor]]  # returns the merit and its gradient
+
+
+class Plateau(NamedTuple):
+    """Definition of a plateau: the merit has fallen by less than the fraction `gain` in `steps` steps."""
+
+    steps: int
+    gain: float
+
+
+PLATEAU = Plateau(10, 0.005)
 
 
 @dataclass(frozen=True)
@@ -148,17 +157,22 @@ class LbfgsState:
     x: Tensor  # all parameters, as one vector
     value: float  # merit at x
     gradient: Tensor
-    pairs: tuple[tuple[Tensor, Tensor, float], ...] = ()  # (s, y, s · y): s change of x, y of gradient; oldest first
+    pairs: Pairs = ()
     steps: int = 0
     before: float = math.inf  # best merit at the last check for a plateau
 
 
-def lbfgs(start: list[Tensor], evaluations: int, state: LbfgsState | None = None) -> Method:
+def lbfgs(
+    start: list[Tensor], evaluations: int, state: LbfgsState | None = None, pairs: Pairs = (),
+    plateau: Plateau = PLATEAU,
+) -> Method:  # fmt: skip
     """Run limited-memory BFGS with a strong Wolfe line search (Nocedal and Wright 2006, algorithms 7.5, 3.5, 3.6).
 
-    Returns "plateau" if no step lowers the merit.  Also returns it if PLATEAU_STEPS steps lowered the merit by less
-    than the fraction PLATEAU_GAIN while more than PLATEAU_STEPS of the `evaluations` are left.  A run resumed from a
-    state has the result of an uninterrupted run.  (torch.optim's would load a compiler for longer than a draft takes.)
+    pairs: `LbfgsState.pairs` of a run on a similar problem, from which the first steps take their inverse Hessian.
+
+    Returns "plateau" if no step lowers the merit.  Also returns it on a plateau, if more than `plateau.steps` of the
+    `evaluations` are left; the merit is compared every `plateau.steps` steps.  A run resumed from a state has the
+    result of an uninterrupted run.  (torch.optim's L-BFGS would load a compiler for longer than a draft takes.)
     """
     sizes, best, resumable = [p.numel() for p in start], Best(), state
 
@@ -172,7 +186,7 @@ def lbfgs(start: list[Tensor], evaluations: int, state: LbfgsState | None = None
     if state is None:
         x = torch.cat([p.detach().reshape(-1) for p in start])
         value, gradient = yield from at(x)
-        state = LbfgsState(x, value, gradient, before=best.merit)
+        state = LbfgsState(x, value, gradient, pairs=pairs, before=best.merit)
     search = state
     while True:
         resumable = search
@@ -180,8 +194,8 @@ def lbfgs(start: list[Tensor], evaluations: int, state: LbfgsState | None = None
         if following is None:
             return "plateau"
         search = following
-        if search.steps % PLATEAU_STEPS == 0:
-            if evaluations - best.evaluations > PLATEAU_STEPS and best.merit > (1 - PLATEAU_GAIN) * search.before:
+        if search.steps % plateau.steps == 0:
+            if evaluations - best.evaluations > plateau.steps and best.merit > (1 - plateau.gain) * search.before:
                 return "plateau"
             search = replace(search, before=best.merit)
 
@@ -208,8 +222,8 @@ def _step(at: Callable[[Tensor], Values], search: LbfgsState) -> Generator[Query
     return LbfgsState(x + s, trial.value, trial.gradient, pairs=pairs, steps=search.steps + 1, before=search.before)
 
 
-def _inverse_hessian_times(g: Tensor, pairs: Sequence[tuple[Tensor, Tensor, float]]) -> Tensor:
-    """Return H g, H the inverse Hessian, by the two-loop recursion (algorithm 7.4); pairs: as in `LbfgsState`.
+def _inverse_hessian_times(g: Tensor, pairs: Pairs) -> Tensor:
+    """Return H g, H the inverse Hessian, by the two-loop recursion (algorithm 7.4).
 
     Each pass over the vectors also computes the product that the next pass needs, since memory limits the speed.
     """

@@ -118,6 +118,20 @@ def test_a_mode_is_scaled_by_its_laplacian(i, j):
     torch.testing.assert_close(even.heights(mode), 0.5 * energy**-merit.LAPLACIAN_POWER * mode, rtol=0, atol=1e-12)
 
 
+def test_waves_of_four_control_points_and_shorter_have_nearly_one_scale():
+    """Long waves keep the power of the Laplacian; the scale of the shortest ones is at most 2^-1/4 times λ_0^-q."""
+    of_waves, level = (
+        SobolevVariable.of(FLAT, torch.ones((M, M)), level=merit.FOUR_POINTS).scale / 0.5,
+        merit.FOUR_POINTS,
+    )
+    energy = merit.laplacian(M)
+    torch.testing.assert_close(of_waves[1:4, 0], energy[1:4] ** -merit.LAPLACIAN_POWER, rtol=1e-3, atol=0)
+    shortest = of_waves[(energy[:, None] + energy) > level]
+    assert 1.0 <= float(shortest.max() / level**-merit.LAPLACIAN_POWER) <= 2**0.25
+    assert float(shortest.min() / level**-merit.LAPLACIAN_POWER) > 1.0
+    assert of_waves[0, 0] == 0.0
+
+
 def test_steps_are_longer_where_the_picture_is_dark():
     """A flat lens and a beam on axis: control points lie over their own part of the picture; the ninth part of the
     irradiance makes steps three times as long."""

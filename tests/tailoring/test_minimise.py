@@ -1,6 +1,7 @@
 """The minimisers on problems whose minimum is known, and the wrapper that keeps the best."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -78,6 +79,21 @@ def test_lbfgs_follows_a_curved_valley_as_fast_as_torchs():
     optimiser.step(closure)
     torch.testing.assert_close(best.parameters[0], torch.ones_like(start), rtol=0, atol=1e-5)
     assert best.merit <= 10 * min(theirs) + 1e-12
+
+
+def test_a_run_continues_with_the_pairs_of_the_run_before():
+    """A run on a nearly equal problem takes its inverse Hessian from the pairs, and so needs fewer evaluations."""
+    weights = torch.logspace(0, 3, 12, dtype=torch.float64)
+
+    def problem(parameters, factor=1.0):
+        off = parameters[0] - 1.0
+        return float((factor * weights * off**2).sum()), [2 * factor * weights * off], 0.0
+
+    found = list(minimise(problem, lbfgs([torch.zeros(12, dtype=torch.float64)], 30), 30))
+    start, finer = found[-1].best.parameters[0], partial(problem, factor=1.1)
+    last = next(each.state.pairs for each in reversed(found) if each.state is not None)
+    anew, continued = (ended(finer, lbfgs([start], 12, pairs=pairs), 12).best.merit for pairs in ((), last))
+    assert continued < anew / 3
 
 
 def test_lbfgs_steps_back_from_where_the_merit_is_not_finite():

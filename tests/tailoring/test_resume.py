@@ -20,6 +20,7 @@ from tests.conftest import DISK, SMALL
 TINY = SMALL | {"tailoring.rays": 64, "target.pixels": 32, "tailoring.transport_grid": 32, "tailoring.rounds": 3}
 SCENES = {
     "least squares, within bounds": TINY | {"tailoring.stage2_iterations": 40, "lens.tool_radius": 50.0},
+    "short rounds": TINY | {"tailoring.rays": 96, "tailoring.stage2_iterations": 60},
     "free front": TINY | {"lens.front": {"kind": "sphere", "z": 15.0, "curvature": 0.002, "optimise": True}},
     "extended source": TINY | {"source.diameter": 1.0, "tailoring.source_points": 4, "tailoring.stage2_iterations": 12},
     "two faces, two pictures": two_faces.SMALL,
@@ -36,7 +37,12 @@ SCENES = {
 }
 
 
-QUICK = ("least squares, within bounds", "two faces, picture and wave", "paper")  # the others are run by `make bench`
+QUICK = (
+    "least squares, within bounds",
+    "short rounds",
+    "two faces, picture and wave",
+    "paper",
+)  # the others are run by `make bench`
 
 
 def valley(parameters):

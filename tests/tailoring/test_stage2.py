@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -24,6 +26,25 @@ TINY = SMALL | {
 # Changes of the scene for the comparison of float32 with float64, which comes before more evaluations.
 TWINS = SMALL | {"tailoring.stage2_iterations": 1}
 WIDE = TINY | {"source.diameter": 1.2}  # 80 mm before the back, 475 mm behind it: an image of 7 mm of 60
+
+
+@pytest.mark.parametrize(
+    ("changes", "shares", "level"),
+    [
+        ({"tailoring.rays": 96}, stage2.SHORT_ROUNDS, 2.0 * (64 * 48) / 33**2),  # three tubes per cell at last
+        ({"tailoring.rays": 192}, None, 2.0 * (64 * 48) / 33**2),  # three tubes per cell from the first round on
+        ({"tailoring.rays": 96, "target.pixels": 32}, stage2.SHORT_ROUNDS, 2.0),  # pixels not finer than cells
+        ({"tailoring.rays": 66}, None, math.inf),
+        ({"tailoring.rays": 96, "lens.tool_radius": 50.0}, None, math.inf),
+    ],
+)
+def test_only_rounds_that_resolve_the_net_are_short_and_move_its_short_waves(changes, shares, level):
+    scene = load(DISK, SMALL | {"tailoring.stage2_iterations": 60} | changes)
+    knobs = scene.tailoring.resolved(scene.lens.back.net)
+    task = pipeline.task_of(scene, scene.goals, knobs, edge=None)
+    assert stage2.round_shares(task) == shares
+    first = stage2.TubeRound(task, 48, 30, resolved=stage2.resolves_net(task))
+    assert first.level == pytest.approx(level, rel=1e-12)
 
 
 def judged(scene, lens):
