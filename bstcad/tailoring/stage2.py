@@ -53,8 +53,8 @@ DENSE_ROUNDS, DENSE_TUBES = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08)), 2.5
 # letters after 70 evaluations and 0.0443 of a portrait after 55; 0.0235 and 0.0443 after 98 in DENSE_ROUNDS.)
 SHORT_ROUNDS, FEW_TUBES = ((1 / 2, 0.37), (2 / 3, 0.21), (1.0, 0.13)), Plateau(5, 0.05)
 # Rounds if the last one has fewer than DENSE_TUBES tubes per cell.  The first rounds then distort the net between the
-# tubes, and the last one has to correct this.  (1025 control points, two tubes per cell: the portrait ends at an RRMSD
-# of 0.018, and at 0.020 with DENSE_ROUNDS in the same time.)
+# tubes, and the last one has to correct this.  (1025 control points, two tubes per cell: RRMSD 0.018 of the portrait,
+# and 0.020 with DENSE_ROUNDS in the same time.)
 SPARSE_ROUNDS = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25))
 # Rounds for a picture and a wavefront: two nets can distort between the tubes, and so need more tubes.
 WAVEFRONT_ROUNDS = ((2 / 3, 0.45), (1.0, 0.35), (4 / 3, 0.2))
@@ -265,14 +265,14 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
     first = SearchPosition(0, 0, 0, accuracy, sheet_from=given, search_from=given)
     position = first if state is None else state.position
     total = sum(each.evaluations for each in rounds)
-    pairs: Pairs = () if state is None else state.lbfgs.pairs  # of the last search with variables of the same nets
+    pairs: Pairs = () if state is None else state.lbfgs.pairs  # steps stored by the last search
     if state is None:
         yield StageStep(lambda: lens)
     for number in range(position.round, len(rounds)):
         this_round, bound_weight = rounds[number], round_weight(number, len(rounds))
         task, part = this_round.task, this_round.name
         if state is None and not (this_round.resolved and number and rounds[number - 1].resolved):
-            pairs = ()  # of other variables, or not resolved by the tubes
+            pairs = ()  # the stored steps are in other variables, or the tubes do not resolve them
         if state is None:
             end = position.done + this_round.evaluations
             position = replace(position, round=number, round_end=end, sheet_from=Parameters.of(lens))
