@@ -460,7 +460,7 @@ def stage3_rounds(task: Task) -> tuple[TubeRound, ...]:
         return (TubeRound(lights[-1], knobs.rays, knobs.stage2_iterations, "stage 3", source=source),)
     counts = stage3_sheet_sizes(knobs, (max(each.columns for each in screens), max(each.rows for each in screens)))
     return tuple(
-        TubeRound(light, tubes, count, "stage 3", source=light.extended_sources[0], source_size=size, resolved=True)
+        TubeRound(light, tubes, count, "stage 3", source=light.extended_sources[0], source_size=size)
         for light, (tubes, count), (size, _) in zip(lights, counts, SOURCE_SIZES, strict=True)
     )
 
@@ -471,7 +471,7 @@ def stage3_sheet_sizes(knobs: ResolvedTailoring, pixels: tuple[int, int]) -> Ite
     A sheet of n tubes per side has n √(m_x / m_y) along x and n √(m_y / m_x) along y over a net of m_x x m_y points.
     """
     few = knobs.stage2_iterations < MIN_EVALUATIONS
-    total = knobs.stage2_iterations * (2 if few else 1)  # the merit changes from round to round
+    total = knobs.stage2_iterations * (2 if few else 1)  # L-BFGS starts anew in each round
     (m_x, m_y), (columns, rows) = as_pair(knobs.levels[-1]), pixels
     oblong = math.sqrt(m_x / m_y)
     for_pixels = TUBES_PER_PIXEL * max(columns / oblong, rows * oblong)
