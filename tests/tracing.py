@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -33,7 +34,14 @@ def launch(source: Emitter, lens: Lens, n: int, seed: int, area: Rectangle | Non
 
 def from_first_net_plain(coming: Rays, lens: Lens, plane: Receiver) -> Landed:
     """`trace.from_first_net` in plain torch."""
-    return plane.land(across(coming, lens.interfaces[lens.freeform[0] :]))
+    [landed] = from_first_net_to_each_plain(coming, lens, [plane])
+    return landed
+
+
+def from_first_net_to_each_plain(coming: Rays, lens: Lens, planes: Sequence[Receiver]) -> tuple[Landed, ...]:
+    """`trace.from_first_net_to_each` in plain torch."""
+    rays = across(coming, lens.interfaces[lens.freeform[0] :])
+    return tuple(plane.land(rays) for plane in planes)
 
 
 def simulated(source: Emitter, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:

@@ -40,6 +40,7 @@ from bstcad.optics.kernels.reductions import dot, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed
+from bstcad.optics.receivers import Receiver
 from bstcad.optics.sampling import point_pairs
 from bstcad.optics.trace import UNDERSIDE, GhostImage, Simulation, simulate, through, whole_kernel
 
@@ -448,14 +449,14 @@ class RayTubes:
         n = n or tubes_of(lens)
         return cls(tuple(channels), tuple(tubes.launch_tubes(c.source, c.through(lens), n) for c in channels))
 
-    def landing(self, lens: Lens, screen: Screen) -> tuple[Landed, ...]:
-        """Trace the corners of each channel's tubes to the screen."""
+    def landings(self, lens: Lens, planes: Sequence[Receiver]) -> tuple[tuple[Landed, ...], ...]:
+        """Trace the corners of each channel's tubes to each receiver; return the landing points by receiver."""
         pairs = zip(self.channels, self.sheets, strict=True)
-        return tuple(sheet.landing(channel.through(lens), screen.plane) for channel, sheet in pairs)
+        return tuple(zip(*(sheet.landings(c.through(lens), planes) for c, sheet in pairs), strict=True))
 
     def picture(self, lens: Lens, screen: Screen) -> Tensor:
         """Return the flux in each pixel (rows, columns), row 0 = y max, as a fraction of the source's flux."""
-        pairs = zip(self.sheets, self.landing(lens, screen), strict=True)
+        pairs = zip(self.sheets, self.landings(lens, [screen.plane])[0], strict=True)
         return weighted_sum(self.channels, (sheet.collect(corners, screen)[0] for sheet, corners in pairs))
 
 
@@ -603,7 +604,7 @@ def _through(channels: Sequence[Channel], lens: Lens, screen: Screen, x: Tensor,
     lens = channels[0].through(lens)
     p, q, rays = tubes.rays_to([channel.source for channel in channels], lens, x, y)
     behind = replace(lens.unbounded(), losses=None).interfaces[lens.number_of("back") :]
-    landed = through(rays, behind, screen.plane)
+    [landed] = through(rays, behind, [screen.plane])
     centre = tubes.middle(p), tubes.middle(q)
     cells = zip(channels, *centre, strict=True)
     density = [each.weight * each.source.irradiance(x, y, lens.entrance.z) for each, x, y in cells]

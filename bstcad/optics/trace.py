@@ -54,14 +54,15 @@ def across(rays: Rays, interfaces: Sequence[Interface]) -> Rays:
     return rays
 
 
-def through(rays: Rays, interfaces: Sequence[Interface], plane: Receiver) -> Landed:
-    """Trace rays through interfaces to the receiver; nets by a fused kernel if one supports the tensors."""
+def through(rays: Rays, interfaces: Sequence[Interface], planes: Sequence[Receiver]) -> tuple[Landed, ...]:
+    """Trace rays through interfaces to each receiver; nets by a fused kernel if one supports the tensors."""
     *others, last = interfaces
     for interface in others:
         rays = behind(rays, interface)
-    if plane.axes is not None and (fast := _net_kernel("trace.through", rays, last)):
-        return fast(rays, last, plane)
-    return plane.land(cross(rays, last).rays)
+    if all(plane.axes is not None for plane in planes) and (fast := _net_kernel("trace.through", rays, last)):
+        return fast(rays, last, planes)
+    rays = cross(rays, last).rays
+    return tuple(plane.land(rays) for plane in planes)
 
 
 def behind(rays: Rays, interface: Interface) -> Rays:
@@ -94,7 +95,13 @@ def to_first_net(rays: Rays, lens: Lens) -> Rays:
 
 def from_first_net(coming: Rays, lens: Lens, plane: Receiver) -> Landed:
     """Trace rays through the first freeform interface, and all interfaces behind it, to the receiver."""
-    return through(coming, lens.interfaces[lens.freeform[0] :], plane)
+    [landed] = from_first_net_to_each(coming, lens, [plane])
+    return landed
+
+
+def from_first_net_to_each(coming: Rays, lens: Lens, planes: Sequence[Receiver]) -> tuple[Landed, ...]:
+    """Trace rays as `from_first_net` does, once, to each of several receivers."""
+    return through(coming, lens.interfaces[lens.freeform[0] :], planes)
 
 
 def trace(rays: Rays, lens: Lens, plane: Receiver) -> Landed:

@@ -26,7 +26,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed, Rays, Status, joined, stacked
 from bstcad.optics.receivers import LevelPlane, Receiver
 from bstcad.optics.sides import Sides, as_pair, spread
-from bstcad.optics.trace import behind, from_first_net, is_transmitted, whole_kernel
+from bstcad.optics.trace import behind, from_first_net_to_each, is_transmitted, whole_kernel
 
 ALL = slice(None)  # all rows or columns
 SHEET_TUBES = 256  # tubes per side of the sheet from which finer sheets are interpolated
@@ -52,7 +52,12 @@ class Tubes:
 
     def landing(self, lens: Lens, plane: Receiver) -> Landed:
         """Trace the corners to the receiver without the solid's apertures; `flux` excludes light that these stop."""
-        return from_first_net(self.rays, lens.unbounded(), plane)
+        [landed] = self.landings(lens, [plane])
+        return landed
+
+    def landings(self, lens: Lens, planes: Sequence[Receiver]) -> tuple[Landed, ...]:
+        """Trace the corners as `landing` does, once, to each of several receivers."""
+        return from_first_net_to_each(self.rays, lens.unbounded(), planes)
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
         """Return (flux per pixel, row 0 = y max; `outside` (pixel²) as the function `collect` defines it)."""

@@ -42,6 +42,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -153,13 +154,13 @@ class Merit:
         return len(self.goals) == 1 and self.wave is None
 
     def landing(self, lens: Lens) -> Landings:
-        """Trace the corners of each sheet to the receivers; a single picture goal takes one call of the kernels."""
-        if self._is_one:
-            return Landings((self.light.landing(lens, self.goals[0].receiver),))
+        """Trace the corners of each sheet to the receivers."""
+        planes = [goal.receiver.plane for goal in self.goals]
+        if self.wave is None:
+            return Landings(self.light.landings(lens, planes))
         lens, pairs = _from_source(lens, self.wave), zip(self.light.channels, self.light.sheets, strict=True)
-        traced = [_traced_corners(c.source, sheet, c.through(lens), self.wave is not None) for c, sheet in pairs]
-        on_goals = tuple(tuple(goal.receiver.plane.land(rays) for rays, _ in traced) for goal in self.goals)
-        return Landings(on_goals, None if self.wave is None else traced[0])
+        traced = [_traced_corners(c.source, sheet, c.through(lens)) for c, sheet in pairs]
+        return Landings(tuple(tuple(plane.land(rays) for rays, _ in traced) for plane in planes), traced[0])
 
     def __call__(self, landings: Landings) -> tuple[Tensor, Tensor]:
         """Return the merit of the landed corners, and the largest RRMSD of the pictures, each scaled to the sum 1."""
@@ -229,23 +230,18 @@ def _from_source(lens: Lens, wave: Wave | None) -> Lens:
     return replace(lens, shaped=(0, *lens.freeform))
 
 
-def _traced_corners(source: Emitter, sheet: Tubes, lens: Lens, measured: bool) -> tuple[Rays, Tensor]:
-    """Trace the corners of a sheet through a lens; return the rays and, if `measured`, their optical path (mm)."""
-    lens = lens.unbounded()
-    rays, path, index = sheet.rays, torch.zeros(()), 1.0  # index: refractive index before the next interface
-    for number, interface in enumerate(lens.interfaces[lens.freeform[0] :]):
-        refracted, law = behind(rays, interface), interface.law
-        if measured and number == 0:  # the rays come from the source, see `_from_source`
-            index = law.n_in if isinstance(law, Refract) else 1.0
-            path = index * path_from_reference(source, lens.entrance.z, refracted, rays.sense)
-        elif measured:
-            step = torch.stack([*refracted.position[:2], refracted.above(rays.z)]) - rays.position
-            # sqrt(0) has no gradient
-            square = torch.where(refracted.alive, (step * step).sum(0), torch.ones_like(path))
-            path = path + index * torch.sqrt(square)
-        if isinstance(law, Refract):
-            index = law.n_out
-        rays = refracted
+def _traced_corners(source: Emitter, sheet: Tubes, lens: Lens) -> tuple[Rays, Tensor]:
+    """Trace the corners of a sheet that starts at interface 0; return rays and optical path (mm) behind the lens."""
+    first, *others = lens.unbounded().interfaces
+    rays, law = behind(sheet.rays, first), first.law
+    index = law.n_in if isinstance(law, Refract) else 1.0  # refractive index before the next interface
+    path = index * path_from_reference(source, lens.entrance.z, rays, sheet.rays.sense)
+    for before, interface in pairwise((first, *others)):
+        index = before.law.n_out if isinstance(before.law, Refract) else index
+        refracted = behind(rays, interface)
+        step = torch.stack([*refracted.position[:2], refracted.above(rays.z)]) - rays.position
+        square = torch.where(refracted.alive, (step * step).sum(0), torch.ones_like(path))  # sqrt(0) has no gradient
+        path, rays = path + index * torch.sqrt(square), refracted
     return rays, path
 
 
@@ -347,7 +343,7 @@ def local_weight(source: Emitter, lens: Lens, goal: Goal, number: int | None = N
     x, y = torch.meshgrid(*control_point_axes(net), indexing="ij")
     _, _, at_net = rays_to(source, lens, x=x, y=y, number=number)
     with torch.no_grad():
-        landed = through(at_net, onwards, screen.plane)
+        [landed] = through(at_net, onwards, [screen.plane])
     column, row = (p.cpu().double().numpy() for p in screen.pixel(*landed.position))
     on_screen = landed.alive.cpu().numpy() & (column > 0) & (column < screen.columns) & (row > 0) & (row < screen.rows)
     picture = gaussian_filter(goal.picture / goal.picture.mean(), TARGET_BLUR)

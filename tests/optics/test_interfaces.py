@@ -147,8 +147,9 @@ def test_the_metal_of_a_mangin_mirror_is_met_from_the_glass():
     torch.testing.assert_close(left, torch.full_like(left, wanted), rtol=1e-12, atol=0)
 
 
-def plainly(rays, interfaces, plane):
-    return plane.land(across(rays, interfaces))
+def plainly(rays, interfaces, planes):
+    behind = across(rays, interfaces)
+    return tuple(plane.land(behind) for plane in planes)
 
 
 @pytest.mark.parametrize("plane", PLANES)
@@ -165,7 +166,7 @@ def test_the_gradient_through_several_nets_is_that_of_plain_torch(name, plane):
     for form in (through, plainly):
         heights = [surface.heights.clone().requires_grad_() for surface in lens.nets]
         moved = lens.with_heights(heights)
-        landed = form(to_first_net(rays, moved), moved.interfaces[moved.freeform[0] :], goal)
+        [landed] = form(to_first_net(rays, moved), moved.interfaces[moved.freeform[0] :], [goal])
         value = torch.where(landed.alive, (landed.position * weight).sum(0) + landed.flux, 0.0).sum()
         found.append((landed, torch.autograd.grad(value, heights)))
     (fused, ours), (plain, wanted) = found
@@ -195,7 +196,8 @@ def test_beyond_a_net_the_gradient_is_that_of_its_rim():
 
     def value(share, form):
         moved = lens.with_heights((lens.front.heights + share * way[:, None] * way, lens.back.heights))
-        return (form(to_first_net(rays, moved), moved.interfaces, LevelPlane(120.0)).position ** 2).mean()
+        [landed] = form(to_first_net(rays, moved), moved.interfaces, [LevelPlane(120.0)])
+        return (landed.position**2).mean()
 
     for form in (through, plainly):
         at, step = torch.zeros((), dtype=torch.float64, requires_grad=True), 1e-5

@@ -9,11 +9,13 @@ With the ray x + t d, the face's slopes p and q and normal n = (-p, -q, 1), the 
 
 δ the change by the heights at fixed x and y, S_xx … the sag's second derivatives.  The direction behind the face is
 e = η d + s n, s(p, q, n · d) by the law.  The adjoint is the transpose of this map, for the net and, if needed, x, d.
+Rays that land on several screens are traced to the face once.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -26,24 +28,31 @@ from bstcad.optics.interfaces import Interface, apply_losses, net_bounds
 from bstcad.optics.kernels import forward, kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.forward import BLOCK, DX, DY, DZ, FATE, FLUX, SAG, SLOPE_X, SLOPE_Y, WORK, S, U, V, X, Y, Z
-from bstcad.optics.kernels.records import Faces, TiltedScreen
+from bstcad.optics.kernels.records import Faces, Screens, TiltedScreen
 from bstcad.optics.kernels.spline import curved, net_of, sag, scatter
 from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.receivers import Receiver
 
-# Further offsets in `work` for the adjoint: ∂L/∂(landing, or hit and direction), ∂L/∂(path, cosine of incidence), and
-# second derivatives of the sag; L: merit.
-G_X, G_Y, G_PATH, G_COSINE, H_XX, H_XY, H_YY, G_Z, G_DX, G_DY, G_DZ = (WORK + BLOCK * k for k in range(11))
-ADJOINT_WORK = WORK + 11 * BLOCK  # length of `work` for the adjoint
+# Further offsets in `work`: the hit and its status before rays land on the first of several screens.
+HIT_X, HIT_Y, HIT_FATE = (WORK + BLOCK * k for k in range(3))
+# Offsets for the adjoint: ∂L/∂(hit, direction behind the face, path, cosine of incidence), L the merit; second
+# derivatives of the sag; the normal's length 1 / |n|, cosine behind the face, s, and direction e behind the face.
+G_X, G_Y, G_Z, G_DX, G_DY, G_DZ, G_PATH, G_COSINE, H_XX, H_XY, H_YY = (WORK + BLOCK * k for k in range(3, 14))
+NORM, COS_OUT, SHIFT, E_X, E_Y, E_Z = (WORK + BLOCK * k for k in range(14, 20))
+CROSSING_WORK, ADJOINT_WORK = WORK + 3 * BLOCK, WORK + 20 * BLOCK  # lengths of `work`
 
 
 @njit(error_model="numpy")
 def _load(position, direction, status, first, count, work):
+    """Store rays first … first + count - 1; status (k, n): a ray is lost if its status is so for all k screens."""
     for r in range(count):
         at = first + r
         work[X + r], work[Y + r], work[Z + r] = position[0, at], position[1, at], position[2, at]
         work[DX + r], work[DY + r], work[DZ + r] = direction[0, at], direction[1, at], direction[2, at]
-        work[FATE + r], work[FLUX + r] = status[at], 1.0
+        work[FATE + r], work[FLUX + r] = status[0, at], 1.0
+    for k in range(1, status.shape[0]):
+        for r in range(count):
+            work[FATE + r] = work[FATE + r] if status[k, first + r] != 0 else 0.0
 
 
 @njit(error_model="numpy")
@@ -55,19 +64,28 @@ def _start_beside(width, first, begin, count, status, path, work):
     """
     for r in range(count):
         one, two = begin + r - width, begin + r - 2 * width
-        if two >= first and work[S + r] == 0.0 and status[one] == 0 and status[two] == 0:
+        if two >= first and work[S + r] == 0.0 and status[0, one] == 0 and status[0, two] == 0:
             work[S + r] = 2.0 * path[one] - path[two] - work[Z + r]
 
 
+@njit
+def _tilted_screen(tilted, k):
+    """Return plane k of `Screens.tilted`; None if all planes are level."""
+    if tilted is None:
+        return None
+    at = tilted[k]
+    return TiltedScreen(at[0], at[1], at[2], at[3], at[4], at[5], at[6], at[7], at[8], at[9], at[10])
+
+
 @compiled()
-def _cross(net, faces, tilted, lands, width, position, direction, status, out, path, cosine, first, last):
+def _cross(net, faces, screens, width, position, direction, status, outs, path, cosine, first, last):
     """Trace rays first … last - 1 to the face and refract or reflect them.
 
-    If lands is True, out (2, n) receives the landing points (mm); if None, out (6, n) receives hit (mm) and direction
-    behind the face.  path (n,) receives the path to the face (mm), status (n,) is updated, and cosine (n,) receives the
-    cosine of the angle of incidence, if it is not empty.
+    screens: None, or `Screens` on which rays land.  outs: (2, n) for each screen, which receives the landing points;
+    or (3, n) and (3, n), which receive hit (mm) and direction behind the face.  path (n,) receives the path to the face
+    (mm), status (screens, n) is updated, and cosine (n,) receives the cosine of the angle of incidence, if not empty.
     """
-    work, active = np.empty(WORK), np.empty(BLOCK, np.uint32)
+    work, active = np.empty(CROSSING_WORK), np.empty(BLOCK, np.uint32)
     for begin in range(first, last, BLOCK):
         count = min(BLOCK, last - begin)
         _load(position, direction, status, begin, count, work)
@@ -81,35 +99,55 @@ def _cross(net, faces, tilted, lands, width, position, direction, status, out, p
             path[begin + r] = work[Z + r] + work[S + r]
         if cosine.size > 0:
             forward.cosines(forward.COS_BACK, count, work)
-        if lands is None:
+        if screens is None:
             for r in range(count):
                 work[Z + r] = work[S + r] * work[DZ + r]
         if faces.reflects:
             forward.reflect(faces.fates.reflected, count, work)
         else:
             forward.refract(faces.eta, faces.fates.reflected, count, work)
-        if lands is not None:
-            forward.to_screen(faces, tilted, count, work)
-        for r in range(count):
-            fate = work[FATE + r]
-            status[begin + r] = np.uint8(fate)
-            out[0, begin + r] = work[X + r] if fate == 0.0 else 0.0
-            out[1, begin + r] = work[Y + r] if fate == 0.0 else 0.0
-            if cosine.size > 0:
-                cosine[begin + r] = work[forward.COS_BACK + r] if fate == 0.0 else 1.0
-        if lands is None:
-            _store_directions(count, work, begin, direction, out)
+        if cosine.size > 0:
+            for r in range(count):
+                cosine[begin + r] = work[forward.COS_BACK + r] if work[FATE + r] == 0.0 else 1.0
+        if screens is None:
+            _store(0, count, work, begin, status, outs[0])
+            _store_directions(count, work, begin, direction, outs)
+        else:
+            _land(faces, screens, count, work, begin, status, outs)
 
 
 @njit(error_model="numpy")
-def _store_directions(count, work, first, direction, out):
+def _land(faces, screens, count, work, first, status, outs):
+    """Trace rays from the face to each screen, and store where they land."""
+    for k in range(screens.throws.size):
+        for r in range(count):
+            if k == 0:
+                work[HIT_X + r], work[HIT_Y + r], work[HIT_FATE + r] = work[X + r], work[Y + r], work[FATE + r]
+            else:
+                work[X + r], work[Y + r], work[FATE + r] = work[HIT_X + r], work[HIT_Y + r], work[HIT_FATE + r]
+        forward.to_screen(faces, screens.throws[k], _tilted_screen(screens.tilted, k), count, work)
+        _store(k, count, work, first, status, outs[k])
+
+
+@njit(error_model="numpy")
+def _store(k, count, work, first, status, out):
+    for r in range(count):
+        fate = work[FATE + r]
+        status[k, first + r] = np.uint8(fate)
+        out[0, first + r] = work[X + r] if fate == 0.0 else 0.0
+        out[1, first + r] = work[Y + r] if fate == 0.0 else 0.0
+
+
+@njit(error_model="numpy")
+def _store_directions(count, work, first, direction, outs):
     """Store the height of the hit and the direction behind the face; a lost ray keeps its direction."""
+    hit, behind = outs[0], outs[-1]
     for r in range(count):
         at, alive = first + r, work[FATE + r] == 0.0
-        out[2, at] = work[Z + r] if alive else 0.0
-        out[3, at] = work[DX + r] if alive else direction[0, at]
-        out[4, at] = work[DY + r] if alive else direction[1, at]
-        out[5, at] = work[DZ + r] if alive else direction[2, at]
+        hit[2, at] = work[Z + r] if alive else 0.0
+        behind[0, at] = work[DX + r] if alive else direction[0, at]
+        behind[1, at] = work[DY + r] if alive else direction[1, at]
+        behind[2, at] = work[DZ + r] if alive else direction[2, at]
 
 
 # --- the adjoint ------------------------------------------------------------------------------------------------------
@@ -140,56 +178,12 @@ def _restore_hit(net, faces, flat, path, first, count, work):
         work[H_YY + r] = hyy * faces.per_y * faces.per_y
 
 
-@njit(inline="always")
-def _at_level(faces, at, e, h, gx, gy):
-    """Return the gradients of the merit in (direction behind the face, hit, path) for rays that land on a level screen.
-
-    The slopes of the face are constant; the path moves the hit along the ray.  at: x and y of the hit (mm), a zero, and
-    direction before the face; e: direction behind it; h: sag (mm); gx, gy: gradient in the landing point.
-    """
-    ex, ey, ez = e
-    ez = min(ez, -faces.rules.grazing) if faces.reflects else max(ez, faces.rules.grazing)
-    a, b, far = ex / ez, ey / ez, (faces.throw - h) / ez
-    g_t = gx * (at[3] - a * at[5]) + gy * (at[4] - b * at[5])
-    return (gx * far, gy * far, -(a * gx + b * gy) * far), (gx, gy, -(a * gx + b * gy)), g_t
-
-
-@njit(inline="always")
-def _at_tilted(faces, tilted, at, e, h, gx, gy):
-    """Return the gradients of `_at_level` for a tilted screen.
-
-    The landing moves by u · (dP - e (n · dP) / (n · e)) along each axis u of the screen, n its normal,
-    dP = dX + far de (far: path to the screen).
-    """
-    ex, ey, ez = e
-    n_x, n_y, n_z = tilted.n_x, tilted.n_y, tilted.n_z
-    ahead = max(n_x * ex + n_y * ey + n_z * ez, faces.rules.grazing)
-    far = -(n_x * (at[0] - tilted.x) + n_y * (at[1] - tilted.y) + n_z * (h - faces.throw)) / ahead
-    g_x, g_y = gx * tilted.x_x + gy * tilted.y_x, gx * tilted.x_y + gy * tilted.y_y
-    g_z = gx * tilted.x_z + gy * tilted.y_z
-    slide = (g_x * ex + g_y * ey + g_z * ez) / ahead
-    g_x, g_y, g_z = g_x - slide * n_x, g_y - slide * n_y, g_z - slide * n_z
-    return (g_x * far, g_y * far, g_z * far), (g_x, g_y, g_z), g_x * at[3] + g_y * at[4] + g_z * at[5]
-
-
-@njit(inline="always")
-def _behind_face(at, work, r):
-    """Return the gradients of `_at_level` for rays that do not land: `work` contains ∂L/∂hit and ∂L/∂direction."""
-    g_x, g_y, g_z = work[G_X + r], work[G_Y + r], work[G_Z + r]
-    g_e = (work[G_DX + r], work[G_DY + r], work[G_DZ + r])
-    return g_e, (g_x, g_y, g_z), g_x * at[3] + g_y * at[4] + g_z * at[5]
-
-
 @njit(error_model="numpy", fastmath={"contract"})
-def _chain(faces, tilted, lands, count, work, path, d_rays, first):
-    """Replace Z and slopes in `work` by ∂L/∂(sag, slopes in u, v) at the hit, by the chain rule from screen to hit.
-
-    d_rays: None, or (6, n), which receives ∂L/∂(position, direction) of rays first … first + count - 1 before the face.
-    path (n,): path to the face (mm).
-    """
-    eta, min_cos = faces.eta, faces.rules.min_cos
+def _leave(faces, count, work):
+    """Compute, at the slopes of the hit, the direction behind the face and what the chain rule needs for it."""
+    eta = faces.eta
     for r in range(count):
-        p, q, h = work[SLOPE_X + r], work[SLOPE_Y + r], work[SAG + r]
+        p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
         dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
         along = dz - p * dx - q * dy
         norm2 = 1.0 / (1.0 + p * p + q * q)
@@ -200,13 +194,73 @@ def _chain(faces, tilted, lands, count, work, path, d_rays, first):
         else:
             cos_out = math.sqrt(max(1.0 - eta * eta * (1.0 - cos_in * cos_in), 0.0))  # rounding may make it negative
             s = norm * cos_out - eta * along * norm2
-        at, e = (work[X + r], work[Y + r], 0.0, dx, dy, dz), (eta * dx - s * p, eta * dy - s * q, eta * dz + s)
-        if lands is None:
-            (g_ex, g_ey, g_ez), g_hit, g_t = _behind_face(at, work, r)
-        elif tilted is None:
-            (g_ex, g_ey, g_ez), g_hit, g_t = _at_level(faces, at, e, h, work[G_X + r], work[G_Y + r])
-        else:
-            (g_ex, g_ey, g_ez), g_hit, g_t = _at_tilted(faces, tilted, at, e, h, work[G_X + r], work[G_Y + r])
+        work[NORM + r], work[COS_OUT + r], work[SHIFT + r] = norm, cos_out, s
+        work[E_X + r], work[E_Y + r], work[E_Z + r] = eta * dx - s * p, eta * dy - s * q, eta * dz + s
+
+
+@njit(error_model="numpy", fastmath={"contract"})
+def _add_tilted(faces, throw, tilted, g, status, first, count, work):
+    """Add the gradients of `_add_landing` for a tilted screen.
+
+    The landing moves by u · (dP - e (n · dP) / (n · e)) along each axis u of the screen, n its normal,
+    dP = dX + far de (far: path to the screen).
+    """
+    n_x, n_y, n_z = tilted.n_x, tilted.n_y, tilted.n_z
+    for r in range(count):
+        at, ex, ey, ez = first + r, work[E_X + r], work[E_Y + r], work[E_Z + r]
+        gx, gy = (g[0, at], g[1, at]) if status[at] == 0 else (0.0, 0.0)
+        ahead = max(n_x * ex + n_y * ey + n_z * ez, faces.rules.grazing)
+        above = n_x * (work[X + r] - tilted.x) + n_y * (work[Y + r] - tilted.y) + n_z * (work[SAG + r] - throw)
+        far = -above / ahead
+        g_x, g_y = gx * tilted.x_x + gy * tilted.y_x, gx * tilted.x_y + gy * tilted.y_y
+        g_z = gx * tilted.x_z + gy * tilted.y_z
+        slide = (g_x * ex + g_y * ey + g_z * ez) / ahead
+        g_x, g_y, g_z = g_x - slide * n_x, g_y - slide * n_y, g_z - slide * n_z
+        work[G_X + r] += g_x
+        work[G_Y + r] += g_y
+        work[G_Z + r] += g_z
+        work[G_DX + r] += g_x * far
+        work[G_DY + r] += g_y * far
+        work[G_DZ + r] += g_z * far
+
+
+@njit(error_model="numpy", fastmath={"contract"})
+def _add_landing(faces, throw, tilted, g, status, first, count, work):
+    """Add ∂L/∂(hit, direction behind the face) of rays that land on a screen; g (2, n): ∂L/∂landing."""
+    if tilted is not None:
+        _add_tilted(faces, throw, tilted, g, status, first, count, work)
+        return
+    for r in range(count):
+        at, ez = first + r, work[E_Z + r]
+        gx, gy = (g[0, at], g[1, at]) if status[at] == 0 else (0.0, 0.0)
+        ez = min(ez, -faces.rules.grazing) if faces.reflects else max(ez, faces.rules.grazing)
+        far = (throw - work[SAG + r]) / ez
+        gz = -(work[E_X + r] * gx + work[E_Y + r] * gy) / ez
+        work[G_X + r] += gx
+        work[G_Y + r] += gy
+        work[G_Z + r] += gz
+        work[G_DX + r] += gx * far
+        work[G_DY + r] += gy * far
+        work[G_DZ + r] += gz * far
+
+
+@njit(error_model="numpy", fastmath={"contract"})
+def _chain(faces, count, work, path, d_rays, first):
+    """Replace Z and slopes in `work` by ∂L/∂(sag, slopes in u, v) at the hit, by the chain rule through the face.
+
+    d_rays: None, or (6, n), which receives ∂L/∂(position, direction) of rays first … first + count - 1 before the face.
+    path (n,): path to the face (mm).
+    """
+    eta, min_cos = faces.eta, faces.rules.min_cos
+    for r in range(count):
+        p, q = work[SLOPE_X + r], work[SLOPE_Y + r]
+        dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
+        norm, cos_out, s = work[NORM + r], work[COS_OUT + r], work[SHIFT + r]
+        along, norm2 = dz - p * dx - q * dy, norm * norm
+        cos_in = along * norm
+        g_x, g_y, g_z = work[G_X + r], work[G_Y + r], work[G_Z + r]
+        g_ex, g_ey, g_ez = work[G_DX + r], work[G_DY + r], work[G_DZ + r]
+        g_t = g_x * dx + g_y * dy + g_z * dz + work[G_PATH + r]
         g_s = g_ez - p * g_ex - q * g_ey
         # ∂s/∂p with N = norm: in_p = -∂cos_in/∂p = N dx + p N² cos_in, ∂cos_out/∂p = η² cos_in / cos_out ∂cos_in/∂p
         in_p, in_q = norm * dx + p * norm2 * cos_in, norm * dy + q * norm2 * cos_in
@@ -219,7 +273,6 @@ def _chain(faces, tilted, lands, count, work, path, d_rays, first):
         s_q += fall * (2.0 * q * norm2 * along + dy)
         g_p = g_s * s_p - s * g_ex - work[G_COSINE + r] * in_p
         g_q = g_s * s_q - s * g_ey - work[G_COSINE + r] * in_q
-        g_t += work[G_PATH + r]
         if d_rays is None:
             g_t += g_p * (work[H_XX + r] * dx + work[H_XY + r] * dy) + g_q * (work[H_XY + r] * dx + work[H_YY + r] * dy)
             g_sag = g_t / along
@@ -231,7 +284,7 @@ def _chain(faces, tilted, lands, count, work, path, d_rays, first):
             by_y = work[H_XY + r] * g_p + work[H_YY + r] * g_q if in_y else 0.0
             rise_x, rise_y = p if in_x else 0.0, q if in_y else 0.0
             g_sag = (g_t + by_x * dx + by_y * dy) / (dz - rise_x * dx - rise_y * dy)
-            d_x, d_y, d_z = g_hit[0] + by_x + rise_x * g_sag, g_hit[1] + by_y + rise_y * g_sag, g_hit[2] - g_sag
+            d_x, d_y, d_z = g_x + by_x + rise_x * g_sag, g_y + by_y + rise_y * g_sag, g_z - g_sag
             # g_n: along n, from s and the cosine; g_d: along d, from the path t |d|
             g_n, g_d = g_s * (norm2 * turn - fall) + work[G_COSINE + r] * norm, t * work[G_PATH + r]
             d_rays[0, k], d_rays[1, k], d_rays[2, k] = (d_x, d_y, d_z) if alive else (0.0, 0.0, 0.0)
@@ -242,35 +295,39 @@ def _chain(faces, tilted, lands, count, work, path, d_rays, first):
 
 
 @njit(error_model="numpy")
-def _load_gradient(lands, g, more, first, count, work):
-    for r in range(count):
-        work[G_X + r], work[G_Y + r] = g[0, first + r], g[1, first + r]
-    if lands is None:
+def _load_gradient(faces, screens, g, more, status, first, count, work):
+    if screens is None:
+        hit, direction = g[0], g[-1]
         for r in range(count):
             at = first + r
-            work[G_Z + r], work[G_DX + r], work[G_DY + r], work[G_DZ + r] = g[2, at], g[3, at], g[4, at], g[5, at]
+            work[G_X + r], work[G_Y + r], work[G_Z + r] = hit[0, at], hit[1, at], hit[2, at]
+            work[G_DX + r], work[G_DY + r], work[G_DZ + r] = direction[0, at], direction[1, at], direction[2, at]
+    else:
+        work[G_X : G_DZ + BLOCK] = 0.0
+        for k in range(screens.throws.size):
+            tilted = _tilted_screen(screens.tilted, k)
+            _add_landing(faces, screens.throws[k], tilted, g[k], status[k], first, count, work)
     for r in range(count):
         work[G_PATH + r] = more[0, first + r] if more.shape[1] > 0 else 0.0
         work[G_COSINE + r] = more[1, first + r] if more.shape[1] > 0 else 0.0
 
 
 @compiled()
-def _cross_adjoint(
-    net, faces, tilted, lands, position, direction, status, path, g, more, d_rays, first, last, own, touched
-):
+def _cross_adjoint(net, faces, screens, position, direction, status, path, g, more, d_rays, first, last, own, touched):
     """Add to `own` (m, n) the gradient of the merit in the net, from rays first … last - 1 (see reductions.py).
 
-    g: gradient in `out` of `_cross`.  more: gradients in path and cosine of incidence (2, n), or (2, 0).  d_rays: None,
-    or (6, n), which receives the gradient in positions and directions.
+    g: gradients in `outs` of `_cross`.  more: gradients in path and cosine of incidence (2, n), or (2, 0).  d_rays:
+    None, or (6, n), which receives the gradient in positions and directions.
     """
     work = np.empty(ADJOINT_WORK)
     for begin in range(first, last, BLOCK):
         count = min(BLOCK, last - begin)
         _load(position, direction, status, begin, count, work)
-        _load_gradient(lands, g, more, begin, count, work)
         flat = d_rays is None and forward.are_axial(count, work)  # the slopes at the hit do not change with the path
         _restore_hit(net, faces, flat, path, begin, count, work)
-        _chain(faces, tilted, lands, count, work, path, d_rays, begin)
+        _leave(faces, count, work)
+        _load_gradient(faces, screens, g, more, status, begin, count, work)
+        _chain(faces, count, work, path, d_rays, begin)
         for r in range(count):
             if work[FATE + r] != 0.0:
                 work[Z + r] = work[SLOPE_X + r] = work[SLOPE_Y + r] = 0.0
@@ -281,50 +338,49 @@ def _cross_adjoint(
 class Crossing(NamedTuple):
     """Parameters of a crossing besides the net and the rays."""
 
-    faces: Faces  # face, and screen if rays land, as numbers; the fields of the front are unused
-    tilted: TiltedScreen | None  # tilted screen; None: a level screen, or none
-    lands: bool  # True if rays land on the screen, False if they go on behind the face
+    faces: Faces  # face as numbers; the fields of the front and of a screen are unused
+    screens: Screens | None  # screens on which the rays land; None: they go on behind the face
     lossy: bool  # True if the face has losses, which need path and angle of incidence
     width: int  # number of rays in a row of the grid of rays
 
     @property
-    def arguments(self) -> tuple[Faces, TiltedScreen | None, bool | None]:
-        """Arguments of the kernels; `lands` is True or None: for the type of None numba compiles no unused branch."""
-        return self.faces, self.tilted, True if self.lands else None
+    def shapes(self) -> tuple[int, int]:
+        """Number of `outs` of `Cross`, and of the components of each."""
+        return (2, 3) if self.screens is None else (len(self.screens.throws), 2)
 
 
 class Cross(torch.autograd.Function):
-    """Map (heights, position (3, n), direction (3, n), status (n,), crossing) to (out, status, path, cos θ).
+    """Map (heights, position (3, n), direction (3, n), status (n,), crossing) to (status, path, cos θ, *outs).
 
-    out: landing points (2, n) mm; or, if rays go on, hit (mm) and direction behind the face (6, n).  path (n,) to
-    the face (mm) and cos θ (n,) of incidence have a gradient if `crossing.lossy`; otherwise cos θ is empty.  The
-    gradient is taken in heights, positions and directions, where needed.
+    outs: landing points (2, n) mm for each screen; or, if rays go on, hit (mm) and direction behind the face, (3, n)
+    each.  status: (screens, n), or (1, n).  path (n,) to the face (mm) and cos θ (n,) of incidence have a gradient if
+    `crossing.lossy`; otherwise cos θ is empty.  The gradient is taken in heights, positions and directions, where
+    needed.
     """
 
     @staticmethod
     def forward(  # noqa: D102
         ctx: Any, heights: Tensor, position: Tensor, direction: Tensor, status: Tensor, crossing: Crossing
     ) -> Any:
-        n = status.numel()
-        out = torch.empty((2 if crossing.lands else 6, n), dtype=position.dtype)
+        n, (count, components) = status.numel(), crossing.shapes
+        outs = tuple(torch.empty((components, n), dtype=position.dtype) for _ in range(count))
         path, cosine = torch.empty(n, dtype=torch.float64), torch.ones(n if crossing.lossy else 0, dtype=torch.float64)
-        fate = status.clone()
-        inputs = [net_of(heights), *crossing.arguments, crossing.width]
-        inputs += [t.detach().numpy() for t in (position, direction)]
-        results = [t.numpy() for t in (fate, out, path, cosine)]
+        fate = status.expand(count if crossing.screens else 1, n).clone()
+        inputs = [net_of(heights), *crossing[:2], crossing.width, *(t.detach().numpy() for t in (position, direction))]
+        results = fate.numpy(), tuple(out.numpy() for out in outs), path.numpy(), cosine.numpy()
         reductions.on_threads(lambda first, last: _cross(*inputs, *results, first, last), reductions.shares(n, BLOCK))
         ctx.save_for_backward(heights, position, direction, fate, path)
         ctx.crossing = crossing
         ctx.mark_non_differentiable(fate, *(() if crossing.lossy else (path, cosine)))
         ctx.set_materialize_grads(False)
-        return out, fate, path, cosine
+        return fate, path, cosine, *outs
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, g: Tensor | None, _: None, g_path: Tensor | None, g_cosine: Tensor | None) -> Any:  # noqa: D102
+    def backward(ctx: Any, _: None, g_path: Tensor | None, g_cosine: Tensor | None, *g: Tensor | None) -> Any:  # noqa: D102
         heights, position, direction, fate, path = ctx.saved_tensors
-        n, lands = fate.numel(), ctx.crossing.lands
-        g = torch.zeros((2 if lands else 6, n), dtype=position.dtype) if g is None else g.contiguous()
+        n, shape = path.numel(), (ctx.crossing.shapes[1], path.numel())
+        known = tuple((position.new_zeros(shape) if each is None else each.contiguous()).numpy() for each in g)
         more = np.empty((2, 0))
         if g_path is not None or g_cosine is not None:
             more = np.zeros((2, n))
@@ -333,45 +389,47 @@ class Cross(torch.autograd.Function):
         d_rays = torch.empty((6, n), dtype=position.dtype) if any(ctx.needs_input_grad[1:3]) else None
         shares = reductions.shares(n, BLOCK)
         buffers = reductions.buffers(len(shares), *heights.shape)
-        inputs = [net_of(heights), *ctx.crossing.arguments]
-        inputs += [t.detach().numpy() for t in (position, direction, fate, path, g)]
-        inputs += [more, None if d_rays is None else d_rays.numpy()]
+        inputs = [net_of(heights), *ctx.crossing[:2], *(t.detach().numpy() for t in (position, direction, fate, path))]
+        inputs += [known, more, None if d_rays is None else d_rays.numpy()]
         tasks = [(*share, own, rows) for share, own, rows in zip(shares, *buffers, strict=True)]
         reductions.on_threads(lambda *task: _cross_adjoint(*inputs, *task), tasks)
         d_position, d_direction = (None, None) if d_rays is None else (d_rays[:3], d_rays[3:])
         return torch.from_numpy(reductions.merged(*buffers)).to(heights.dtype), d_position, d_direction, None, None
 
 
-def landed(rays: Rays, interface: Interface, plane: Receiver) -> Landed:
-    """Trace rays across a net to the receiver, as `interfaces.cross` and `Receiver.land` do."""
-    position, traced = _across(rays, interface, plane)
-    return Landed(position, traced.flux, traced.status, traced.taken)
+def landed(rays: Rays, interface: Interface, planes: Sequence[Receiver]) -> tuple[Landed, ...]:
+    """Trace rays across a net to each of the receivers, as `interfaces.cross` and `Receiver.land` do."""
+    status, traced, positions = _across(rays, interface, planes)
+    pairs = zip(positions, status, strict=True)
+    return tuple(Landed(position, traced.flux, fate, traced.taken) for position, fate in pairs)
 
 
 def behind(rays: Rays, interface: Interface) -> Rays:
     """Trace rays across a net, as `interfaces.cross` does."""
-    out, traced = _across(rays, interface, None)
-    position, direction = reflect_z(out, rays.sense).split(3)
+    _, traced, outs = _across(rays, interface, ())
+    position, direction = (reflect_z(out, rays.sense) for out in outs)
     sense = -rays.sense if interface.law.reverses else rays.sense
     return replace(traced, position=position, direction=direction, z=interface.surface.z, axial=False, sense=sense)
 
 
-def _across(rays: Rays, interface: Interface, plane: Receiver | None) -> tuple[Tensor, Rays]:
-    """Return (`out` of `Cross`, rays with flux and status behind the face but their old position and direction)."""
+def _across(rays: Rays, interface: Interface, planes: Sequence[Receiver]) -> tuple[Tensor, Rays, tuple[Tensor, ...]]:
+    """Return (status for each plane; rays behind the face, with old positions and directions; `outs` of `Cross`)."""
     shape, heights, lossy = rays.status.shape, interface.net.heights, bool(interface.losses)
     if rays.axial and interface.status_if_missed == Status.MISSED_FRONT:
         rays = _start_below_net(rays, interface)
     vectors = (reflect_z(t, rays.sense).reshape(3, -1).contiguous() for t in (rays.position, rays.direction))
-    faces, width = kernel_arguments.faces(interface, plane, rays.sense, rays.z), shape[-1]
-    crossing = Crossing(*faces, plane is not None, lossy, width)
-    out, status, path, cos_in = Cross.apply(
-        -heights if rays.sense < 0 else heights, *vectors, rays.status.reshape(-1), crossing
-    )
-    traced = replace(rays, status=status.view(shape))
+    faces, _ = kernel_arguments.faces(interface, None, rays.sense, rays.z)
+    screens = kernel_arguments.screens(interface, planes, rays.sense) if planes else None
+    status, path, cos_in, *outs = Cross.apply(
+        -heights if rays.sense < 0 else heights, *vectors, rays.status.reshape(-1),
+        Crossing(faces, screens, lossy, width=shape[-1]),
+    )  # fmt: skip
+    status = status.view(len(status), *shape)
+    traced = replace(rays, status=status.amin(0) if len(status) > 1 else status[0])  # lost: on none of the planes
     if lossy:
         cos_in, path = cos_in.view(shape), path.view(shape)
         traced = apply_losses(traced, cos_in, interface.law.deflection(cos_in)[1], path=path, losses=interface.losses)
-    return out.view(len(out), *shape), traced
+    return status, traced, tuple(out.view(len(out), *shape) for out in outs)
 
 
 def _start_below_net(rays: Rays, interface: Interface) -> Rays:
@@ -389,8 +447,7 @@ def _start_below_net(rays: Rays, interface: Interface) -> Rays:
 
 
 def reflect_z(vectors: Tensor, sense: int) -> Tensor:
-    """Convert vectors (3 k, …) to the frame of the kernels, or back: reflect them by z -> -z for light along -z."""
+    """Convert vectors (3, …) to the frame of the kernels, or back: reflect them by z -> -z for light along -z."""
     if sense > 0:
         return vectors
-    flip = torch.tensor([1.0, 1.0, -1.0] * (len(vectors) // 3), dtype=vectors.dtype)
-    return vectors * flip.view(-1, *([1] * (vectors.ndim - 1)))
+    return vectors * torch.tensor([1.0, 1.0, -1.0], dtype=vectors.dtype).view(-1, *([1] * (vectors.ndim - 1)))

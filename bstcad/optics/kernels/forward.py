@@ -196,12 +196,12 @@ def at_back(faces, count, work):
 
 
 @njit(error_model="numpy")
-def to_tilted(faces, tilted, count, work):
+def to_tilted(faces, throw, tilted, count, work):
     """Move rays from the back face to a tilted screen, as `TiltedPlane.land` does."""
     grazing, turned = faces.rules.grazing, faces.fates.turned
     for r in range(count):
         dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
-        x, y, z = work[X + r] - tilted.x, work[Y + r] - tilted.y, work[SAG + r] - faces.throw
+        x, y, z = work[X + r] - tilted.x, work[Y + r] - tilted.y, work[SAG + r] - throw
         rise = tilted.n_x * dx + tilted.n_y * dy + tilted.n_z * dz
         ahead = rise > grazing
         far = -(tilted.n_x * x + tilted.n_y * y + tilted.n_z * z) / (rise if ahead else 1.0)
@@ -213,16 +213,16 @@ def to_tilted(faces, tilted, count, work):
 
 
 @njit(error_model="numpy")
-def to_screen(faces, tilted, count, work):
-    """Move rays from the back face to the screen; store x and y on it."""
+def to_screen(faces, throw, tilted, count, work):
+    """Move rays from the back face to the screen; store x and y on it.  throw: as `Faces.throw`."""
     if tilted is not None:
-        to_tilted(faces, tilted, count, work)
+        to_tilted(faces, throw, tilted, count, work)
         return
     sense, grazing, turned = -1.0 if faces.reflects else 1.0, faces.rules.grazing, faces.fates.turned
     for r in range(count):
         dz = work[DZ + r]
         ahead = sense * dz > grazing
-        far = (faces.throw - work[SAG + r]) / (dz if ahead else 1.0)
+        far = (throw - work[SAG + r]) / (dz if ahead else 1.0)
         work[X + r] += far * work[DX + r]
         work[Y + r] += far * work[DY + r]
         fate = work[FATE + r]
@@ -378,7 +378,7 @@ def _trace(net, beam, faces, tilted, losses, count, work, active):
         reflect(faces.fates.reflected, count, work)
     else:
         refract(faces.eta, faces.fates.reflected, count, work)
-    to_screen(faces, tilted, count, work)
+    to_screen(faces, faces.throw, tilted, count, work)
 
 
 @njit(error_model="numpy")

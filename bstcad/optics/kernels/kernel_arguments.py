@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -18,7 +19,18 @@ from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Interface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import records
-from bstcad.optics.kernels.records import Beam, Faces, Fates, LightTable, LossTables, Pixels, RayCells, Rules, floats
+from bstcad.optics.kernels.records import (
+    Beam,
+    Faces,
+    Fates,
+    LightTable,
+    LossTables,
+    Pixels,
+    RayCells,
+    Rules,
+    Screens,
+    floats,
+)
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.rays import Status
@@ -58,7 +70,18 @@ def faces(
     net = floats([*corner, *per_mm, *bounds, sense * (throw - surface.z)])
     fates = [Status.MISSED_FRONT, interface.status_if_missed, law.status_if_blocked, Status.TURNED_BACK]
     numbers = Faces._make([int(law.reverses), *face, *surface.shape, *net, rules(), Fates(*floats(fates))])
+    if plane is None or plane.is_level:
+        return numbers, None
     return numbers, _tilted(plane, sense, -sense if law.reverses else sense)
+
+
+def screens(interface: Interface, planes: Sequence[Receiver], sense: int) -> Screens:
+    """Return the planes behind a net as numbers; sense: of the light before the net."""
+    behind, z = -sense if interface.law.reverses else sense, interface.net.z
+    throws = np.array([sense * (plane.middle[2] - z) for plane in planes])
+    if all(plane.is_level for plane in planes):
+        return Screens(throws, None)
+    return Screens(throws, np.array([_tilted(plane, sense, behind) for plane in planes]))
 
 
 def losses(lens: Lens) -> LossTables:
@@ -128,10 +151,8 @@ def _table_of_light(source: Emitter, window: Rectangle, z: float) -> Beam | None
     return None
 
 
-def _tilted(plane: Receiver | None, before: int, behind: int) -> records.TiltedScreen | None:
-    """Return a tilted plane as numbers, None for a level one; before, behind: sense of light on the net's two sides."""
-    if plane is None or plane.is_level:
-        return None
+def _tilted(plane: Receiver, before: int, behind: int) -> records.TiltedScreen:
+    """Return a plane as numbers; before, behind: sense of light on the net's two sides."""
     assert plane.axes is not None  # no kernel traces to other receivers
     along_x, along_y, normal = ((*axis[:2], before * axis[2]) for axis in plane.axes)
     return records.TiltedScreen(*floats([*plane.middle[:2], *(behind * n for n in normal), *along_x, *along_y]))

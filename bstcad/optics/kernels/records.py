@@ -99,6 +99,13 @@ class TiltedScreen(NamedTuple):
     y_z: float
 
 
+class Screens(NamedTuple):
+    """Planes on which light lands behind one net."""
+
+    throws: np.ndarray  # (k,) `Faces.throw` of each plane (mm)
+    tilted: np.ndarray | None  # (k, 11) `TiltedScreen` of each plane; None: all are level
+
+
 class Faces(NamedTuple):
     """Lens and screen as numbers, in the frame in which light starts along +z (see `kernel_arguments.faces`)."""
 

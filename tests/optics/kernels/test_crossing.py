@@ -16,7 +16,7 @@ from bstcad.optics.surfaces import Plane, Sphere
 from tests.lenses import lens_of, uniform, wavy
 from tests.optics.kernels.arrays import DTYPES, close
 from tests.optics.test_mirror import LIGHTS, bumpy, mirror
-from tests.tracing import from_first_net_plain, stratified
+from tests.tracing import from_first_net_plain, from_first_net_to_each_plain, stratified
 
 
 def deep(dtype=torch.float64, depth=4.0, m=17):
@@ -89,7 +89,14 @@ def test_a_beam_meets_a_front_that_reaches_beyond_where_it_begins():
         torch.testing.assert_close(ours, wanted, rtol=1e-12, atol=1e-12)
 
 
-PLANES = {"level": LevelPlane(120.0), "tilted": TiltedPlane((3.0, 2.0, 120.0), (20.0, -10.0), 5.0)}
+TILTED = TiltedPlane((3.0, 2.0, 120.0), (20.0, -10.0), 5.0)
+STEEP = TiltedPlane((3.0, 2.0, 120.0), (75.0, -10.0))  # some of the light goes away from it
+PLANES = {
+    "level": [LevelPlane(120.0)],
+    "tilted": [TILTED],
+    "level ones": [LevelPlane(120.0), LevelPlane(60.0)],
+    "several": [STEEP, LevelPlane(60.0), TILTED],
+}
 LOSSES = Losses(FresnelLoss(587.6), AbsorptionLoss(0.01))
 NETS = {  # a lens, and the rays on their way to its net
     "lens": (lens_of(deep(), index=1.6), Point()),
@@ -109,19 +116,23 @@ def test_the_gradient_in_the_rays_is_that_of_the_plain_form(name, plane):
     x, y = stratified(Rectangle(23.0, 23.0), 60, 0)
     coming = trace.to_first_net(source.rays(x, y, lens.entrance.z, 1.0), lens)
     weight, gradients, landings = uniform((2, *x.shape), 1), [], []
-    for form in (trace.from_first_net, from_first_net_plain):
+    for form in (trace.from_first_net_to_each, from_first_net_to_each_plain):
         leaves = [t.detach().clone().requires_grad_() for t in (lens.back.heights, coming.position, coming.direction)]
         moved = replace(lens, back=replace(lens.back, heights=leaves[0]))
-        landed = form(replace(coming, position=leaves[1], direction=leaves[2]), moved, PLANES[plane])
-        merit = torch.where(landed.alive, (landed.position * weight).sum(0) + landed.flux, 0.0).sum()
+        found = form(replace(coming, position=leaves[1], direction=leaves[2]), moved, PLANES[plane])
+        merit = sum(
+            torch.where(landed.alive, (landed.position * (weight + k)).sum(0) + landed.flux, 0.0).sum()
+            for k, landed in enumerate(found)
+        )
         gradients.append(torch.autograd.grad(merit, leaves))
-        landings.append(landed)
-    ours, wanted = landings
-    assert 0 < int(wanted.alive.sum()) < x.numel() and not gradients[0][1][:, ~wanted.alive].any()
-    assert torch.equal(ours.status, wanted.status)
-    there = wanted.alive
-    torch.testing.assert_close(ours.position[:, there], wanted.position[:, there], rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(ours.flux[there], wanted.flux[there], rtol=1e-9, atol=0)
+        landings.append(found)
+    for ours, wanted in zip(*landings, strict=True):
+        there = wanted.alive
+        assert 0 < int(there.sum()) < x.numel() and torch.equal(ours.status, wanted.status)
+        torch.testing.assert_close(ours.position[:, there], wanted.position[:, there], rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(ours.flux[there], wanted.flux[there], rtol=1e-9, atol=0)
+    lost = ~torch.stack([wanted.alive for wanted in landings[1]]).any(0)
+    assert not gradients[0][1][:, lost].any()
     for fused, plain in zip(*gradients, strict=True):
         torch.testing.assert_close(fused, plain, rtol=1e-9, atol=1e-11 * float(plain.abs().max()))
 
