@@ -94,17 +94,25 @@ class Screen:
         per_x, per_y = self.per_unit
         return (x - self.x[0]) * per_x, (self.y[1] - y) * per_y
 
+    @property
+    def scale(self) -> tuple[float, float, float, float]:
+        """Numbers (x_0, y_0, s_x, s_y): column and row of (x, y) are (x - x_0) s_x and (y - y_0) s_y."""
+        per_x, per_y = self.per_unit
+        return self.x[0], self.y[1], per_x, -per_y
+
     def pixels_of(self, position: Tensor) -> Tensor:
         """Return (column, row) (2, …) of positions (2, …), as `pixel` does."""
-        shape = (2, *[1] * (position.ndim - 1))
-        per_x, per_y = self.per_unit
-        corner = torch.tensor((self.x[0], self.y[1]), dtype=position.dtype, device=position.device).view(shape)
-        per_unit = torch.tensor((per_x, -per_y), dtype=position.dtype, device=position.device).view(shape)
-        return (position - corner).mul_(per_unit)
+        return scaled(position, self.scale)
 
     def contains(self, x: Tensor, y: Tensor) -> Tensor:
         """Return True where (x, y) is on the screen."""
         return (x >= self.x[0]) & (x <= self.x[1]) & (y >= self.y[0]) & (y <= self.y[1])
+
+
+def scaled(position: Tensor, scale: tuple[float, float, float, float]) -> Tensor:
+    """Return ((x - x_0) s_x, (y - y_0) s_y) (2, …) of positions (2, …); scale: (x_0, y_0, s_x, s_y)."""
+    first, factor = (position.new_tensor(part).view(2, *[1] * (position.ndim - 1)) for part in (scale[:2], scale[2:]))
+    return (position - first).mul_(factor)
 
 
 def landed_flux(rays: Landed) -> Tensor:

@@ -19,7 +19,7 @@ from torch import Tensor
 from bstcad.optics import ops
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import cross
-from bstcad.optics.irradiance import Screen
+from bstcad.optics.irradiance import Screen, scaled
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
@@ -43,6 +43,10 @@ RELATIVE_DIFFERENCE_STEP = 1e-6  # step of the difference quotients of `rays_to`
 MIN_BROYDEN_DIVISOR = 0.1  # divisor of a Broyden update, relative to the squared step, up to which there is no update
 
 
+Scale = tuple[float, float, float, float]  # (x_0, y_0, s_x, s_y), see `collect`
+PIXELS: Scale = (0.0, 0.0, 1.0, 1.0)  # scale of corners in pixels
+
+
 @dataclass(frozen=True)
 class Tubes:
     """Flux tubes in front of the first freeform interface, each between four neighbouring rays."""
@@ -61,7 +65,7 @@ class Tubes:
 
     def collect(self, corners: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
         """Return (flux per pixel, row 0 = y max; `outside` (pixel²) as the function `collect` defines it)."""
-        return collect(screen.pixels_of(corners.position.double()), self.arriving_flux(corners), screen.shape)
+        return collect(corners.position.double(), self.arriving_flux(corners), screen.shape, screen.scale)
 
     def transmitted_flux(self, corners: Landed) -> Tensor:
         """Return the flux of each tube (rows, columns) after losses at faces and in glass, even if corners are lost."""
@@ -385,22 +389,24 @@ def _interpolate(lines: Sequence[Tensor], shape: Sequence[int], t: Tensor) -> Te
     return t.contiguous()
 
 
-def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int], scale: Scale = PIXELS) -> tuple[Tensor, Tensor]:
     """Return (picture (rows, columns), outside) of tubes.
 
-    corner: (column, row) of the corners in pixels, (2, n + 1, m + 1).  flux: flux of the tubes, (n, m).
+    corner: corners (2, n + 1, m + 1); column and row of (x, y) are (x - x_0) s_x and (y - y_0) s_y pixels, by
+    scale = (x_0, y_0, s_x, s_y).  flux: flux of the tubes, (n, m).
     outside: Σ flux · (mean squared distance of corners to the picture, pixel²), so that light outside has a gradient.
     """
     if corner.dtype == torch.float64 and (fast := ops.kernel("tubes.collect", corner)):
-        return fast(corner, flux, shape, MIN_TRIANGLE_AREA)
-    return collect_plain(corner, flux, shape)
+        return fast(corner, flux, (shape, scale), MIN_TRIANGLE_AREA)
+    return collect_plain(corner, flux, shape, scale)
 
 
-def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int], scale: Scale = PIXELS) -> tuple[Tensor, Tensor]:
     """Collect as `collect` does, but in plain torch, by Green's theorem (clip.py); edges are split at pixel borders.
 
     On a GPU `index_add` sums in no fixed order, so that the last bits change from run to run.
     """
+    corner = scaled(corner, scale)
     off = sum((p - p.clamp(0, size)) ** 2 for p, size in zip(corner, reversed(shape), strict=True))
     outside = total(flux * middle(off))
     rows, columns = shape

@@ -210,10 +210,12 @@ def area_cells(scene: Scene, lens: Lens) -> ControlCells:
     tubes = launch_tubes(light.source, lens, DENSITY_TUBES)
     x, y = cross(tubes.rays, lens.interfaces[lens.freeform[0]]).rays.position[:2]
     landed = tubes.landing(lens, screen.plane)
-    flux, corners = tubes.arriving_flux(landed), tiles.pixels_of(landed.position.double())
+    flux, corners = tubes.arriving_flux(landed), landed.position.double()
     area = torch.where(flux > 0, area_of(x, y).double(), torch.zeros_like(flux))
     area, flux = (
-        gaussian_filter(collect(corners, carried, tiles.shape)[0].cpu().numpy().clip(0), 1.0, mode="nearest")
+        gaussian_filter(
+            collect(corners, carried, tiles.shape, tiles.scale)[0].cpu().numpy().clip(0), 1.0, mode="nearest"
+        )
         for carried in (area, flux)
     )
     mean = area.sum() / flux.sum() if flux.sum() > 0 else 0.0

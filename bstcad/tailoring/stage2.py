@@ -53,16 +53,22 @@ DENSE_ROUNDS, DENSE_TUBES = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08)), 2.5
 # letters after 70 evaluations and 0.0443 of a portrait after 55; 0.0235 and 0.0443 after 98 in DENSE_ROUNDS.)
 SHORT_ROUNDS, FEW_TUBES = ((1 / 2, 0.37), (2 / 3, 0.21), (1.0, 0.13)), Plateau(5, 0.05)
 # Rounds if the last one has fewer than DENSE_TUBES tubes per cell.  The first rounds then distort the net between the
-# tubes, and the last one has to correct this.  (1025 control points, two tubes per cell: RRMSD 0.018 of the portrait,
-# and 0.020 with DENSE_ROUNDS in the same time.)
-SPARSE_ROUNDS = ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25))
+# tubes, and the last one has to correct this, with MAX_TUBES tubes per side or fewer, since more need much memory; if
+# these are too few, with as many as the settings state.  (1025 control points, portrait: RRMSD 0.0175 after 54
+# evaluations with 2733 tubes per side at last, and 0.0177 after 97, in a quarter more time, with 2050.)
+FINER_ROUNDS, SPARSE_ROUNDS = ((1 / 2, 0.3), (1.0, 0.2), (4 / 3, 0.05)), ((1 / 2, 0.40), (3 / 4, 0.35), (1.0, 0.25))
+MAX_TUBES = 3100
 # Rounds for a picture and a wavefront: two nets can distort between the tubes, and so need more tubes.
 WAVEFRONT_ROUNDS = ((2 / 3, 0.45), (1.0, 0.35), (4 / 3, 0.2))
 # Rounds for several pictures, and the number of control points per side above which the evaluations grow in proportion:
-# with LAPLACIAN_POWER = 0.5, the Hessian in the Sobolev variable still contains a power of the Laplacian.  (Letters
-# before a portrait, 769 points per side: RRMSD 0.057 and 0.062 after 196 evaluations in three rounds, 0.047 and 0.057
-# after 309 in these two.)
-PICTURES_ROUNDS, PICTURES_SIDE = ((2 / 3, 1.4), (4 / 3, 0.7)), 513
+# with LAPLACIAN_POWER = 0.5, the Hessian in the Sobolev variable still contains a power of the Laplacian.  Two nets
+# distort between the tubes, the less the more tubes there are.  (Two photographs, 769 points per side: RRMSDs 0.027 and
+# 0.038 after 206 and 103 evaluations in the rounds (2/3, 4/3); 0.027 and 0.031 after 73, 73 and 15 in three rounds, in
+# three quarters of the time.)
+PICTURES_ROUNDS, PICTURES_SIDE = ((2 / 3, 1.4), (4 / 3, 0.6), (2.0, 0.1)), 513
+# Ratio of the RRMSD by tubes to the RRMSD by rays at which such a round ends before the last, since further evaluations
+# would mostly fit the nets to the tubes; and evaluations between two comparisons.
+DISTORTION_RATIO, COMPARISON_INTERVAL = 0.5, 25
 # Coarse rounds: (pixels along the longer side, tubes per side, evaluations).  They precede the fine rounds if light has
 # to move far: if the RRMSD exceeds FAR_OFF_RRMSD on LARGE_PIXELS pixels along the longer side.  Any net resolves so few
 # pixels, so such an error means that light is in the wrong place.  In stage 2 the last coarse round is repeated after
@@ -97,6 +103,7 @@ class TubeRound:
     source_size: float = 1.0  # size of the source in this round, as a fraction of its full size
     plateau: Plateau = PLATEAU  # plateau at which the round ends
     resolved: bool = False  # True if the tubes resolve the net's shortest waves (`resolves_net`)
+    ends_distorted: bool = False  # True if the round ends at DISTORTION_RATIO
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -111,6 +118,13 @@ class TubeRound:
         """
         pixels = max(math.sqrt(math.prod(goal.receiver.shape)) for goal in self.task.goals)
         return FOUR_POINTS * max(1.0, pixels / self.task.knobs.side) ** 2 if self.resolved else math.inf
+
+    def takes_over(self, before: TubeRound) -> bool:
+        """Return True if L-BFGS keeps the steps stored by the round before: it has nearly the same merit and variables.
+
+        In sparse rounds for one goal, these steps distort the net between the tubes.
+        """
+        return (self.resolved and before.resolved) or (before.ends_distorted and self.stage == before.stage)
 
     @property
     def name(self) -> str:
@@ -153,6 +167,9 @@ class TubeRound:
                 if self.pixels is None:
                     step = replace(step, rrmsd=best.figure)
                     reason = "accuracy" if best.figure <= position.goal_by_tubes else reason
+                if self.ends_distorted and not reason and best.evaluations % COMPARISON_INTERVAL == 0:
+                    distorted = best.figure < DISTORTION_RATIO * self.task.rrmsd(step.lens)
+                    reason = "distortion" if distorted else ""
             if iterate.state is not None and not reason:
                 step = replace(step, state=TubeSearch(position, best, iterate.state))
             yield replace(iterate, reason=reason), step
@@ -187,15 +204,19 @@ def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Steps:
     """
     coarse, fine = coarse_rounds(task, lens), tuple(sheet_sizes(task.knobs, round_shares(task)))
     factor = 1.0 if not coarse else EVALUATION_FACTOR if len(fine) > 1 else SINGLE_ROUND_FACTOR
-    first, *others = (_fine_round(task, tubes, round(factor * count)) for tubes, count in fine)
+    last = len(fine) - 1
+    first, *others = (_fine_round(task, tubes, round(factor * n), k == last) for k, (tubes, n) in enumerate(fine))
     again = coarse[-1:] if others else ()
     return run_rounds((*coarse, first, *again, *others), lens, state)
 
 
-def _fine_round(task: Task, tubes: int, evaluations: int) -> TubeRound:
+def _fine_round(task: Task, tubes: int, evaluations: int, is_last: bool) -> TubeRound:
     resolved = resolves_net(task)
     few = tubes < DENSE_TUBES * task.knobs.side
-    return TubeRound(task, tubes, evaluations, plateau=FEW_TUBES if resolved and few else PLATEAU, resolved=resolved)
+    return TubeRound(
+        task, tubes, evaluations, plateau=FEW_TUBES if resolved and few else PLATEAU, resolved=resolved,
+        ends_distorted=len(task.goals) > 1 and not task.preview and not is_last,
+    )  # fmt: skip
 
 
 def coarse_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
@@ -220,7 +241,7 @@ def with_pixels(task: Task, pixels: int) -> Task:
 
 
 def round_shares(task: Task) -> RoundFractions | None:
-    """Return the rounds of a task; None: DENSE_ROUNDS or SPARSE_ROUNDS, which `sheet_sizes` chooses."""
+    """Return the rounds of a task; None: `sheet_sizes` chooses dense, finer or sparse rounds."""
     if task.preview:
         return ((1.0, 1.0),)
     if not task.several:
@@ -248,11 +269,14 @@ def _are_dense(knobs: ResolvedTailoring) -> bool:
 
 def sheet_sizes(knobs: ResolvedTailoring, shares: RoundFractions | None = None) -> Iterator[tuple[int, int]]:
     """Yield (tubes per side, evaluations) of each round; tubes: at least min(knobs.side, knobs.rays)."""
-    shares = shares or (DENSE_ROUNDS if _are_dense(knobs) else SPARSE_ROUNDS)
+    if shares is None:
+        finer = round(FINER_ROUNDS[-1][0] * knobs.rays) <= MAX_TUBES
+        shares = DENSE_ROUNDS if _are_dense(knobs) else FINER_ROUNDS if finer else SPARSE_ROUNDS
     if knobs.stage2_iterations < MIN_EVALUATIONS:
         shares = ((1.0, 1.0),)
-    for tubes, share in shares:
-        yield max(round(tubes * knobs.rays), min(knobs.rays, knobs.side)), round(share * knobs.stage2_iterations)
+    for part, share in shares:
+        tubes = min(round(part * knobs.rays), max(knobs.rays, MAX_TUBES))
+        yield max(tubes, min(knobs.rays, knobs.side)), round(share * knobs.stage2_iterations)
 
 
 def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None = None) -> Steps:
@@ -271,8 +295,8 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
     for number in range(position.round, len(rounds)):
         this_round, bound_weight = rounds[number], round_weight(number, len(rounds))
         task, part = this_round.task, this_round.name
-        if state is None and not (this_round.resolved and number and rounds[number - 1].resolved):
-            pairs = ()  # the stored steps are in other variables, or the tubes do not resolve them
+        if state is None and not (number and this_round.takes_over(rounds[number - 1])):
+            pairs = ()
         if state is None:
             end = position.done + this_round.evaluations
             position = replace(position, round=number, round_end=end, sheet_from=Parameters.of(lens))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from bstcad.scene.quality import VERIFICATION_DRAW
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
 from bstcad.tailoring.source_image import ExtendedSource
+from tests import two_faces
 from tests.conftest import DISK, SMALL
 
 TINY = SMALL | {
@@ -45,6 +47,33 @@ def test_only_rounds_that_resolve_the_net_are_short_and_move_its_short_waves(cha
     assert stage2.round_shares(task) == shares
     first = stage2.TubeRound(task, 48, 30, resolved=stage2.resolves_net(task))
     assert first.level == pytest.approx(level, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("points", "tubes"),
+    [(513, [768, 1024, 1536]), (1025, [1025, 2050, 2733]), (2049, [2049, 3074, 4098])],
+)
+def test_the_last_round_of_a_large_net_has_more_tubes_unless_memory_forbids_it(points, tubes):
+    scene = load("templates/portrait.toml", {"lens.back.control_points": points})
+    knobs = scene.tailoring.resolved(scene.lens.back.net)
+    shares = stage2.round_shares(pipeline.task_of(scene, scene.goals, knobs, edge=None))
+    found = list(stage2.sheet_sizes(knobs, shares))
+    assert [each for each, _ in found] == tubes
+    assert [count for _, count in found] == [round(part * 98) for part in ROUNDS_OF[points]]
+
+
+ROUNDS_OF = {513: (0.37, 0.21, 0.13), 1025: (0.3, 0.2, 0.05), 2049: (0.4, 0.35, 0.25)}
+
+
+@pytest.mark.parametrize(("ratio", "evaluations"), [(0.0, [84, 36, 6]), (math.inf, [25, 25, 6])])
+def test_a_round_for_several_pictures_ends_once_it_fits_its_tubes_alone(monkeypatch, ratio, evaluations):
+    """No RRMSD by tubes is below 0 times that by rays, and each is below ∞ times it, at the first comparison."""
+    monkeypatch.setattr(stage2, "DISTORTION_RATIO", ratio)
+    scene = load(DISK, two_faces.SMALL)
+    knobs = scene.tailoring.resolved(scene.lens.back.net).model_copy(update={"stage2_iterations": 60})
+    task, lens = pipeline.task_of(scene, scene.goals, knobs, edge=None), scene.flat_lens(scene.lens.back.net)
+    counts = Counter(step.part for step in stage2.steps(task, scene.as_mounted(lens)) if step.rrmsd is not None)
+    assert list(counts.values()) == evaluations
 
 
 def judged(scene, lens):

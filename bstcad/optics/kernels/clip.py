@@ -14,8 +14,9 @@ With L the merit function, G = ∂L/∂I and H(x, y) = ∫_y^∞ G dy, the adjoi
 and ∫ (1 - s) G ds, ∫ s G ds, s = 0 … 1 along the edge (an edge that moves by δ sweeps the area δ · n ds, n its normal).
 They are computed once for the two triangles beside the edge.
 
-All lengths are in pixels, x across the columns, y down the rows.  Columns are the first index of the sums, as x
-is that of the tubes: so the rows of tubes of one part, which one thread computes, reach few columns.
+All lengths but those of the corners in memory are in pixels, x across the columns, y down the rows.  Columns are the
+first index of the sums, as x is that of the tubes: so the rows of tubes of one part, which one thread computes, reach
+few columns.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ ROWS_PER_STRIP = 16  # rows of tubes whose gradient one thread computes at a tim
 ON, OUT_OF_RANGE = 0, 16  # state of a corner: on the screen; outside MAX_DISTANCE or not a number
 LEFT, RIGHT, ABOVE, BELOW = 1, 2, 4, 8  # bits of the state of a corner outside one or two borders of the screen
 
+Scale = tuple[float, float, float, float]  # (x_0, y_0, s_x, s_y) of `_clip`
+
 inlined = njit(forceinline=True, error_model="numpy")
 
 
@@ -57,9 +60,15 @@ def pixel_at(x, y, columns, rows):
 
 
 @inlined
-def corner_at(corner, k, r, columns, rows):
+def point_at(corner, scale, k, r):
+    """Return (x, y) of the corner (k, r)."""
+    return (corner[0, k, r] - scale[0]) * scale[2], (corner[1, k, r] - scale[1]) * scale[3]
+
+
+@inlined
+def corner_at(corner, scale, k, r, columns, rows):
     """Return (x, y, column, row, state) of the corner (k, r)."""
-    x, y = corner[0, k, r], corner[1, k, r]
+    x, y = point_at(corner, scale, k, r)
     i, j, state = pixel_at(x, y, columns, rows)
     return x, y, i, j, state
 
@@ -265,7 +274,7 @@ def _density(sums, thinnest, a, b, c, flux):
 
 
 @njit(error_model="numpy")
-def _add_row(sums, thinnest, corner, flux, k, upper):
+def _add_row(sums, thinnest, corner, scale, flux, k, upper):
     """Add row k of tubes and the edges between it and the row before, whose densities `upper` (m,) contains.
 
     Corners 0 and 3 of a tube lie in row k, 1 and 2 in row k + 1; the tube before shares 0 and 1.  The triangles are 012
@@ -273,10 +282,13 @@ def _add_row(sums, thinnest, corner, flux, k, upper):
     distance outside the border), and stores in `upper` the densities for the next row.
     """
     columns, rows = sums.shape[0], sums.shape[1] - 1
-    c0, c1 = corner_at(corner, k, 0, columns, rows), corner_at(corner, k + 1, 0, columns, rows)
+    c0, c1 = corner_at(corner, scale, k, 0, columns, rows), corner_at(corner, scale, k + 1, 0, columns, rows)
     before = far = 0.0
     for r in range(flux.shape[1]):
-        c3, c2 = corner_at(corner, k, r + 1, columns, rows), corner_at(corner, k + 1, r + 1, columns, rows)
+        c3, c2 = (
+            corner_at(corner, scale, k, r + 1, columns, rows),
+            corner_at(corner, scale, k + 1, r + 1, columns, rows),
+        )
         half, odd = 0.5 * flux[k, r], (k + r) & 1
         state = c0[4] | c1[4] | c2[4] | c3[4]
         if state == ON and in_one_cell(c0, c1, c2) and same_cell(c0, c3):
@@ -298,24 +310,25 @@ def _add_row(sums, thinnest, corner, flux, k, upper):
 
 
 @njit
-def _add_end(sums, corner, k, upper):
+def _add_end(sums, corner, scale, k, upper):
     """Add the edges behind the last row of tubes."""
     columns, rows = sums.shape[0], sums.shape[1] - 1
     for r in range(upper.size):
-        a, b = corner_at(corner, k, r, columns, rows), corner_at(corner, k, r + 1, columns, rows)
+        a, b = corner_at(corner, scale, k, r, columns, rows), corner_at(corner, scale, k, r + 1, columns, rows)
         add_edge(sums, a, b, upper[r])
 
 
 @njit
-def _clear_columns(own, touched, x):
-    """Clear the columns of `own` that triangles between corners at x can reach, with a margin for rounding."""
+def _clear_columns(own, touched, corner, scale):
+    """Clear the columns of `own` that triangles between the corners can reach, with a margin for rounding."""
     low, high = math.inf, -math.inf
-    for k in range(x.shape[0]):
-        for r in range(x.shape[1]):
-            if x[k, r] < low:
-                low = x[k, r]
-            if x[k, r] > high:
-                high = x[k, r]
+    for k in range(corner.shape[1]):
+        for r in range(corner.shape[2]):
+            x = (corner[0, k, r] - scale[0]) * scale[2]
+            if x < low:
+                low = x
+            if x > high:
+                high = x
     if high - low < MAX_WIDTH:
         low, high = max(low - 1.0, 0.0), min(high + 2.0, float(own.shape[0]))
     else:
@@ -325,11 +338,12 @@ def _clear_columns(own, touched, x):
 
 
 @compiled(parallel=True)
-def _clip(corner, flux, thinnest, sums, touched, far):
+def _clip(corner, scale, flux, thinnest, sums, touched, far):
     """Add the flux of the two triangles of each tube to `sums`, (parts, columns, rows + 1), and set `far`, (parts,).
 
-    corner (2, n + 1, m + 1): corners of the tubes (pixels).  flux (n, m): flux of the tubes.  thinnest: smallest area
-    of a triangle that is followed (pixels²).  touched (parts, 2): range of the columns of `sums` that are in use.
+    corner (2, n + 1, m + 1): corners of the tubes.  scale (x_0, y_0, s_x, s_y): pixels are (x - x_0) s_x and
+    (y - y_0) s_y.  flux (n, m): flux of the tubes.  thinnest: smallest area of a triangle that is followed (pixels²).
+    touched (parts, 2): range of the columns of `sums` that are in use.
     far: Σ flux · (mean square of the distance by which the corners lie outside the border).
     """
     n, m = flux.shape
@@ -339,11 +353,11 @@ def _clip(corner, flux, thinnest, sums, touched, far):
         first, last = c * share, min(n, (c + 1) * share)
         far[c] = 0.0
         if first < last:
-            _clear_columns(sums[c], touched[c], corner[0, first : last + 1])
+            _clear_columns(sums[c], touched[c], corner[:, first : last + 1], scale)
             upper = np.zeros(m)
             for k in range(first, last):
-                far[c] += _add_row(sums[c], thinnest, corner, flux, k, upper)
-            _add_end(sums[c], corner, last, upper)
+                far[c] += _add_row(sums[c], thinnest, corner, scale, flux, k, upper)
+            _add_end(sums[c], corner, scale, last, upper)
 
 
 # --- the adjoint ------------------------------------------------------------------------------------------------------
@@ -387,7 +401,7 @@ def _mean(g, a, b, c):
 
 
 @njit(error_model="numpy")
-def _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, flags, known, edges):
+def _integrate_row(g, below_g, thinnest, corner, scale, flux, k, in_flux, flags, known, edges):
     """Store in `edges` the integrals `along_edge` of the edges of those triangles of row k that are followed.
 
     flags (m, 3): True for the first and the second triangle of a tube if it is followed, and for a tube that extends
@@ -397,10 +411,13 @@ def _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, flags, known,
     """
     columns, rows = g.shape
     upper, lower, across, side = edges
-    c0, c1 = corner_at(corner, k, 0, columns, rows), corner_at(corner, k + 1, 0, columns, rows)
+    c0, c1 = corner_at(corner, scale, k, 0, columns, rows), corner_at(corner, scale, k + 1, 0, columns, rows)
     known_01 = False
     for r in range(flux.shape[1]):
-        c3, c2 = corner_at(corner, k, r + 1, columns, rows), corner_at(corner, k + 1, r + 1, columns, rows)
+        c3, c2 = (
+            corner_at(corner, scale, k, r + 1, columns, rows),
+            corner_at(corner, scale, k + 1, r + 1, columns, rows),
+        )
         odd, first, second = (k + r) & 1, False, False
         state = c0[4] | c1[4] | c2[4] | c3[4]
         in_one = state == ON and in_one_cell(c0, c1, c2) and same_cell(c0, c3)
@@ -424,10 +441,10 @@ def _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, flags, known,
 
 
 @njit(error_model="numpy")
-def _add_row_adjoint(corner, flux, k, flags, edges, d_corner, d_flux):
+def _add_row_adjoint(corner, scale, flux, k, flags, edges, d_corner, d_flux):
     """Add the gradient of the triangles of row k that are followed, from the integrals along their edges."""
     upper, lower, across, side = edges
-    ax, ay, bx, by = corner[0, k], corner[1, k], corner[0, k + 1], corner[1, k + 1]
+    _, _, per_x, per_y = scale
     x0 = y0 = x1 = y1 = 0.0  # sums of the gradient in corners 0 and 1
     m = flux.shape[1]
     for r in range(m):
@@ -435,7 +452,8 @@ def _add_row_adjoint(corner, flux, k, flags, edges, d_corner, d_flux):
         first, second = flags[r, 0], flags[r, 1]
         if first or second:
             half, odd = 0.5 * flux[k, r], (k + r) & 1
-            c0, c1, c2, c3 = (ax[r], ay[r]), (bx[r], by[r]), (bx[r + 1], by[r + 1]), (ax[r + 1], ay[r + 1])
+            c0, c1 = point_at(corner, scale, k, r), point_at(corner, scale, k + 1, r)
+            c3, c2 = point_at(corner, scale, k, r + 1), point_at(corner, scale, k + 1, r + 1)
             e03, e12 = (upper[r, 0], upper[r, 1], upper[r, 2]), (lower[r, 0], lower[r, 1], lower[r, 2])
             edge = (across[r, 0], across[r, 1], across[r, 2])
             if first:
@@ -456,19 +474,19 @@ def _add_row_adjoint(corner, flux, k, flags, edges, d_corner, d_flux):
                 x2, y2, x3, y3, mean = x2 + p, y2 + q, x3 + s, y3 + t, mean + more
         if d_flux.size > 0:
             d_flux[k, r] = 0.5 * mean
-        d_corner[0, k, r] += x0
-        d_corner[1, k, r] += y0
-        d_corner[0, k + 1, r] += x1
-        d_corner[1, k + 1, r] += y1
+        d_corner[0, k, r] += per_x * x0
+        d_corner[1, k, r] += per_y * y0
+        d_corner[0, k + 1, r] += per_x * x1
+        d_corner[1, k + 1, r] += per_y * y1
         x0, y0, x1, y1 = x3, y3, x2, y2
-    d_corner[0, k, m] += x0
-    d_corner[1, k, m] += y0
-    d_corner[0, k + 1, m] += x1
-    d_corner[1, k + 1, m] += y1
+    d_corner[0, k, m] += per_x * x0
+    d_corner[1, k, m] += per_y * y0
+    d_corner[0, k + 1, m] += per_x * x1
+    d_corner[1, k + 1, m] += per_y * y1
 
 
 @njit
-def _add_rest_of_row(g, corner, flux, k, flags, g_far, d_corner, d_flux):
+def _add_rest_of_row(g, corner, scale, flux, k, flags, g_far, d_corner, d_flux):
     """Add the gradient of the triangles that are not followed, and of the light outside the border."""
     columns, rows = g.shape
     for r in range(flux.shape[1]):
@@ -476,11 +494,15 @@ def _add_rest_of_row(g, corner, flux, k, flags, g_far, d_corner, d_flux):
             weight = g_far * 0.5 * flux[k, r]
             for i in range(k, k + 2):
                 for j in range(r, r + 2):
-                    d_corner[0, i, j] += weight * outside(corner[0, i, j], columns)
-                    d_corner[1, i, j] += weight * outside(corner[1, i, j], rows)
+                    x, y = point_at(corner, scale, i, j)
+                    d_corner[0, i, j] += weight * scale[2] * outside(x, columns)
+                    d_corner[1, i, j] += weight * scale[3] * outside(y, rows)
         if d_flux.size > 0:
-            c0, c1 = corner_at(corner, k, r, columns, rows), corner_at(corner, k + 1, r, columns, rows)
-            c3, c2 = corner_at(corner, k, r + 1, columns, rows), corner_at(corner, k + 1, r + 1, columns, rows)
+            c0, c1 = corner_at(corner, scale, k, r, columns, rows), corner_at(corner, scale, k + 1, r, columns, rows)
+            c3, c2 = (
+                corner_at(corner, scale, k, r + 1, columns, rows),
+                corner_at(corner, scale, k + 1, r + 1, columns, rows),
+            )
             odd, mean = (k + r) & 1, 0.0
             if not flags[r, 0]:
                 mean += _mean(g, c0, c1, c3 if odd else c2)
@@ -492,7 +514,7 @@ def _add_rest_of_row(g, corner, flux, k, flags, g_far, d_corner, d_flux):
 
 
 @compiled(parallel=True)
-def clip_adjoint(corner, flux, thinnest, g, below_g, g_far, d_corner, d_flux):
+def clip_adjoint(corner, scale, flux, thinnest, g, below_g, g_far, d_corner, d_flux):
     """Add the gradient in the corners to d_corner; store the gradient in the flux in d_flux, (n, m) or empty.
 
     g (columns, rows), g_far: gradients in the picture and in `far` of `_clip`.  below_g: see `along_edge`.  The even
@@ -507,26 +529,27 @@ def clip_adjoint(corner, flux, thinnest, g, below_g, g_far, d_corner, d_flux):
             flags, known, in_flux = np.empty((m, 3), np.bool_), np.zeros(m, np.bool_), d_flux.size > 0
             for k in range(first, min(n, first + ROWS_PER_STRIP)):
                 edges = upper, lower, across, side
-                _integrate_row(g, below_g, thinnest, corner, flux, k, in_flux, flags, known, edges)
-                _add_row_adjoint(corner, flux, k, flags, edges, d_corner, d_flux)
-                _add_rest_of_row(g, corner, flux, k, flags, g_far, d_corner, d_flux)
+                _integrate_row(g, below_g, thinnest, corner, scale, flux, k, in_flux, flags, known, edges)
+                _add_row_adjoint(corner, scale, flux, k, flags, edges, d_corner, d_flux)
+                _add_rest_of_row(g, corner, scale, flux, k, flags, g_far, d_corner, d_flux)
                 upper, lower = lower, upper
 
 
 class Clip(torch.autograd.Function):
-    """Map (corner (2, n + 1, m + 1), flux (n, m), (rows, columns), thinnest) to (picture, Σ far): see `_clip`.
+    """Map (corner (2, n + 1, m + 1), flux (n, m), picture, thinnest) to (picture, Σ far): see `_clip`.
 
-    Lengths are in pixels.  The gradient is taken in the corners and in the flux.
+    picture: its (rows, columns) and its scale.  The gradient is taken in the corners and in the flux.
     """
 
     @staticmethod
-    def forward(ctx: Any, corner: Tensor, flux: Tensor, shape: tuple[int, int], thinnest: float) -> Any:  # noqa: D102
+    def forward(  # noqa: D102
+        ctx: Any, corner: Tensor, flux: Tensor, picture: tuple[tuple[int, int], Scale], thinnest: float
+    ) -> Any:
         ctx.save_for_backward(corner, flux)
-        ctx.thinnest = thinnest
-        (rows, columns), count = shape, reductions.parts(flux.numel())
+        ((rows, columns), scale), count = picture, reductions.parts(flux.numel())
+        ctx.scale, ctx.thinnest = scale, thinnest
         (sums, touched), far = reductions.buffers(count, columns, rows + 1), np.zeros(count)
-        tubes = corner.detach().contiguous().numpy(), flux.detach().contiguous().numpy()
-        _clip(*tubes, thinnest, sums, touched, far)
+        _clip(_array(corner), scale, _array(flux), thinnest, sums, touched, far)
         image = reductions.merged(sums, touched).cumsum(1)[:, :rows]
         return torch.from_numpy(image.T.copy()), torch.tensor(far.sum())
 
@@ -540,6 +563,10 @@ class Clip(torch.autograd.Function):
         below[:, :-1] = by_column[:, ::-1].cumsum(1)[:, ::-1]
         d_corner = torch.zeros(corner.shape, dtype=torch.float64)
         d_flux = torch.empty(flux.shape if ctx.needs_input_grad[1] else (0, 0), dtype=torch.float64)
-        tubes = corner.detach().contiguous().numpy(), flux.detach().contiguous().numpy()
-        clip_adjoint(*tubes, ctx.thinnest, by_column, below, float(g_far), d_corner.numpy(), d_flux.numpy())
+        tubes, adjoints = (_array(corner), ctx.scale, _array(flux), ctx.thinnest), (d_corner.numpy(), d_flux.numpy())
+        clip_adjoint(*tubes, by_column, below, float(g_far), *adjoints)
         return d_corner, d_flux if ctx.needs_input_grad[1] else None, None, None
+
+
+def _array(t: Tensor) -> np.ndarray:
+    return t.detach().contiguous().numpy()

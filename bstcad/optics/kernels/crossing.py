@@ -28,7 +28,7 @@ from bstcad.optics.interfaces import Interface, apply_losses, net_bounds
 from bstcad.optics.kernels import forward, kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.forward import BLOCK, DX, DY, DZ, FATE, FLUX, SAG, SLOPE_X, SLOPE_Y, WORK, S, U, V, X, Y, Z
-from bstcad.optics.kernels.records import Faces, Screens, TiltedScreen
+from bstcad.optics.kernels.records import Faces, Screens
 from bstcad.optics.kernels.spline import curved, net_of, sag, scatter
 from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.receivers import Receiver
@@ -73,8 +73,7 @@ def _tilted_screen(tilted, k):
     """Return plane k of `Screens.tilted`; None if all planes are level."""
     if tilted is None:
         return None
-    at = tilted[k]
-    return TiltedScreen(at[0], at[1], at[2], at[3], at[4], at[5], at[6], at[7], at[8], at[9], at[10])
+    return tilted[k]
 
 
 @compiled()

@@ -81,7 +81,7 @@ def screens(interface: Interface, planes: Sequence[Receiver], sense: int) -> Scr
     throws = np.array([sense * (plane.middle[2] - z) for plane in planes])
     if all(plane.is_level for plane in planes):
         return Screens(throws, None)
-    return Screens(throws, np.array([_tilted(plane, sense, behind) for plane in planes]))
+    return Screens(throws, tuple(_tilted(plane, sense, behind) for plane in planes))
 
 
 def losses(lens: Lens) -> LossTables:

@@ -103,7 +103,7 @@ class Screens(NamedTuple):
     """Planes on which light lands behind one net."""
 
     throws: np.ndarray  # (k,) `Faces.throw` of each plane (mm)
-    tilted: np.ndarray | None  # (k, 11) `TiltedScreen` of each plane; None: all are level
+    tilted: tuple[TiltedScreen, ...] | None  # each plane; None: all are level
 
 
 class Faces(NamedTuple):

@@ -30,10 +30,10 @@ def seed_of(shape=SHAPE):
     return torch.rand(shape, generator=torch.Generator().manual_seed(11), dtype=torch.float64)
 
 
-def light(form, corner, flux, shape=SHAPE):
+def light(form, corner, flux, shape=SHAPE, scale=tubes.PIXELS):
     """(image, outside, gradient in the corners, gradient in the flux)."""
     corner, flux = corner.clone().requires_grad_(), flux.clone().requires_grad_()
-    image, outside = form(corner, flux, shape)
+    image, outside = form(corner, flux, shape, scale)
     gradients = torch.autograd.grad((image * seed_of(shape)).sum() + 0.3 * outside, (corner, flux))
     return image.detach(), outside.detach(), *gradients
 
@@ -95,6 +95,20 @@ def test_a_tube_unlike_its_neighbours_takes_nothing_from_them(put):
     flux[2, 3:6] = 0.0
     loose = put in (thin, far_away)  # ill-conditioned: a density of 1e4 a pixel², or edges of 1e5 pixels
     same(*(light(form, corner, flux) for form in BOTH), 1e-9 if loose else 1e-12, 1e-5 if loose else 1e-9)
+
+
+def test_corners_in_another_unit_make_the_same_picture():
+    """Half a pixel and, upside down, a quarter; powers of two, so that the pixels are the same to the last bit."""
+    corner, flux = crowded(12, 14, 3)
+    beside_the_screen(corner)
+    corner = (corner * 2**20).round() / 2**20
+    factor = torch.tensor([2.0, -4.0], dtype=torch.float64).view(2, 1, 1)
+    first = torch.tensor([0.5, 3.0], dtype=torch.float64).view(2, 1, 1)
+    for form in BOTH:
+        image, outside, in_corner, in_flux = light(form, corner, flux)
+        found = light(form, corner / factor + first, flux, scale=(0.5, 3.0, 2.0, -4.0))
+        for ours, wanted in zip(found, (image, outside, in_corner * factor, in_flux), strict=True):
+            assert torch.equal(ours, wanted)
 
 
 @pytest.mark.parametrize("far", [math.nan, math.inf, -math.inf, 1e17])
