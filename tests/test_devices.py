@@ -186,7 +186,7 @@ def test_a_kernel_of_the_gpu_is_an_entry_of_the_table(monkeypatch):
         monkeypatch.setitem(ops.KERNELS[name], "cuda", kernel)
 
     enter("bspline.evaluate", bspline.evaluate_plain)
-    enter("tubes.collect", lambda corner, flux, shape, thinnest: tubes.collect_plain(corner, flux, shape))
+    enter("tubes.collect", lambda corner, flux, picture, thinnest: tubes.collect_plain(corner, flux, *picture))
     same_merit_and_gradient(scene(TEMPLATES[0].with_name("mirror.toml"), "draft"))
     assert all(calls.values())
 

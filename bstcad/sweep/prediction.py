@@ -204,7 +204,7 @@ RAY_SECONDS, DRAFT_RAY_SECONDS = 1.6, 1.0  # tracing parallel light, per target 
 WITNESS_SECONDS, DRAFT_WITNESS_SECONDS = 6.0, 2.5  # time to verify a lens of two nets with flux tubes, per target
 LIBRARIES_GB = 1.5  # memory of the libraries in both processes
 TUBES_GB, NET_GB, PIXELS_GB = 0.12, 0.27, 0.02  # memory of tubes, net and pixels
-GOAL_MEMORY_FACTOR = 3.0  # memory of tubes per goal with several goals / memory with one target
+GOAL_MEMORY_FACTOR = 1.2  # memory of tubes per goal with several goals / memory with one target
 
 
 @cache
@@ -232,7 +232,8 @@ def typical_seconds(scene: Scene) -> Seconds:
     if scene.source.extent is not None:
         each, begun = each + BLUR_SECONDS * pixels, begun + IMAGE_SECONDS
     launched = sum((tubes / UNIT_TUBES) ** 2 for tubes, _ in sheets)
-    search = sum(count * (EVALUATION_SECONDS * (tubes / UNIT_TUBES) ** 2 + each) + begun for tubes, count in sheets)
+    tube = len(scene.targets) * EVALUATION_SECONDS  # upper limit: rounds for several pictures may end early
+    search = sum(count * (tube * (tubes / UNIT_TUBES) ** 2 + each) + begun for tubes, count in sheets)
     if point:
         sides = [*(SUBCELLS * grid for grid in grids), min(2 * knobs.side, knobs.rays)]
         first += AIMING_SECONDS * sum((side / UNIT_TUBES) ** 2 for side in sides)
