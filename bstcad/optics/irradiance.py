@@ -24,6 +24,9 @@ LEAK_ROUNDING = 1e-12  # largest `Leak.share` that counts as rounding
 MAX_DARK_VALUE = 1e-6  # largest value of a dark pixel of a target, as a fraction of its brightest pixel
 
 
+Scale = tuple[float, float, float, float]  # (x_0, y_0, s_x, s_y): column and row are (x - x_0) s_x and (y - y_0) s_y
+
+
 @dataclass(frozen=True)
 class Screen:
     """Rectangle of a level or tilted plane, or of another receiver, divided into columns x rows of pixels."""
@@ -95,7 +98,7 @@ class Screen:
         return (x - self.x[0]) * per_x, (self.y[1] - y) * per_y
 
     @property
-    def scale(self) -> tuple[float, float, float, float]:
+    def scale(self) -> Scale:
         """Numbers (x_0, y_0, s_x, s_y): column and row of (x, y) are (x - x_0) s_x and (y - y_0) s_y."""
         per_x, per_y = self.per_unit
         return self.x[0], self.y[1], per_x, -per_y
@@ -109,8 +112,8 @@ class Screen:
         return (x >= self.x[0]) & (x <= self.x[1]) & (y >= self.y[0]) & (y <= self.y[1])
 
 
-def scaled(position: Tensor, scale: tuple[float, float, float, float]) -> Tensor:
-    """Return ((x - x_0) s_x, (y - y_0) s_y) (2, …) of positions (2, …); scale: (x_0, y_0, s_x, s_y)."""
+def scaled(position: Tensor, scale: Scale) -> Tensor:
+    """Return ((x - x_0) s_x, (y - y_0) s_y) (2, …) of positions (2, …)."""
     first, factor = (position.new_tensor(part).view(2, *[1] * (position.ndim - 1)) for part in (scale[:2], scale[2:]))
     return (position - first).mul_(factor)
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from bstcad.optics import ops
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import cross
-from bstcad.optics.irradiance import Screen, scaled
+from bstcad.optics.irradiance import Scale, Screen, scaled
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
@@ -42,8 +42,6 @@ RAY_TOLERANCE = 1e-8  # distance of rays from their points at which the search e
 RELATIVE_DIFFERENCE_STEP = 1e-6  # step of the difference quotients of `rays_to`, as a fraction of the grid's extent
 MIN_BROYDEN_DIVISOR = 0.1  # divisor of a Broyden update, relative to the squared step, up to which there is no update
 
-
-Scale = tuple[float, float, float, float]  # (x_0, y_0, s_x, s_y), see `collect`
 PIXELS: Scale = (0.0, 0.0, 1.0, 1.0)  # scale of corners in pixels
 
 

@@ -29,6 +29,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
+from bstcad.optics.irradiance import Scale
 from bstcad.optics.kernels import reductions
 from bstcad.optics.kernels.compiling import compiled
 
@@ -39,8 +40,6 @@ ROWS_PER_STRIP = 16  # rows of tubes whose gradient one thread computes at a tim
 
 ON, OUT_OF_RANGE = 0, 16  # state of a corner: on the screen; outside MAX_DISTANCE or not a number
 LEFT, RIGHT, ABOVE, BELOW = 1, 2, 4, 8  # bits of the state of a corner outside one or two borders of the screen
-
-Scale = tuple[float, float, float, float]  # (x_0, y_0, s_x, s_y) of `_clip`
 
 inlined = njit(forceinline=True, error_model="numpy")
 

@@ -197,6 +197,17 @@ def _leave(faces, count, work):
         work[E_X + r], work[E_Y + r], work[E_Z + r] = eta * dx - s * p, eta * dy - s * q, eta * dz + s
 
 
+@njit(inline="always")
+def _add_gradient(work, r, g, far):
+    """Add ∂L/∂hit = g, and ∂L/∂direction = far g, of a ray that goes on by the path `far`."""
+    work[G_X + r] += g[0]
+    work[G_Y + r] += g[1]
+    work[G_Z + r] += g[2]
+    work[G_DX + r] += g[0] * far
+    work[G_DY + r] += g[1] * far
+    work[G_DZ + r] += g[2] * far
+
+
 @njit(error_model="numpy", fastmath={"contract"})
 def _add_tilted(faces, throw, tilted, g, status, first, count, work):
     """Add the gradients of `_add_landing` for a tilted screen.
@@ -215,12 +226,7 @@ def _add_tilted(faces, throw, tilted, g, status, first, count, work):
         g_z = gx * tilted.x_z + gy * tilted.y_z
         slide = (g_x * ex + g_y * ey + g_z * ez) / ahead
         g_x, g_y, g_z = g_x - slide * n_x, g_y - slide * n_y, g_z - slide * n_z
-        work[G_X + r] += g_x
-        work[G_Y + r] += g_y
-        work[G_Z + r] += g_z
-        work[G_DX + r] += g_x * far
-        work[G_DY + r] += g_y * far
-        work[G_DZ + r] += g_z * far
+        _add_gradient(work, r, (g_x, g_y, g_z), far)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
@@ -235,12 +241,7 @@ def _add_landing(faces, throw, tilted, g, status, first, count, work):
         ez = min(ez, -faces.rules.grazing) if faces.reflects else max(ez, faces.rules.grazing)
         far = (throw - work[SAG + r]) / ez
         gz = -(work[E_X + r] * gx + work[E_Y + r] * gy) / ez
-        work[G_X + r] += gx
-        work[G_Y + r] += gy
-        work[G_Z + r] += gz
-        work[G_DX + r] += gx * far
-        work[G_DY + r] += gy * far
-        work[G_DZ + r] += gz * far
+        _add_gradient(work, r, (gx, gy, gz), far)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
