@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.measure import ImageSamples
+from bstcad.optics.source_images import ImageSamples
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.source_image import IMAGE_NODES, MAX_TRANSFORM_BYTES, VALUE_BYTES, widest

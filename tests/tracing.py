@@ -46,9 +46,11 @@ def from_first_net_to_each_plain(coming: Rays, lens: Lens, planes: Sequence[Rece
 
 def simulated(source: Emitter, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
     """The light of n x n stratified rays of one source on the screen."""
-    return simulate([(1.0, source, lens, seed)], screen, n)
+    [found] = simulate([(1.0, source, lens, seed)], [screen], n)
+    return found
 
 
 def simulated_plain(source: Emitter, lens: Lens, screen: Screen, n: int, seed: int) -> Simulation:
     """`simulated` in plain torch."""
-    return simulate_plain([(1.0, source, lens, seed)], screen, n)
+    [found] = simulate_plain([(1.0, source, lens, seed)], [screen], n)
+    return found

@@ -25,6 +25,7 @@ LAST_TENTH_RATIO = 1.1  # RRMSD / final RRMSD: a report states how long before t
 FITTED_FRACTION = 0.5  # the power law is fitted to this last fraction of the time
 MIN_FIT_POINTS = 5  # smallest number of points of the curve for a fit
 MIN_R_SQUARED = 0.9  # smallest R² of the fit (in logarithms) at which the curve counts as a power law
+LAST_EVALUATIONS = 5  # number of evaluations at the end over which a report states by how much the RRMSD fell
 MAX_HALVING = 10.0  # largest reported factor by which the time grows if the error is halved
 
 History = Sequence[tuple[float, float]]  # (seconds since the start, RRMSD)
@@ -45,6 +46,8 @@ class ConvergenceEnd:
     power: float | None  # exponent p, zero if the curve does not fall; None: too few points
     fit: float | None  # R² of the fit in logarithms; None: too few points
     halving: float | None  # factor 2^(1/p) of the time; None: no or a poor fit, or a factor above 10
+    # fraction by which the RRMSD fell in the last LAST_EVALUATIONS evaluations; None: the last round has no more
+    last_gain: float | None
 
 
 def ending(history: History, stages: StageResults, since: float = 0.0) -> ConvergenceEnd | None:
@@ -63,10 +66,14 @@ def ending(history: History, stages: StageResults, since: float = 0.0) -> Conver
     above = np.flatnonzero(values > LAST_TENTH_RATIO * last)
     took = float(seconds[-1] - (seconds[above[-1]] if len(above) else 0.0))
     power, fit = _fit_power(*_last_points(seconds, values, ends, since))
+    in_round = values[np.searchsorted(ends, seconds) == np.searchsorted(ends, seconds[-1])]
+    many = len(in_round) > LAST_EVALUATIONS
+    gain = max(0.0, float(1 - in_round[-1] / in_round[-1 - LAST_EVALUATIONS])) if many else None
     halving = None
     if power and fit is not None and fit >= MIN_R_SQUARED and power * np.log2(MAX_HALVING) >= 1:
         halving = 2 ** (1 / power)
-    return ConvergenceEnd(last, took, took / float(seconds[-1]), power, fit=fit, halving=halving)
+    share = took / float(seconds[-1])
+    return ConvergenceEnd(last, took, share, power, fit=fit, halving=halving, last_gain=gain)
 
 
 def _last_points(

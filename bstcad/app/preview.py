@@ -21,8 +21,9 @@ from bstcad.analysis.shape import describe
 from bstcad.folder import Made
 from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import landing_pixels, side_factor, simulated, tubes_picture
+from bstcad.optics.measure import side_factor, simulated, tubes_picture
 from bstcad.optics.sides import as_pair, coarser
+from bstcad.optics.source_images import landing_pixels
 from bstcad.optics.tubes import corners, middle
 from bstcad.report.light_figures import rrmsd
 from bstcad.scene.scene import Scene
@@ -138,11 +139,11 @@ def _evaluate(scene: Scene, made: Made) -> Preview:
         light = _picture(scene, lens, goal)
         pictures.append((goal.picture, light * (goal.picture.sum() / max(light.sum(), 1e-300))))
     rays = max(round(side_factor(channels) * LEDGER_RAYS), 8)
-    ledger = simulated(lens, channels, scene.target.screen, n=rays, seed=SEED).flux
+    [light] = simulated(lens, channels, [scene.target.screen], n=rays, seed=SEED)
     images = [blur(channels, lens, target.screen, target.irradiance(), n=IMAGE_POINTS) for target in scene.targets]
     shape, lit = describe(lens, SHAPE_POINTS), _lit_fraction(scene, lens)
     return Preview(
-        scene, lens, tuple(pictures), flux=ledger, shape=shape, source_images=tuple(images), lit_fraction=lit
+        scene, lens, tuple(pictures), flux=light.flux, shape=shape, source_images=tuple(images), lit_fraction=lit
     )
 
 

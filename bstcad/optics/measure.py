@@ -15,9 +15,6 @@ linearly between their corners: with two tubes per side of a cell of the net the
 after tailoring with tubes, with four a third of this error, with eight a tenth (measured).  The tubes are therefore
 halved in width until the pictures agree, or the error of the tubes cannot explain the difference.  `rrmsd_by_tubes` is
 a few per cent too low for a lens tailored with tubes.  A ghost (light reflected twice in a lens) is traced only once.
-
-An extended source forms an image of itself through each point of the lens (`ImageSamples`).  All rays through one point
-of the back meet the same slope, whichever source point they come from: no lens can unite them in one point.
 """
 
 from __future__ import annotations
@@ -26,7 +23,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import groupby
 
 import numpy as np
 import torch
@@ -35,14 +31,12 @@ from torch import Tensor
 from bstcad.optics import tubes
 from bstcad.optics.channels import Channel, points_per_line, source_numbers, weighted_sum
 from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import Leak, Screen, efficiency, leak, rrmsd, tent
+from bstcad.optics.irradiance import Leak, Screen, efficiency, leak, rrmsd
 from bstcad.optics.kernels.reductions import dot, total
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed
 from bstcad.optics.receivers import Receiver
-from bstcad.optics.sampling import point_pairs
-from bstcad.optics.trace import UNDERSIDE, GhostImage, Simulation, simulate, through, whole_kernel
+from bstcad.optics.trace import UNDERSIDE, GhostImage, Simulation, simulate, whole_kernel
 
 SETS = 8  # number of independent sets of rays: the relative uncertainty of a standard error is a quarter
 PILOT_DIVISOR = 5  # maximum rays per side divided by those of the first sets, which predict the number needed
@@ -60,12 +54,6 @@ MIN_TUBES = 513  # minimum tubes per side (`tubes_of`): fewer do not resolve pix
 COARSE_SHEET = 64  # tubes per side of the grid from which finer ones are interpolated, with 1e-6 of the light misplaced
 PASS_SEEDS = 1 << 20  # difference between the seeds of successive passes of rays from an extended source
 GHOST_DIVISOR = 4  # rays per side divided by those of the ghost, which is about a thousandth of the light
-MAX_IMAGE_RAYS = 1 << 17  # maximum rays of the images of a source that are traced at a time, which limits the memory
-IMAGE_POINTS_PER_SIDE = 48  # number of points per side of the back face through which the source is imaged
-# Largest distance of landing light from the screen's centre, divided by (longer side of the screen + median distance).
-# Light farther out grazes a tilted plane and does not belong to the image.
-MAX_IMAGE_DISTANCE = 16
-EVEN_POINT_PAIRS = 2048  # number of pairs of points that represent a uniformly bright source
 
 
 @dataclass(frozen=True)
@@ -148,37 +136,56 @@ def measure_goal(
     lens: Lens, channels: Sequence[Channel], goal: Goal, effort: Effort, ghost: GhostTracer | None, draw: Draw | None
 ) -> Light:
     """Measure the light on the receiver of a goal against its picture and against `goal.whole` (see `measure`)."""
-    screen, target = goal.receiver, torch.from_numpy(goal.picture)
-    side = effort.rays / GHOST_DIVISOR
-    ghost_image = ghost(lens, channels, screen, round(side_factor(channels) * side), effort.seed) if ghost else None
-    setup = _Setup(lens, draw or (lambda count, seed: channels), screen, target, ghost=ghost_image)
-    rays = (_sample if draw is None else _sample_source)(setup, effort, PICTURE_NOISE * effort.accuracy / FULL.accuracy)
+    [light] = measure_goals(lens, channels, [goal], effort, ghost=ghost, draw=draw)
+    return light
+
+
+def measure_goals(
+    lens: Lens, channels: Sequence[Channel], goals: Sequence[Goal], effort: Effort, *, ghost: GhostTracer | None,
+    draw: Draw | None,
+) -> list[Light]:  # fmt: skip
+    """Measure the light on the receivers of several goals, with the same rays for all (see `measure_goal`)."""
+    setups = _setups(lens, channels, goals, draw)
+    if ghost:
+        n = round(side_factor(channels) * effort.rays / GHOST_DIVISOR)
+        ghosts = [ghost(lens, channels, setup.screen, n, effort.seed) for setup in setups]
+        setups = [replace(setup, ghost=image) for setup, image in zip(setups, ghosts, strict=True)]
+    sample = _sample if draw is None else _sample_source
+    rays = sample(setups, effort, PICTURE_NOISE * effort.accuracy / FULL.accuracy)
+    given = zip(setups, goals, rays, strict=True)
+    witness = effort.witness and draw is None
+    return [_light(setup, goal, channels, found, witness=witness) for setup, goal, found in given]
+
+
+def _light(setup: _Setup, goal: Goal, channels: Sequence[Channel], rays: _Rays, *, witness: bool) -> Light:
+    """Return the light on one receiver; witness: if possible, compare it with a picture by tubes."""
+    lens, screen, target, ghost_image = setup.lens, setup.screen, setup.target, setup.ghost
     if not rays.boxes:
         return Light(np.zeros(screen.shape), math.nan, math.inf, rays=rays.count, flux=rays.flux)
     (value, error), (tent, _) = _value(rays, target), squared_distance(rays.tents, target)
     smoothed, error_of_smoothed = _smoothed(rays.boxes, target)
     # two nets, windows and mirrors have no kernel for the whole path, and yet have a witness
     plain = lens.shapes("front") or bool(lens.before or lens.behind)
-    lossless = draw is None and all(c.losses is None for c in channels)
+    lossless = all(c.losses is None for c in channels)
     paths = ((c.source, c.through(lens), screen.plane) for c in channels)
     simple = lossless and (plain or all(whole_kernel("trace.simulate", *path) for path in paths))
     return Light(
         smoothed.numpy(), value, error, rays=rays.count, flux=rays.flux, tent=math.sqrt(max(tent, 0.0)),
         picture_error=error_of_smoothed,
-        witness=_witness(setup, channels, rays) if effort.witness and simple else None,
+        witness=_witness(setup, channels, rays) if witness and simple else None,
         ghost=None if ghost_image is None else (ghost_image.picture.cpu() * (total(target) / rays.on_screen)).numpy(),
         leak=leak((sum(rays.boxes, torch.zeros_like(target)) / SETS).numpy(), goal.picture),
         rrmsd_whole=None if goal.whole is None else _value(rays, torch.from_numpy(goal.whole))[0],
     )  # fmt: skip
 
 
-def rrmsd_by_rays(
-    lens: Lens, channels: Sequence[Channel], goal: Goal, effort: Effort = FULL, draw: Draw | None = None
-) -> float:
-    """Return `Light.rrmsd` alone; NaN if no light falls on the screen."""
-    target = torch.from_numpy(goal.picture)
-    rays = _sample(_Setup(lens, draw or (lambda count, seed: channels), goal.receiver, target), effort)
-    return _value(rays, target)[0] if rays.boxes else math.nan
+def rrmsds_by_rays(
+    lens: Lens, channels: Sequence[Channel], goals: Sequence[Goal], effort: Effort = FULL, draw: Draw | None = None
+) -> list[float]:
+    """Return `Light.rrmsd` alone for each goal; NaN if no light falls on its screen."""
+    setups = _setups(lens, channels, goals, draw)
+    pairs = zip(setups, _sample(setups, effort), strict=True)
+    return [_value(rays, setup.target)[0] if rays.boxes else math.nan for setup, rays in pairs]
 
 
 def rrmsd_by_tubes(lens: Lens, channels: Sequence[Channel], goal: Goal, n: int) -> float:
@@ -222,14 +229,8 @@ class _Setup:
     target: Tensor  # (rows, columns), row 0 = y max, of any sum
     ghost: GhostImage | None = None
 
-    def trace(self, side: int, seed: int) -> _Rays:
-        """Trace SETS sets, each of about side x side rays per spectral line."""
-        sets = []
-        count = min(max(side**2 // RAYS_PER_POINT, MIN_SOURCE_POINTS), MAX_SOURCE_POINTS)
-        for i in range(SETS):
-            channels = self.draw(count, seed + i)
-            n = max(1, round(side_factor(channels) * side))
-            sets.append(simulated(self.lens, channels, self.screen, n, seed=seed + i))
+    def rays(self, sets: Sequence[Simulation], side: int) -> _Rays:
+        """Return the pictures and the ledger of SETS sets, each of about side x side rays per spectral line."""
         flux = {line: math.fsum(part.flux[line] for part in sets) / SETS for line in sets[0].flux}
         if self.ghost is not None:
             flux |= {line: flux.get(line, 0.0) + more for line, more in self.ghost.flux.items()}
@@ -244,6 +245,28 @@ class _Setup:
     def with_ghost(self, picture: Tensor) -> Tensor:
         """Return the picture on the CPU, plus that of the ghost if one is traced."""
         return picture.cpu() if self.ghost is None else picture.cpu() + self.ghost.picture.cpu()
+
+
+def _setups(lens: Lens, channels: Sequence[Channel], goals: Sequence[Goal], draw: Draw | None) -> list[_Setup]:
+    """Return the measurements of one lens and light on the receivers of all goals; draw: as in `measure`."""
+    draw = draw or (lambda count, seed: channels)
+    return [_Setup(lens, draw, goal.receiver, torch.from_numpy(goal.picture)) for goal in goals]
+
+
+def _trace(setups: Sequence[_Setup], side: int, seed: int) -> list[_Rays]:
+    """Trace SETS sets, each of about side x side rays per spectral line, to the screens of all `setups` of one lens."""
+    sets, screens = [], [setup.screen for setup in setups]
+    count = min(max(side**2 // RAYS_PER_POINT, MIN_SOURCE_POINTS), MAX_SOURCE_POINTS)
+    for i in range(SETS):
+        channels = setups[0].draw(count, seed + i)
+        n = max(1, round(side_factor(channels) * side))
+        sets.append(simulated(setups[0].lens, channels, screens, n, seed=seed + i))
+    return [setup.rays(parts, side) for setup, parts in zip(setups, zip(*sets, strict=True), strict=True)]
+
+
+def _joined(rays: Sequence[_Rays] | None, more: Sequence[_Rays]) -> list[_Rays]:
+    """Return the rays on each screen joined with `more` rays (`_Rays.joined`); None: no rays so far."""
+    return list(more) if rays is None else [a.joined(b) for a, b in zip(rays, more, strict=True)]
 
 
 def _value(rays: _Rays, target: Tensor) -> tuple[float, float]:
@@ -312,40 +335,48 @@ def _smoothed(pictures: Sequence[Tensor], target: Tensor) -> tuple[Tensor, float
     return smooth(whole / SETS, best), math.sqrt(max(least, 0.0))
 
 
-def _sample(setup: _Setup, effort: Effort, max_noise: float = math.inf) -> _Rays:
-    """Trace passes of up to `effort.rays` rays per side until the standard error is `effort.accuracy` times the RRMSD.
+def _sample(setups: Sequence[_Setup], effort: Effort, max_noise: float = math.inf) -> list[_Rays]:
+    """Trace passes of up to `effort.rays` rays per side until each standard error is `effort.accuracy` times the RRMSD.
 
-    The noise of the mean picture, which falls as n^-3/2 with n rays per side, must also be below `max_noise` times
+    The noise of each mean picture, which falls as n^-3/2 with n rays per side, must also be below `max_noise` times
     RRMSD.  The standard error falls as n^-3 where products of noise dominate (the variance of a pixel of n² stratified
     rays falls as n^-3; measured: n^-2.9), and as n^-3/2 where products of the lens's error and noise dominate.
     """
     pilot = max(effort.rays // PILOT_DIVISOR, min(effort.rays, 32))
     began, side, rays = time.perf_counter(), pilot if effort.accuracy else effort.rays, None
     first = side
+
+    def finer(rays: _Rays, target: Tensor) -> float:
+        """Return the ratio by which the rays per side have to grow for one screen; 1: they suffice."""
+        squared, error = squared_distance(rays.boxes, target)
+        goal = 2 * effort.accuracy * squared  # σ(U) = 2 RRMSD σ(RRMSD)
+        noise = _noise(rays.boxes, target)
+        if error <= goal and noise <= max_noise**2 * squared and side > first:  # the first errors are uncertain
+            return 1.0
+        ratio = (1.5 * error / goal) ** (1 / 3) if goal > 0 else math.inf
+        if squared > 0:
+            ratio = max(ratio, (1.5 * noise / (max_noise**2 * squared)) ** (1 / 3))
+        return max(ratio, 2.0 if side == first else 1.2)
+
     while True:
         start = time.perf_counter()
-        more = setup.trace(side, effort.seed)
-        if not more.boxes:
+        more = _trace(setups, side, effort.seed)
+        if not all(each.boxes for each in more):
             return more
-        rays = more if rays is None else rays.joined(more)
+        rays = _joined(rays, more)
         if side >= effort.rays:
             return rays
-        squared, error = squared_distance(rays.boxes, setup.target)
-        goal = 2 * effort.accuracy * squared  # σ(U) = 2 RRMSD σ(RRMSD)
-        noise = _noise(rays.boxes, setup.target)
-        if error <= goal and noise <= max_noise**2 * squared and side > first:  # the first errors are uncertain
+        ratio = max(finer(each, setup.target) for each, setup in zip(rays, setups, strict=True))
+        if ratio == 1:
             return rays
-        finer = (1.5 * error / goal) ** (1 / 3) if goal > 0 else math.inf
-        if squared > 0:
-            finer = max(finer, (1.5 * noise / (max_noise**2 * squared)) ** (1 / 3))
-        larger = min(effort.rays, side * max(finer, 2.0 if side == first else 1.2))
+        larger = min(effort.rays, side * ratio)
         now = time.perf_counter()
         if now - began + (now - start) * (larger / side) ** 2 > effort.seconds:
             return rays
         side = round(larger)
 
 
-def _sample_source(setup: _Setup, effort: Effort, max_noise: float) -> _Rays:
+def _sample_source(setups: Sequence[_Setup], effort: Effort, max_noise: float) -> list[_Rays]:
     """Trace rays to the accuracy of `_sample`, at most `effort.rays`² per set and line, with new source points per set.
 
     Each pixel gets few rays from each of many points: with n rays per side its variance falls as n^-2, as for random
@@ -355,24 +386,31 @@ def _sample_source(setup: _Setup, effort: Effort, max_noise: float) -> _Rays:
     pilot = max(effort.rays // PILOT_DIVISOR, min(effort.rays, 32))
     began, side, rays = time.perf_counter(), pilot if effort.accuracy else effort.rays, None
     number = 0
+
+    def times_more(rays: _Rays, target: Tensor) -> float:
+        """Return the ratio by which the rays have to grow for one screen; 1: they suffice."""
+        squared, error = squared_distance(rays.boxes, target)
+        goal, max_square = 2 * effort.accuracy * squared, max_noise**2 * squared  # σ(U) = 2 RRMSD σ(RRMSD)
+        # the error of the first pass alone may be small by chance
+        if number and error <= goal and _smoothed(rays.boxes, target)[1] ** 2 <= max_square:
+            return 1.0
+        ratio = 1.3 * error / goal if goal > 0 else math.inf
+        return max(ratio if number else ratio**0.8, 4.0 if number == 0 else 1.2)
+
     while True:
         start = time.perf_counter()
         seed = effort.seed + number * PASS_SEEDS  # passes with equal numbers of rays must not repeat them
-        more = setup.trace(side, seed)
-        if not more.boxes:
+        more = _trace(setups, side, seed)
+        if not all(each.boxes for each in more):
             return more
-        more = replace(more, weight=float(side) ** 2)
-        rays = more if rays is None else rays.joined(more)
-        if rays.weight >= effort.rays**2:
+        rays = _joined(rays, [replace(each, weight=float(side) ** 2) for each in more])
+        weight = rays[0].weight
+        if weight >= effort.rays**2:
             return rays
-        squared, error = squared_distance(rays.boxes, setup.target)
-        goal, max_square = 2 * effort.accuracy * squared, max_noise**2 * squared  # σ(U) = 2 RRMSD σ(RRMSD)
-        # the error of the first pass alone may be small by chance
-        if number and error <= goal and _smoothed(rays.boxes, setup.target)[1] ** 2 <= max_square:
+        ratio = max(times_more(each, setup.target) for each, setup in zip(rays, setups, strict=True))
+        if ratio == 1:
             return rays
-        ratio = 1.3 * error / goal if goal > 0 else math.inf
-        needed = rays.weight * max(ratio if number else ratio**0.8, 4.0 if number == 0 else 1.2)
-        finer = math.sqrt(min(needed, effort.rays**2) - rays.weight)
+        finer = math.sqrt(min(weight * ratio, effort.rays**2) - weight)
         now = time.perf_counter()
         if now - began + (now - start) * (finer / side) ** 2 > effort.seconds:
             return rays
@@ -495,10 +533,12 @@ def spectral_lines(lens: Lens, channels: Sequence[Channel], goal: Goal, n: int) 
     return tuple(parts)
 
 
-def simulated(lens: Lens, channels: Sequence[Channel], screen: Screen, n: int, seed: int) -> Simulation:
-    """Simulate picture and ledger by n x n stratified rays per channel, with another seed for each source point."""
+def simulated(
+    lens: Lens, channels: Sequence[Channel], screens: Sequence[Screen], n: int, seed: int
+) -> tuple[Simulation, ...]:
+    """Simulate pictures and ledgers by n x n stratified rays per channel, with another seed for each source point."""
     pairs = zip(channels, source_numbers(channels), strict=True)
-    return simulate([(c.weight, c.source, c.through(lens), seed + SETS * k) for c, k in pairs], screen, n)
+    return simulate([(c.weight, c.source, c.through(lens), seed + SETS * k) for c, k in pairs], screens, n)
 
 
 def side_factor(channels: Sequence[Channel]) -> float:
@@ -509,107 +549,3 @@ def side_factor(channels: Sequence[Channel]) -> float:
 
 def _squared(t: Tensor) -> float:
     return dot(t.reshape(-1), t.reshape(-1))
-
-
-@dataclass(frozen=True)
-class ImageSamples:
-    """Images of a source through several points of the back face: landing points of the light of each channel."""
-
-    offset: Tensor  # landing point minus centroid of the image, (2, channels, points): columns, rows (pixels)
-    flux: Tensor  # flux of each channel through each point, (channels, points)
-
-    def width(self) -> float:
-        """Return 2 √2 times the RMS distance from the centroid (pixels), the diameter of a uniform disc of this RMS."""
-        square = torch.where(self.flux > 0, (self.offset**2).sum(0), torch.zeros_like(self.flux))
-        return 2 * math.sqrt(2 * float(total(square * self.flux) / total(self.flux)))
-
-    def mean(self, limit: tuple[int, int]) -> np.ndarray:
-        """Return the mean image (odd number of rows, odd number of columns), centred; sum: fraction of light inside.
-
-        limit: largest distance from the centre of the image in columns and in rows; light farther out is left out.
-        """
-        extent = [math.ceil(float(p[self.flux > 0].abs().max())) + 1 for p in self.offset]
-        columns, rows = (2 * min(reach, side) + 1 for reach, side in zip(extent, limit, strict=True))
-        own = Screen(0.0, (-columns / 2, columns / 2), (-rows / 2, rows / 2), (columns, rows))
-        position = self.offset * torch.tensor([1.0, -1.0]).view(2, 1, 1)  # rows count downwards
-        image = tent(Landed(position, self.flux, torch.zeros(self.flux.shape, dtype=torch.uint8)), own)
-        fits = all(reach <= side for reach, side in zip(extent, limit, strict=True))
-        return (image / (image.sum() if fits else self.flux.sum())).numpy()
-
-    def deviation(self, target: np.ndarray) -> float:
-        """Return the RRMSD between a target (rows, columns) and the target convolved with the mean image.
-
-        Light shifted by more than the target's width falls outside the target and needs no pixels.
-        """
-        from scipy.signal import fftconvolve  # half a second to load, which a point source does not need
-
-        rows, columns = target.shape
-        blurred = fftconvolve(target, self.mean((columns, rows)), mode="same").clip(min=0)
-        if not blurred.any():  # the image is so much wider than the target that no sample falls on the target
-            blurred = np.ones_like(target)
-        return float(rrmsd(torch.from_numpy(blurred), torch.from_numpy(np.asarray(target, dtype=np.float64))))
-
-
-def even_image(extent: Outline) -> ImageSamples:
-    """Return the image of a uniformly bright disc or rectangle; extent: outline of the image (pixels)."""
-    offset = torch.tensor(point_pairs(extent, EVEN_POINT_PAIRS), dtype=torch.float64).T[..., None]
-    return ImageSamples(offset, torch.full(offset.shape[1:], 1 / (2 * EVEN_POINT_PAIRS), dtype=torch.float64))
-
-
-def detail_width(source_image: float, pixel: float) -> float:
-    """Return √(D² + 4/3 p²): diameter of the uniform disc whose variance is the sum of those of a disc and a pixel.
-
-    D: `source_image`, diameter of the disc, variance D² / 8.  p: `pixel`, its side, variance p² / 6.  All in one unit.
-    """
-    return math.sqrt(source_image**2 + 4 / 3 * pixel**2)
-
-
-@torch.no_grad()
-def images(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int = IMAGE_POINTS_PER_SIDE) -> ImageSamples:
-    """Return the source's images, in light of the first line, through the lit cells of an n x n grid on the back."""
-    first = channels[0]
-    channels = [c for c in channels if (c.source.wavelength, c.index) == (first.source.wavelength, first.index)]
-    pixel, flux = landing_pixels(channels, lens, screen, n)
-    if (flux > 0).any():
-        centre = torch.tensor([screen.columns / 2, screen.rows / 2]).to(pixel).view(2, 1, 1)
-        distance = (pixel - centre).abs().amax(0)
-        stray = distance > MAX_IMAGE_DISTANCE * (max(screen.shape) + distance[flux > 0].median())
-        flux = torch.where(stray, torch.zeros_like(flux), flux)
-    lit = flux.sum(0) > 0
-    flux, share = flux[:, lit], flux[:, lit] / flux[:, lit].sum(0)
-    pixel = torch.where(flux > 0, pixel[..., lit], torch.zeros_like(share))
-    return ImageSamples(pixel - (pixel * share).sum(1, keepdim=True), flux)
-
-
-@torch.no_grad()
-def landing_pixels(channels: Sequence[Channel], lens: Lens, screen: Screen, n: int) -> tuple[Tensor, Tensor]:
-    """Return (pixel (2, channels, points), flux (channels, points)) of the light through n x n cells of the back.
-
-    pixel: column and row at which each channel's light lands, meaningless where the flux is zero.
-    """
-    x, y = tubes.corners(lens.apertures[1], n)
-    lines = groupby(channels, key=lambda channel: (channel.index, channel.losses, channel.around))
-    count, parts = max(1, MAX_IMAGE_RAYS // x.numel()), []
-    for line in (list(members) for _, members in lines):
-        parts += [_through(line[k : k + count], lens, screen, x=x, y=y) for k in range(0, len(line), count)]
-    position, flux = (torch.cat(part, dim=-2) for part in zip(*parts, strict=True))
-    return screen.pixels_of(position), flux
-
-
-def _through(channels: Sequence[Channel], lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Trace light of one index through the cells between the points (x, y) (mm) of the back; return (landing, flux).
-
-    landing: points (2, channels, cells) in the receiver's unit.  flux: (channels, cells), zero for light that is lost.
-    """
-    lens = channels[0].through(lens)
-    p, q, rays = tubes.rays_to([channel.source for channel in channels], lens, x, y)
-    behind = replace(lens.unbounded(), losses=None).interfaces[lens.number_of("back") :]
-    [landed] = through(rays, behind, [screen.plane])
-    centre = tubes.middle(p), tubes.middle(q)
-    cells = zip(channels, *centre, strict=True)
-    density = [each.weight * each.source.irradiance(x, y, lens.entrance.z) for each, x, y in cells]
-    flux = torch.stack(density) * tubes.area_of(p, q)
-    if lens.passes.sense > 0:  # light comes to the front
-        flux = torch.where(lens.apertures[0].contains(*centre), flux, torch.zeros_like(flux))
-    flux = tubes.arriving_flux(flux, landed).double()
-    return tubes.middle(landed.position).flatten(-2), flux.flatten(-2)

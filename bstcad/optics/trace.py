@@ -194,39 +194,45 @@ Lights = Sequence[tuple[float, Emitter, Lens, int]]  # (weight, source, lens at 
 
 
 @torch.no_grad()
-def simulate(lights: Lights, screen: Screen, n: int) -> Simulation:
-    """Simulate the weighted sum of lights by n x n stratified rays each; by the fused kernel if it supports all lights.
+def simulate(lights: Lights, screens: Sequence[Screen], n: int) -> tuple[Simulation, ...]:
+    """Simulate the weighted sum of lights on each screen by n x n stratified rays each, the same rays for all screens.
 
-    Kernel and plain form trace the same rays and agree to rounding.
+    The fused kernel is used if it supports all lights; it and the plain form trace the same rays and agree to rounding.
     """
     tables = n >= MIN_RAYS_FOR_TABLE and len(lights) <= MAX_LIGHT_TABLES
     kernels = [
-        whole_kernel("trace.simulate", source, lens, screen.plane, tables=tables) for _, source, lens, _ in lights
+        whole_kernel("trace.simulate", source, lens, screen.plane, tables=tables)
+        for _, source, lens, _ in lights
+        for screen in screens
     ]
     if all(kernels) and (fast := kernels[0]):
         whole = [(*light, window(light[1], light[2])) for light in lights]
-        return _as_fractions(lights, *fast(whole, screen, n))
-    return simulate_plain(lights, screen, n)
+        return tuple(_as_fractions(lights, *fast(whole, screen, n)) for screen in screens)
+    return simulate_plain(lights, screens, n)
 
 
 @torch.no_grad()
-def simulate_plain(lights: Lights, screen: Screen, n: int) -> Simulation:
+def simulate_plain(lights: Lights, screens: Sequence[Screen], n: int) -> tuple[Simulation, ...]:
     """Simulate as `simulate` does, but in plain torch, with one strip of rays (`launch_strips`) at a time."""
-    box = torch.zeros(screen.shape, dtype=torch.float64, device=lights[0][2].like.device)
-    tent, count = torch.zeros_like(box), 0
-    flux: dict[str, float] = {}
+    like, count = lights[0][2].like, 0
+    pictures = [torch.zeros((2, *screen.shape), dtype=torch.float64, device=like.device) for screen in screens]
+    ledgers: list[dict[str, float]] = [{} for _ in screens]
     for weight, source, lens, seed in lights:
         for rays in launch_strips(source, lens, n, seed):
-            landed = trace(rays, lens, screen.plane)
-            box += weight * irradiance.box(landed, screen)
-            tent += weight * irradiance.tent(landed, screen)
-            lines = irradiance.ledger(landed, screen)
-            if lens.behind:
-                lines[BLOCKED] = float(total(landed.flux[landed.status == int(Status.BLOCKED)].double()))
-            for line, value in lines.items():
-                flux[line] = flux.get(line, 0.0) + weight * value
+            landings = from_first_net_to_each(to_first_net(rays, lens), lens, [screen.plane for screen in screens])
+            for screen, landed, (box, tent), flux in zip(screens, landings, pictures, ledgers, strict=True):
+                box += weight * irradiance.box(landed, screen)
+                tent += weight * irradiance.tent(landed, screen)
+                lines = irradiance.ledger(landed, screen)
+                if lens.behind:
+                    lines[BLOCKED] = float(total(landed.flux[landed.status == int(Status.BLOCKED)].double()))
+                for line, value in lines.items():
+                    flux[line] = flux.get(line, 0.0) + weight * value
             count += rays.flux.numel()
-    return _as_fractions(lights, box, tent, flux=flux, count=count)
+    return tuple(
+        _as_fractions(lights, box, tent, flux=flux, count=count)
+        for (box, tent), flux in zip(pictures, ledgers, strict=True)
+    )
 
 
 def _as_fractions(lights: Lights, box: Tensor, tent: Tensor, flux: dict[str, float], count: int) -> Simulation:

@@ -108,8 +108,8 @@ class Plate:
         return 2 * distance * math.tan(math.radians(self.light.size / 2))
 
     def detail(self, distance: float) -> float:
-        """Return the width (mm) of the finest detail on a wall at this distance; see optics.measure.detail_width."""
-        from bstcad.optics.measure import detail_width  # loads torch, which a list of the templates does not need
+        """Return the width (mm) of the finest detail on a wall at this distance; see source_images.detail_width."""
+        from bstcad.optics.source_images import detail_width  # loads torch, which a list of the templates does not need
 
         as_a_disc = math.sqrt(4 / 3) if self.light.square else 1.0
         return detail_width(as_a_disc * self.source_image(distance), self.pixel)
@@ -134,8 +134,8 @@ class Plate:
 
     def blur_rrmsd(self, scene: Scene) -> float | None:
         """Return the RRMSD of the scene's picture blurred by the source's image; None for a source without size."""
-        from bstcad.optics.measure import even_image
         from bstcad.optics.outlines import Circle, Rectangle
+        from bstcad.optics.source_images import even_image
 
         if not self.light.size:
             return None

@@ -33,7 +33,7 @@ from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, measure_goal
+from bstcad.optics.measure import Effort, measure_goals
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane
 from bstcad.runs import environment, files, processes
@@ -316,7 +316,7 @@ def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick:
 def judge_run(run: ColdRun, base: Scene, folder: Path, effort: Effort) -> ColdRun:
     """Return `run` with the RRMSD of the lens in `folder` by `effort`: the largest on the targets of `base`."""
     lens, channels = read_nominal(folder)[1].lens, base.verification_channels()
-    lights = [measure_goal(lens, channels, goal, effort, ghost=base.ghost, draw=base.draw) for goal in base.goals]
+    lights = measure_goals(lens, channels, base.goals, effort, ghost=base.ghost, draw=base.draw)
     if not all(light.rrmsd >= 0 for light in lights):
         return run.model_copy(update={"status": FAILED, "reason": "none of its light falls on the target"})
     light = max(lights, key=lambda light: light.rrmsd)

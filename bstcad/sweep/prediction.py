@@ -24,7 +24,7 @@ from bstcad import pipeline
 from bstcad.analysis.light import blur
 from bstcad.analysis.steepness import Steepness
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, rrmsd_by_rays
+from bstcad.optics.measure import Effort, rrmsds_by_rays
 from bstcad.optics.sides import Sides, as_pair, coarser
 from bstcad.runs.processes import Tick
 from bstcad.scene.quality import COARSEST_GRID
@@ -88,7 +88,7 @@ def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
     if compilations.buffer:  # the first design after an installation waits for the compiler; time another one
         finished = make_design()
     light, finer = small.channels(), factor > 1
-    rrmsd = max(rrmsd_by_rays(finished.lens, light, goal, PILOT_EFFORT, draw=small.draw) for goal in finished.goals)
+    rrmsd = max(rrmsds_by_rays(finished.lens, light, finished.goals, PILOT_EFFORT, draw=small.draw))
     sides = [max(goal.receiver.shape) for goal in finished.goals]
     pairs = zip(scene.single_target_scenes(), small.single_target_scenes(), strict=True)
     blurs = [blur_rrmsd(one, finished.lens) - blur_rrmsd(few, finished.lens) for one, few in pairs] if finer else [0.0]

@@ -41,7 +41,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -75,6 +75,7 @@ FOUR_POINTS = 2.0  # eigenvalue of the Laplacian for waves of four control point
 COARSE_LAPLACIAN_POWER = 0.75  # power of the Laplacian in `CoarseVariable`, whose net has about one cell per pixel
 TARGET_BLUR = 1.0  # standard deviation (pixels) of the blur of the target before the local weight is computed
 WEIGHT_SMOOTHING = 1.5  # standard deviation (control points) of the smoothing of the weight's logarithm
+MAX_WEIGHT_POINTS = 513  # largest number of points per side at which the local weight is computed; linear between
 MAX_LOCAL_WEIGHT = 4.0  # largest local weight; the smallest is 1 / MAX_LOCAL_WEIGHT, before division by the leverage
 # Range of the leverage / median in which the weight is proportional to 1 / leverage.
 MIN_LEVERAGE, MAX_LEVERAGE = 3.0, 96.0
@@ -331,37 +332,66 @@ def _apply_both(left: csr_array, t: Tensor, right: csr_array) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray((right @ within).T)).to(t)
 
 
-def local_weight(source: Emitter, lens: Lens, goal: Goal, number: int | None = None) -> Tensor:
+def local_weight(source: Emitter, lens: Lens, goals: Sequence[Goal], number: int | None = None) -> Tensor:
     """Return the weight w = (E / mean E)^-1/2 at each control point (m, n), smoothed and clamped.
 
     E is the irradiance of the target where light from the control point lands; before smoothing, w = 1 for light that
     misses the screen.  On the last net, if light leaves the glass there, the weight is divided by `_excess_leverage`.
-    number: index of the freeform interface in the lens; None: the back.
+    For several goals w is the geometric mean.  number: index of the freeform interface in the lens; None: the back.
     """
-    number, screen = lens.number_of("back") if number is None else number, goal.receiver
+    number = lens.number_of("back") if number is None else number
     net, onwards = lens.interfaces[number].net, lens.unbounded().interfaces[number:]
-    x, y = torch.meshgrid(*control_point_axes(net), indexing="ij")
+    few = [min(m, MAX_WEIGHT_POINTS) for m in net.shape]
+    x, y = torch.meshgrid(*_even_axes(net, few), indexing="ij")
     _, _, at_net = rays_to(source, lens, x=x, y=y, number=number)
     with torch.no_grad():
-        [landed] = through(at_net, onwards, [screen.plane])
+        landings = through(at_net, onwards, [goal.receiver.plane for goal in goals])
+    first, *others = (
+        torch.from_numpy(_spread(_weight_for(goal, lens, number, at_net=at_net, landed=landed), net.shape))
+        for goal, landed in zip(goals, landings, strict=True)
+    )
+    if not others:
+        return first
+    logarithm = sum((elementary(torch.log, w) for w in others), elementary(torch.log, first))
+    return elementary(torch.exp, logarithm / len(goals))
+
+
+def _weight_for(goal: Goal, lens: Lens, number: int, *, at_net: Rays, landed: Landed) -> np.ndarray:
+    """Return the weight (k, l) for one goal; at_net, landed: rays (k, l) through even points, at net and receiver."""
+    screen, interface = goal.receiver, lens.interfaces[number]
+    sides = zip(at_net.status.shape, interface.net.shape, strict=True)
+    smooth = partial(gaussian_filter, sigma=[WEIGHT_SMOOTHING * (k - 1) / (m - 1) for k, m in sides])
     column, row = (p.cpu().double().numpy() for p in screen.pixel(*landed.position))
     on_screen = landed.alive.cpu().numpy() & (column > 0) & (column < screen.columns) & (row > 0) & (row < screen.rows)
     picture = gaussian_filter(goal.picture / goal.picture.mean(), TARGET_BLUR)
     irradiance = map_coordinates(picture, [row - 0.5, column - 0.5], order=1, mode="nearest")
     logarithm = np.where(on_screen, np.log(np.maximum(irradiance, MAX_LOCAL_WEIGHT**-4)), 0.0)
-    weight = np.exp(-0.5 * gaussian_filter(logarithm, WEIGHT_SMOOTHING)).clip(1 / MAX_LOCAL_WEIGHT, MAX_LOCAL_WEIGHT)
-    if number == lens.freeform[-1] and onwards[0].law.eta > 1:
+    weight = np.exp(-0.5 * smooth(logarithm)).clip(1 / MAX_LOCAL_WEIGHT, MAX_LOCAL_WEIGHT)
+    if number == lens.freeform[-1] and interface.law.eta > 1:
         plane = image_from_last_net(lens, screen.plane)
-        leverage = _excess_leverage(at_net, landed.position, plane, law=onwards[0].law, on_screen=on_screen)
+        leverage = _excess_leverage(at_net, landed.position, plane, law=interface.law, on_screen=on_screen)
         if leverage is not None:
-            weight = weight / np.exp(gaussian_filter(np.log(leverage), WEIGHT_SMOOTHING))
-    return torch.from_numpy(weight)
+            weight = weight / np.exp(smooth(np.log(leverage)))
+    return weight
 
 
 def control_point_axes(net: BSplineSurface) -> tuple[Tensor, Tensor]:
     """Return x (m,) and y (n,) of the control points of a net (m, n), evenly spaced (mm)."""
-    x, y = (torch.linspace(*ends, m, dtype=torch.float64) for ends, m in zip((net.x, net.y), net.shape, strict=True))
+    return _even_axes(net, net.shape)
+
+
+def _even_axes(net: BSplineSurface, sides: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Return x and y (mm) of evenly spaced points, from the first to the last control point; sides: their numbers."""
+    x, y = (torch.linspace(*ends, m, dtype=torch.float64) for ends, m in zip((net.x, net.y), sides, strict=True))
     return x, y
+
+
+def _spread(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return values (k, l) at evenly spaced points interpolated linearly to `shape` points of the same extent."""
+    if values.shape == shape:
+        return values
+    at = np.meshgrid(*(np.linspace(0, k - 1, m) for k, m in zip(values.shape, shape, strict=True)), indexing="ij")
+    return map_coordinates(values, at, order=1, mode="nearest")
 
 
 def _excess_leverage(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, on_screen: np.ndarray) -> np.ndarray | None:

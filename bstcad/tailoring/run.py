@@ -18,7 +18,7 @@ from torch import Tensor
 from bstcad.optics.channels import Channel
 from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, measure_goal, rrmsd_by_rays
+from bstcad.optics.measure import Effort, measure_goal, rrmsds_by_rays
 from bstcad.optics.sides import Sides
 from bstcad.optics.unfolding import image_screen
 from bstcad.optics.wavefront import Wave
@@ -83,6 +83,7 @@ RRMSD_SECONDS = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
 # is estimated from products of two pictures (measure.py).  With n² stratified rays per picture its error varies as
 # (p / n)³ / p, so a target of p pixels per side needs (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays per side.
 STAGE_EFFORT, STAGE_EFFORT_PIXELS = Effort(rays=724, accuracy=0, witness=False), 512
+ROUGH_RAYS = 0.5  # rays per side of `Task.stage_effort`, relative to STAGE_EFFORT, for an RRMSD known to some 15 %
 FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays in scenes with accuracy or bounds, and in `better`
 FLUX_EFFORT = Effort(rays=128, accuracy=1.0, witness=False)  # rays for the flux on the target alone
 
@@ -162,21 +163,23 @@ class Task:
         """Return the largest RRMSD over the goals from independent rays, on the CPU; NaN without light on a target.
 
         The flux tubes used for tailoring would underestimate the RRMSD.  effort: rays to use; None: FLUX_EFFORT for a
-        preview, FINE_EFFORT for a scene with an accuracy or bounds, else STAGE_EFFORT, scaled to the number of pixels.
+        preview, FINE_EFFORT for a scene with an accuracy or bounds, else `stage_effort`.
         """
         if effort is None and self.preview:  # only the light on the target counts
             effort = FLUX_EFFORT
         if effort is None and (self.knobs.accuracy is not None or self.bounds is not None):
             effort = FINE_EFFORT
-        if effort is None:
-            pixels = max(goal.picture.size for goal in self.goals)
-            rays = STAGE_EFFORT.rays * (pixels / STAGE_EFFORT_PIXELS**2) ** (1 / 3)
-            effort = replace(STAGE_EFFORT, rays=round(rays))
+        effort = effort or self.stage_effort()
         sources = () if self.sampled_sources else self.extended_sources  # centre alone before stage 3
         draw = sources[-1].draw if sources else None  # samples the task's last source
-        lens = lens.plain()
-        values = [rrmsd_by_rays(lens, self.channels, goal, effort, draw=draw) for goal in self.goals]
+        values = rrmsds_by_rays(lens.plain(), self.channels, self.goals, effort, draw=draw)
         return math.nan if any(map(math.isnan, values)) else max(values)
+
+    def stage_effort(self, factor: float = 1.0) -> Effort:
+        """Return STAGE_EFFORT, scaled to the number of pixels of the goals; factor: of the rays per side."""
+        pixels = max(goal.picture.size for goal in self.goals)
+        rays = factor * STAGE_EFFORT.rays * (pixels / STAGE_EFFORT_PIXELS**2) ** (1 / 3)
+        return replace(STAGE_EFFORT, rays=round(rays))
 
     def rated(self, lens: Lens, rrmsd: float) -> RatedLens:
         """Return the lens with its figure of merit; rrmsd: its RRMSD by `Task.rrmsd`."""

@@ -33,10 +33,11 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen, tent
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Draw, landing_pixels, side_factor, simulated
+from bstcad.optics.measure import Draw, side_factor, simulated
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import point_pairs
+from bstcad.optics.source_images import landing_pixels
 
 IMAGE_NODES = 5  # nodes t_n per side of the screen; the outermost lie on its edges
 IMAGE_GRID = 32  # cells per side of the back through which the images of the source are traced
@@ -223,7 +224,7 @@ def blur_error(by_images: Tensor, draw: Draw, lens: Lens, screen: Screen, *, bor
     for k in range(2):
         points = draw(ERROR_POINTS, seed + ERROR_SEED_OFFSET + k)
         n = max(1, round(side_factor(points) * ERROR_RAYS))
-        rays = simulated(lens, points, screen, n=n, seed=seed + ERROR_SEED_OFFSET + k)
+        [rays] = simulated(lens, points, [screen], n=n, seed=seed + ERROR_SEED_OFFSET + k)
         left = sum(rays.flux[line] for line in ("on target", "off target", "total internal reflection"))
         error = (rays.box / left - picture).numpy() if left > 0 else np.zeros(picture.shape)
         errors.append(gaussian_filter(error, ERROR_SMOOTHING * (border - 2)))

@@ -21,7 +21,7 @@ the size of the source to its full size; coarse rounds for the centre alone may 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -30,10 +30,10 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.channels import Channel, channels_of, points_per_line
-from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import images, rrmsd_by_tubes, side_factor
+from bstcad.optics.measure import rrmsd_by_tubes, side_factor
 from bstcad.optics.sides import as_pair, coarser
+from bstcad.optics.source_images import images
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import ResolvedTailoring
 from bstcad.tailoring.grazing import Grazing
@@ -42,7 +42,7 @@ from bstcad.tailoring.merit import FOUR_POINTS, CoarseVariable, Merit, SobolevVa
 from bstcad.tailoring.minimise import PLATEAU, Best, Iterate, LbfgsState, Pairs, Plateau, lbfgs, minimise
 from bstcad.tailoring.net_variables import NetVariables, along_light
 from bstcad.tailoring.reachable import resample
-from bstcad.tailoring.run import TUBES_PER_SECOND, Parameters, Stage, StageStep, Steps, Task, maker
+from bstcad.tailoring.run import ROUGH_RAYS, TUBES_PER_SECOND, Parameters, Stage, StageStep, Steps, Task, maker
 from bstcad.tailoring.source_image import ExtendedSource
 
 RoundFractions = tuple[tuple[float, float], ...]  # (tubes per side, evaluations) of rounds, relative to the settings
@@ -65,7 +65,7 @@ WAVEFRONT_ROUNDS = ((2 / 3, 0.45), (1.0, 0.35), (4 / 3, 0.2))
 # distort between the tubes, the less the more tubes there are.  (Two photographs, 769 points per side: RRMSDs 0.027 and
 # 0.038 after 206 and 103 evaluations in the rounds (2/3, 4/3); 0.027 and 0.031 after 73, 73 and 15 in three rounds, in
 # three quarters of the time.)
-PICTURES_ROUNDS, PICTURES_SIDE = ((2 / 3, 1.4), (4 / 3, 0.6), (2.0, 0.1)), 513
+PICTURES_ROUNDS, PICTURES_SIDE = ((2 / 3, 1.2), (4 / 3, 0.5), (2.0, 0.1)), 513
 # Ratio of the RRMSD by tubes to the RRMSD by rays at which such a round ends before the last, since further evaluations
 # would mostly fit the nets to the tubes; and evaluations between two comparisons.
 DISTORTION_RATIO, COMPARISON_INTERVAL = 0.5, 25
@@ -168,7 +168,8 @@ class TubeRound:
                     step = replace(step, rrmsd=best.figure)
                     reason = "accuracy" if best.figure <= position.goal_by_tubes else reason
                 if self.ends_distorted and not reason and best.evaluations % COMPARISON_INTERVAL == 0:
-                    distorted = best.figure < DISTORTION_RATIO * self.task.rrmsd(step.lens)
+                    rough = self.task.rrmsd(step.lens, self.task.stage_effort(ROUGH_RAYS))
+                    distorted = best.figure < DISTORTION_RATIO * rough
                     reason = "distortion" if distorted else ""
             if iterate.state is not None and not reason:
                 step = replace(step, state=TubeSearch(position, best, iterate.state))
@@ -398,25 +399,13 @@ def variables_of(task: Task, lens: Lens, pixels: int | None = None, level: float
     if pixels is not None:
         lens = lens.with_nets(net.refined(coarser(net.shape, pixels + 1)) for net in nets)
     source, lens = task.heaviest.source, task.heaviest.through(lens)
-
-    def weight(number: int) -> Tensor:
-        return _geometric_mean(local_weight(source, lens, goal, number) for goal in task.goals)
-
-    weights = [weight(number) for number in lens.freeform]
+    weights = [local_weight(source, lens, task.goals, number) for number in lens.freeform]
     if pixels is not None:
         return NetVariables(tuple(map(CoarseVariable.of, nets, lens.nets, weights)))
     blocks = tuple(SobolevVariable.of(net, weight, level=level) for net, weight in zip(nets, weights, strict=True))
     if lens.shapes_two_faces and len(task.goals) > 1:
         return NetVariables(blocks, *along_light(source, lens, task.goals))
     return NetVariables(blocks)
-
-
-def _geometric_mean(weights: Iterable[Tensor]) -> Tensor:
-    first, *others = weights
-    if not others:
-        return first
-    logarithm = sum((elementary(torch.log, w) for w in others), elementary(torch.log, first))
-    return elementary(torch.exp, logarithm / (1 + len(others)))
 
 
 def minimise_merit(

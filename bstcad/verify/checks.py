@@ -24,7 +24,7 @@ from bstcad.optics import quadrature
 from bstcad.optics.channels import Channel
 from bstcad.optics.goal import Goal, worst
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import FULL, RESOLVED, Effort, Light, SpectralLine, measure_goal, spectral_lines, tubes_of
+from bstcad.optics.measure import FULL, RESOLVED, Effort, Light, SpectralLine, measure_goals, spectral_lines, tubes_of
 from bstcad.optics.outlines import Outline
 from bstcad.optics.passes import Face
 from bstcad.optics.wavefront_error import WavefrontError, wavefront_error
@@ -87,7 +87,12 @@ class Nominal:
 
     def light(self, lens: Lens, goal: Goal, effort: Effort) -> Light:
         """Return the light of a lens on a target."""
-        return measure_goal(lens, self.channels, goal, effort, ghost=self.scene.ghost, draw=self.scene.draw)
+        [light] = self.lights(lens, [goal], effort)
+        return light
+
+    def lights(self, lens: Lens, goals: Sequence[Goal], effort: Effort) -> list[Light]:
+        """Return the light of a lens on each target, by the same rays."""
+        return measure_goals(lens, self.channels, goals, effort, ghost=self.scene.ghost, draw=self.scene.draw)
 
 
 @dataclass(frozen=True)
@@ -210,8 +215,8 @@ def _read_text(path: Path, read: Future[Lens]) -> StepText:
 def _measure_targets(lens: Lens, nominal: Nominal, effort: Effort, on_light: OnLight) -> list[tuple[Light, Lines]]:
     """Measure the light on each target, and the lines of a spectrum there; ValueError if a target gets no light."""
     found = []
-    for number, goal in enumerate(nominal.goals):
-        light = nominal.light(lens, goal, effort)
+    lights = nominal.lights(lens, nominal.goals, effort)
+    for number, (goal, light) in enumerate(zip(nominal.goals, lights, strict=True)):
         if not light.rrmsd >= 0:
             name = "lens.step" if nominal.scene.mount is None else "part.step"
             raise ValueError(f"{name}: none of its light falls on {goal.words}; write it again, or check scene.toml")

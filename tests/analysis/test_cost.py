@@ -23,6 +23,7 @@ class TestEnding:
         # t^-1/2 is 1.1 times its end at t / 1.21, to a step; the median of the last twentieth stands for the end
         assert found.last_tenth_seconds == pytest.approx(100 - 98 / 1.21, abs=1.5)
         assert found.last_tenth == pytest.approx(found.last_tenth_seconds / 104)
+        assert found.last_gain == pytest.approx(1 - 0.95**0.5)  # from 95 to 100 evaluations
 
     def test_a_curve_without_a_power_law_offers_no_halving(self):
         rests = ending(self.curve(lambda t: 0.03 + 0.3 * 0.8**t), self.STAGES)
@@ -31,6 +32,7 @@ class TestEnding:
         few = ending(self.curve(lambda t: 0.3 * t**-0.5, count=3), self.STAGES)
         assert rests.power < 0.01 and rests.last_tenth > 0.7 and noise.fit < 0.1
         assert rises.power == 0.0 and few.power is None
+        assert rises.last_gain == 0.0 and few.last_gain is None
         assert rests.halving is noise.halving is rises.halving is few.halving is None
         assert ending([(4.0, 0.4)], self.STAGES[:2]) is None and ending([], []) is None
 

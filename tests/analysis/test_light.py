@@ -24,10 +24,10 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import even_image, images
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.receivers import LevelPlane
+from bstcad.optics.source_images import even_image, images
 from bstcad.optics.surfaces import Plane, Sphere
 from tests.lenses import net
 

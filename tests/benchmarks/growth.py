@@ -169,7 +169,7 @@ def _start(m: int) -> Work:
 
     def begin() -> None:
         launch_tubes(light.source, light.through(lens), 2 * m)
-        local_weight(light.source, light.through(lens), scene.goals[0])
+        local_weight(light.source, light.through(lens), scene.goals)
 
     return begin
 

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from skimage import data
 
-from bstcad.optics.measure import Effort, rrmsd_by_rays
+from bstcad.optics.measure import Effort, rrmsds_by_rays
 from bstcad.optics.sides import as_pair, coarser, spread
 from bstcad.pipeline import design
 from bstcad.scene.scene import Scene, load
@@ -122,7 +122,7 @@ def measure(scene: Scene) -> dict[str, float]:
     began = time.process_time()
     made = design(scene, device="cpu")
     spent = time.process_time() - began
-    rrmsd = rrmsd_by_rays(made.lens, scene.verification_channels(), scene.goals[0], JUDGED)
+    [rrmsd] = rrmsds_by_rays(made.lens, scene.verification_channels(), scene.goals, JUDGED)
     return {"rrmsd": round(rrmsd, 5), "cpu_seconds": round(spent, 2)}
 
 

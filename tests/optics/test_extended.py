@@ -12,11 +12,12 @@ from bstcad.optics.collimated import Collimated
 from bstcad.optics.interfaces import cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels.forward import land
-from bstcad.optics.measure import Effort, images, measure, tubes_picture
+from bstcad.optics.measure import Effort, measure, tubes_picture
 from bstcad.optics.outlines import Circle
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Rays
 from bstcad.optics.receivers import LevelPlane
+from bstcad.optics.source_images import images
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import trace
 from tests.lenses import lens_of, net

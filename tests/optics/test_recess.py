@@ -70,7 +70,7 @@ def test_the_light_beside_the_dome_is_a_line_of_the_ledger(rays, half_angle):
         return min(r * r / (r * r + PLANE**2) / whole, 1.0)
 
     through = simulate if rays == "kernel" else simulate_plain
-    light = through([(1.0, Point(half_angle=half_angle), lens(), 1)], SCREEN, 400)
+    [light] = through([(1.0, Point(half_angle=half_angle), lens(), 1)], [SCREEN], 400)
     assert math.fsum(light.flux.values()) == pytest.approx(1, abs=1e-12)
     assert light.flux[UNDERSIDE] == pytest.approx(within(RIM) - within(EDGE), abs=3e-4)
     assert light.flux["missed the lens"] == pytest.approx(1 - within(RIM), abs=1e-3)
@@ -88,8 +88,8 @@ def test_a_source_in_the_dome_lights_no_underside():
 
 def test_the_kernel_traces_a_dome_as_the_plain_form_does(monkeypatch):
     source, wide = Point((0.5, -1.0, 1.0), half_angle=70.0), replace(lens(), outline=Rectangle(50.0, 40.0))
-    fast = simulate([(1.0, source, wide, 3)], SCREEN, 300)
-    plain = simulate_plain([(1.0, source, wide, 3)], SCREEN, 300)
+    [fast] = simulate([(1.0, source, wide, 3)], [SCREEN], 300)
+    [plain] = simulate_plain([(1.0, source, wide, 3)], [SCREEN], 300)
     torch.testing.assert_close(fast.box, plain.box, rtol=0, atol=1e-13)
     assert fast.flux == pytest.approx(plain.flux, abs=1e-12)
     x = torch.linspace(-15, 15, 40, dtype=torch.float64)

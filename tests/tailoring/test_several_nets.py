@@ -14,11 +14,11 @@ from bstcad.optics.goal import Goal
 from bstcad.optics.interfaces import Interface, Reflect, Refract
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import images
 from bstcad.optics.outlines import EVERYWHERE, Rectangle
 from bstcad.optics.passes import Pass, Passes
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
+from bstcad.optics.source_images import images
 from bstcad.optics.surfaces import Plane
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.machinability import active_bounds, enforce_bounds

@@ -13,7 +13,7 @@ from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import rrmsd_by_rays
+from bstcad.optics.measure import rrmsds_by_rays
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.tubes import collect
@@ -196,7 +196,7 @@ def test_two_pictures_are_met_together(tmp_path):
     said = []
     made = pipeline.design(scene, hooks=Hooks(progress=lambda *told: said.append(told[3])))
     assert [net.shape for net in made.lens.nets] == [(49, 49), (65, 65)]
-    assert all(rrmsd_by_rays(made.lens, scene.channels(), goal) < 0.03 for goal in scene.goals)
+    assert max(rrmsds_by_rays(made.lens, scene.channels(), scene.goals)) < 0.03
     assert any("convex solution" in text for text in said)
 
 
@@ -205,7 +205,7 @@ def test_a_front_alone_makes_a_picture(tmp_path):
     scene = scene.changed({"target.image": waves_of(0.0), "target.z": 60.0})
     made = pipeline.design(scene)
     assert not made.lens.back.heights.any() and made.lens.freeform == (0,)
-    assert rrmsd_by_rays(made.lens, scene.channels(), scene.goals[0]) < 0.1
+    assert rrmsds_by_rays(made.lens, scene.channels(), scene.goals)[0] < 0.1
 
 
 # ---- faults of scenes ------------------------------------------------------------------------------------------------

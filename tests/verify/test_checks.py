@@ -393,8 +393,8 @@ def test_light_that_is_unaccounted_for_fails(folder, nominal, monkeypatch):
     simulate = measure.simulate
 
     def leaky(*arguments):
-        found = simulate(*arguments)
-        return replace(found, flux=found.flux | {"missed the lens": found.flux["missed the lens"] - 1e-9})
+        [found] = simulate(*arguments)
+        return (replace(found, flux=found.flux | {"missed the lens": found.flux["missed the lens"] - 1e-9}),)
 
     monkeypatch.setattr(measure, "simulate", leaky)
     assert failing(checks.verify(folder, nominal)) == {"ledger"}
@@ -411,8 +411,8 @@ def test_rays_that_do_not_see_what_the_tubes_see_fail(folder, nominal, monkeypat
     simulate = measure.simulate
 
     def moved(*arguments):
-        found = simulate(*arguments)
-        return replace(found, box=found.box + 0.33 * (found.box.roll(1, 0) - found.box))
+        [found] = simulate(*arguments)
+        return (replace(found, box=found.box + 0.33 * (found.box.roll(1, 0) - found.box)),)
 
     effort = replace(FEW, rays=512)
     assert "tubes" not in failing(checks.verify(folder, nominal, effort=effort))

@@ -177,7 +177,7 @@ def test_light_with_an_edge_and_of_few_rays_is_traced_by_the_plain_form():
 def test_a_sum_of_lights_is_the_sum_of_their_simulations():
     """Each light has its own weight and seed; one call of the kernel traces all of them."""
     lit = [(0.3, *SCENES["point, plane"][:2], 3), (0.7, *SCENES["point, sphere"][:2], 4)]
-    found, plain = simulate(lit, SCREEN, 120), simulate_plain(lit, SCREEN, 120)
+    [found], [plain] = simulate(lit, [SCREEN], 120), simulate_plain(lit, [SCREEN], 120)
     parts = [simulated(source, lens, SCREEN, 120, seed) for _, source, lens, seed in lit]
     for one, other in ((found.box, plain.box), (found.tent, plain.tent)):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-12)
