@@ -65,8 +65,8 @@ def shown(merit):
 def by_rays(source, sets=6):
     """Independent pictures of sum 1, each from other points of the source."""
     seen = extended(source)
-    boxes = [simulated(lens(), seen.draw(128, seed), SCREEN, n=50, seed=seed).box for seed in range(sets)]
-    return [box / total(box) for box in boxes]
+    sets_of_rays = [simulated(lens(), seen.draw(128, seed), [SCREEN], n=50, seed=seed) for seed in range(sets)]
+    return [rays.box / total(rays.box) for [rays] in sets_of_rays]
 
 
 def off(pictures, other):
