@@ -209,9 +209,13 @@ def max_cells(lens: Lens, max_triangles: int | None = None) -> int:
 def is_closed(mesh: Mesh) -> bool:
     """True if each edge belongs to two triangles, once in each direction: watertight and wound consistently."""
     ends, others = mesh.faces.astype(np.int64), np.roll(mesh.faces, -1, axis=1).astype(np.int64)
-    count = len(mesh.vertices)
-    forward, backward = (np.sort((a * count + b).ravel()) for a, b in ((ends, others), (others, ends)))
-    return len(forward) > 0 and bool((np.diff(forward) > 0).all()) and np.array_equal(forward, backward)
+    # An edge's number: even in the direction from the vertex of smaller index to the other one, and odd in the reverse.
+    edges = 2 * (np.minimum(ends, others) * len(mesh.vertices) + np.maximum(ends, others)) + (ends > others)
+    edges = np.sort(edges.ravel())
+    smaller, larger = edges[::2], edges[1::2]
+    if len(edges) == 0 or len(edges) % 2:
+        return False
+    return bool((smaller % 2 == 0).all() and (larger == smaller + 1).all() and (smaller[1:] > larger[:-1]).all())
 
 
 def volume_and_area(mesh: Mesh) -> tuple[float, float]:

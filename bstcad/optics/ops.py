@@ -28,6 +28,7 @@ KERNELS: dict[str, dict[str, str | Callable[..., Any]]] = {
     "trace.through": {"cpu": "crossing.landed"},
     "trace.simulate": {"cpu": "forward.simulate"},  # the whole path, from the source to the receiver
     "trace.land": {"cpu": "forward.land"},  # the whole path of single rays
+    "tubes.search": {"cpu": "search.search"},  # rays of sources through a front to given points
     "tubes.collect": {"cpu": "clip.Clip.apply"},
     "reductions.dot": {"cpu": "reductions.dot_of_arrays"},
 }
@@ -36,6 +37,7 @@ DTYPES = (torch.float32, torch.float64)  # precisions that the kernels support
 SURFACE_FORMS = {"bspline": "net", "plane": "revolved", "sphere": "revolved", "conic": "revolved"}
 # Sequences of interfaces that these kernels trace, each interface as (its form, True if it reflects).
 WHOLE_PATHS = [("net", True)], [("revolved", False), ("net", False)]
+FRONTS = [path[:-1] for path in WHOLE_PATHS]  # interfaces before the last face of these paths
 
 
 def kernel(name: str, *tensors: Tensor) -> Callable[..., Any] | None:
@@ -49,10 +51,18 @@ def kernel(name: str, *tensors: Tensor) -> Callable[..., Any] | None:
 
 def whole_kernel(name: str, interfaces: Sequence[Any]) -> Callable[..., Any] | None:
     """Return kernel `name` of KERNELS for rays across all these Interfaces; None: no kernel supports them."""
-    path = [(SURFACE_FORMS.get(interface.surface.kind), interface.law.reverses) for interface in interfaces]
-    if path not in WHOLE_PATHS or not all(loss.fused for interface in interfaces for loss in interface.losses):
+    if _forms(interfaces) not in WHOLE_PATHS or not all(loss.fused for each in interfaces for loss in each.losses):
         return None
     return kernel(name, interfaces[-1].surface.heights)
+
+
+def front_kernel(name: str, before: Sequence[Any], *tensors: Tensor) -> Callable[..., Any] | None:
+    """Return kernel `name` for rays across the Interfaces before a face, without losses; None: none supports them."""
+    return kernel(name, *tensors) if _forms(before) in FRONTS else None
+
+
+def _forms(interfaces: Sequence[Any]) -> list[tuple[str | None, bool]]:
+    return [(SURFACE_FORMS.get(interface.surface.kind), interface.law.reverses) for interface in interfaces]
 
 
 @functools.cache

@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from bstcad.optics import ops
 from bstcad.optics.emitters import Emitter
-from bstcad.optics.interfaces import cross
+from bstcad.optics.interfaces import Interface, cross
 from bstcad.optics.irradiance import Scale, Screen, scaled
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
@@ -41,6 +42,7 @@ MAX_BROYDEN_STEPS = 30  # maximum number of Broyden steps of `rays_to`
 RAY_TOLERANCE = 1e-8  # distance of rays from their points at which the search ends, as a fraction of the grid's extent
 RELATIVE_DIFFERENCE_STEP = 1e-6  # step of the difference quotients of `rays_to`, as a fraction of the grid's extent
 MIN_BROYDEN_DIVISOR = 0.1  # divisor of a Broyden update, relative to the squared step, up to which there is no update
+MIN_ARRIVAL_COSINE = 1e-3  # smallest cosine with the axis by which a height is divided
 
 PIXELS: Scale = (0.0, 0.0, 1.0, 1.0)  # scale of corners in pixels
 
@@ -286,47 +288,102 @@ def rays_to(
     source: one source, or k sources, whose results have the shape (k, rows, columns).  number: number of the interface;
     None: the back.  Returns x and y (mm) at which the rays cross the vertex plane of the first surface, and the rays at
     the interface, not yet deflected; rays that are not found there are lost.
-
-    Broyden's method starts from a Jacobian of difference quotients.  On a fine grid the initial points and Jacobian
-    are interpolated from the solution on a coarse grid.
     """
     x, y = (p.to(lens.like.device) for p in (x, y))
     number = lens.number_of("back") if number is None else number
     face = lens.interfaces[number].surface
     z = face.relative_sag_and_slope(x.to(lens.like), y.to(lens.like))[0].double()
+    sources: Sequence[Emitter] = (source,) if isinstance(source, Emitter) else source
     if not isinstance(source, Emitter):
-        x, y, z = (t.expand(len(source), *t.shape[-2:]) for t in (x, y, z))
+        x, y, z = (t.expand(len(sources), *t.shape[-2:]) for t in (x, y, z))
     extent = float(torch.maximum(x.max() - x.min(), y.max() - y.min()))
-    path = replace(lens.to(x.dtype).unbounded(), losses=None)  # in the precision of x and y
-    before = path.interfaces[:number]
+    before = replace(lens.to(x.dtype).unbounded(), losses=None).interfaces[:number]  # in the precision of x and y
+    path = Path(tuple(sources), before, lens.entrance.z, z=face.z, sense=lens.passes.sense, extent=extent)
+    found = path.search(x, y, z)
+    status = found.rays.lose(found.error > 1e3 * path.tolerance, Status.VIGNETTED)
+    return found.x, found.y, replace(found.rays, position=torch.stack([x, y, z]), z=face.z, status=status)
 
-    def arrive(p: Tensor, q: Tensor, height: Tensor) -> Rays:
-        rows = _rows_at_a_time(p[..., 0, :].numel())
-        if p.shape[-2] <= rows:
-            return arrive_band(p, q, height)
-        bands = (slice(first, first + rows) for first in range(0, p.shape[-2], rows))
-        return joined((arrive_band(*(t[..., band, :] for t in (p, q, height))) for band in bands), p.shape[-2])
 
-    def arrive_band(p: Tensor, q: Tensor, height: Tensor) -> Rays:
-        rays = functools.reduce(behind, before, _launched(source, p, q, lens.entrance.z))
-        ahead = (rays.sense * rays.direction[2]).clamp(min=1e-3)
-        s = rays.sense * (height - rays.above(face.z)) / ahead
+class Found(NamedTuple):
+    """Rays that a search found; (rows, columns) for one source, (k, rows, columns) for k sources."""
+
+    x: Tensor  # points (mm) at which they cross the vertex plane of the first surface
+    y: Tensor
+    rays: Rays  # rays at the heights
+    error: Tensor  # largest distance (mm) in x and y from the wanted points before the last step; 0 for lost rays
+
+
+@dataclass(frozen=True)
+class Path:
+    """Light of one source, or of k sources, on its way to heights over the plane of a face."""
+
+    sources: tuple[Emitter, ...]
+    before: Sequence[Interface]  # interfaces before the face, unbounded and without losses
+    start: float  # z (mm) of the vertex plane of the first surface, through whose points rays are launched
+    z: float  # z (mm) of the plane of the face
+    sense: int  # +1 or -1, direction of the light along z
+    extent: float  # extent (mm) of the grid of points
+
+    @property
+    def tolerance(self) -> float:
+        """Distance of rays from their points (mm) at which the search ends."""
+        return RAY_TOLERANCE * self.extent
+
+    @property
+    def step(self) -> float:
+        """Step of the difference quotients (mm)."""
+        return RELATIVE_DIFFERENCE_STEP * self.extent
+
+    def search(self, x: Tensor, y: Tensor, height: Tensor) -> Found:
+        """Find the rays that meet the points (x, y) at heights over the plane of the face (mm).
+
+        x, y, height: (rows, columns) for one source, (k, rows, columns) for k sources.
+        """
+        fast = ops.front_kernel("tubes.search", self.before, x) if x.dtype == torch.float64 else None
+        if fast is not None and all(source.beam(self.start) is not None for source in self.sources):
+            return fast(self, x=x, y=y, height=height)
+        return search_plain(self, x, y, height)
+
+    def arrive(self, x: Tensor, y: Tensor, height: Tensor) -> Rays:
+        """Trace rays through points (x, y) of the first vertex's plane to the heights, in plain torch."""
+        rows = _rows_at_a_time(x[..., 0, :].numel())
+        if x.shape[-2] <= rows:
+            return self._arrive_band(x, y, height)
+        bands = (slice(first, first + rows) for first in range(0, x.shape[-2], rows))
+        return joined((self._arrive_band(*(t[..., band, :] for t in (x, y, height))) for band in bands), x.shape[-2])
+
+    def _arrive_band(self, x: Tensor, y: Tensor, height: Tensor) -> Rays:
+        if x.ndim == 2:
+            [source] = self.sources
+            rays = source.rays(x, y, self.start, 1.0)
+        else:
+            points = zip(self.sources, x, y, strict=True)
+            rays = stacked([source.rays(p, q, self.start, 1.0) for source, p, q in points])
+        rays = functools.reduce(behind, self.before, rays)
+        s = rays.sense * (height - rays.above(self.z)) / (rays.sense * rays.direction[2]).clamp(min=MIN_ARRIVAL_COSINE)
         return replace(rays, position=rays.position + s * rays.direction)
 
-    jacobian = functools.partial(_inverse_jacobian, arrive, RELATIVE_DIFFERENCE_STEP * extent)
+
+def search_plain(path: Path, x: Tensor, y: Tensor, height: Tensor) -> Found:
+    """Find rays as `Path.search` does, in plain torch.
+
+    Broyden's method starts from a Jacobian of difference quotients.  On a fine grid the initial points and Jacobian
+    are interpolated from the solution on a coarse grid.
+    """
+    jacobian = functools.partial(_inverse_jacobian, path.arrive, path.step)
     p, q = x, y
     inverse: list[Tensor] | None = None
     last: tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]] | None = None  # step, and distance left before it
     # for light along the axis, x and y are the solution
     sides = x.shape[-2:]
-    if max(sides) > 2 * COARSE_GRID_POINTS and not arrive(*(t[..., :1, :1] for t in (x, y, z))).axial:
+    if max(sides) > 2 * COARSE_GRID_POINTS and not path.arrive(*(t[..., :1, :1] for t in (x, y, height))).axial:
         lines = tuple(torch.linspace(0, n - 1, min(n, COARSE_GRID_POINTS)).round().long() for n in sides)
-        c_x, c_y, c_z = (t[..., lines[0][:, None], lines[1]] for t in (x, y, z))
-        c_p, c_q, c_hit = rays_to(source, lens, x=c_x, y=c_y, number=number)
-        inverse = [_interpolate(lines, sides, t) for t in jacobian(c_hit, c_p, c_q, c_z)]
-        p, q = (_interpolate(lines, sides, t) for t in (c_p, c_q))
+        coarse = [t[..., lines[0][:, None], lines[1]] for t in (x, y, height)]
+        few = search_plain(path, *coarse)
+        inverse = [_interpolate(lines, sides, t) for t in jacobian(few.rays, few.x, few.y, coarse[2])]
+        p, q = (_interpolate(lines, sides, t) for t in (few.x, few.y))
     for _ in range(MAX_BROYDEN_STEPS):
-        hit = arrive(p, q, z)
+        hit = path.arrive(p, q, height)
         off_x, off_y = x - hit.position[0], y - hit.position[1]
         error = torch.where(hit.alive, torch.maximum(off_x.abs(), off_y.abs()), torch.zeros_like(x))
         if not bool(error.any()):
@@ -334,21 +391,12 @@ def rays_to(
         if last is not None and inverse is not None:
             step, (last_x, last_y) = last
             inverse = _broyden_update(inverse, step, (last_x - off_x, last_y - off_y))
-        xx, xy, yx, yy = inverse = inverse or jacobian(hit, p, q, z)
+        xx, xy, yx, yy = inverse = inverse or jacobian(hit, p, q, height)
         step = xx * off_x + xy * off_y, yx * off_x + yy * off_y
         p, q, last = p + step[0], q + step[1], (step, (off_x, off_y))
-        if float(error.max()) <= RAY_TOLERANCE * extent:
+        if float(error.max()) <= path.tolerance:
             break
-    position = torch.stack([x, y, z])
-    status = hit.lose(error > 1e3 * RAY_TOLERANCE * extent, Status.VIGNETTED)
-    return p, q, replace(hit, position=position, z=face.z, status=status)
-
-
-def _launched(source: Emitter | Sequence[Emitter], p: Tensor, q: Tensor, z: float) -> Rays:
-    """Return the rays of a source through points (p, q) of the plane z (mm), or those of each of k sources."""
-    if isinstance(source, Emitter):
-        return source.rays(p, q, z, 1.0)
-    return stacked([each.rays(x, y, z, 1.0) for each, x, y in zip(source, p, q, strict=True)])
+    return Found(p, q, hit, error)
 
 
 def _inverse_jacobian(

@@ -251,7 +251,7 @@ def _points(cells, i, j, count, work):
 
 
 @njit(error_model="numpy")
-def _launch(beam, count, work):
+def launch(beam, count, work):
     """Store flux density and direction of the rays through the points, as `source.irradiance` and `source.rays` do."""
     for r in range(count):
         x, y = work[X + r] - beam.x, work[Y + r] - beam.y
@@ -276,7 +276,7 @@ def _launch(beam, count, work):
 
 
 @njit(error_model="numpy")
-def _tilt(beam, count, work):
+def tilt(beam, count, work):
     """Replace the flux density for light along z by that of a tilted point source."""
     for r in range(count):
         x, y = work[X + r] - beam.x, work[Y + r] - beam.y
@@ -310,7 +310,7 @@ def _look_up(peak, table, count, work):
 
 
 @njit(error_model="numpy")
-def _meet_front(faces, axial, count, work):
+def meet_front(faces, axial, count, work):
     """Move rays to the front as `interfaces.intersect` does: by `Conic.crossing`, or along the axis by the sag."""
     c, conic, min_cos2 = faces.curvature, 1.0 + faces.conic_constant, faces.rules.min_cos2
     for r in range(count):
@@ -345,9 +345,9 @@ def _trace(net, beam, faces, tilted, losses, count, work, active):
     if beam.table.m > 0:
         _look_up(beam.peak, beam.table, count, work)
     else:
-        _launch(beam, count, work)
+        launch(beam, count, work)
     if beam.tilted == 1 and beam.distance > 0.0:
-        _tilt(beam, count, work)
+        tilt(beam, count, work)
     if faces.reflects:  # there is no front: rays start at the source
         for r in range(count):
             work[FATE + r] = 0.0
@@ -358,7 +358,7 @@ def _trace(net, beam, faces, tilted, losses, count, work, active):
                 work[X + r] -= beam.start * (work[DX + r] / work[DZ + r])
                 work[Y + r] -= beam.start * (work[DY + r] / work[DZ + r])
     else:
-        _meet_front(faces, beam.distance == 0.0 and beam.tilted == 0, count, work)
+        meet_front(faces, beam.distance == 0.0 and beam.tilted == 0, count, work)
         if losses.present:
             cosines(COS_FRONT, count, work)
         refract(1.0 / faces.eta, faces.fates.reflected, count, work)

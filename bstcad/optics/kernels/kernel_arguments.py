@@ -75,6 +75,16 @@ def faces(
     return numbers, _tilted(plane, sense, -sense if law.reverses else sense)
 
 
+def front_face(before: Sequence[Interface], sense: int) -> records.FrontFace:
+    """Return the face in front of a net as numbers; before: this face, or nothing."""
+    numbers, fates = [0.0, 0.0, *3 * [math.inf], 1.0], [Status.MISSED_FRONT] * 4
+    for face in before:
+        form = floats([sense * face.surface.curvature, face.surface.conic_constant])
+        numbers = [*form, *face.outline.limits, face.law.eta]
+        fates = [*2 * [face.status_if_missed], face.law.status_if_blocked, Status.TURNED_BACK]
+    return records.FrontFace._make([len(before), *floats(numbers), rules(), Fates(*floats(fates))])
+
+
 def screens(interface: Interface, planes: Sequence[Receiver], sense: int) -> Screens:
     """Return the planes behind a net as numbers; sense: of the light before the net."""
     behind, z = -sense if interface.law.reverses else sense, interface.net.z

@@ -136,6 +136,20 @@ class Faces(NamedTuple):
     fates: Fates
 
 
+class FrontFace(NamedTuple):
+    """Face in front of a net as numbers, by the names of `Faces`, in the frame in which light starts along +z."""
+
+    present: int  # 1: there is such a face; 0: light comes from the source to the net
+    curvature: float  # curvature of the face (1/mm)
+    conic_constant: float
+    front_x: float  # outlines.Limits of its clear aperture (mm, mm, mm²)
+    front_y: float
+    front_r2: float
+    eta: float  # relative index η = n_in / n_out at the face
+    rules: Rules
+    fates: Fates
+
+
 class RayCells(NamedTuple):
     """Grid of n x n cells with a ray in each."""
 
