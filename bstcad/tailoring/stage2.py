@@ -51,7 +51,7 @@ DENSE_ROUNDS, DENSE_TUBES = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08)), 2.5
 # Rounds if, of these, the first has fewer than DENSE_TUBES tubes per cell, for a lens without bounds on its shape.  The
 # last round corrects what the others distort between the tubes; these end on the plateau FEW_TUBES.  (RRMSD 0.0233 of
 # letters after 70 evaluations and 0.0443 of a portrait after 55; 0.0235 and 0.0443 after 98 in DENSE_ROUNDS.)
-SHORT_ROUNDS, FEW_TUBES = ((1 / 2, 0.34), (3 / 4, 0.22), (1.0, 0.10)), Plateau(5, 0.05)
+SHORT_ROUNDS, FEW_TUBES = ((1 / 2, 0.37), (2 / 3, 0.21), (1.0, 0.16)), Plateau(5, 0.05)
 # Rounds if the last one has fewer than DENSE_TUBES tubes per cell.  The first rounds then distort the net between the
 # tubes, and the last one has to correct this, with MAX_TUBES tubes per side or fewer, since more need much memory; if
 # these are too few, with as many as the settings state.  (1025 control points, portrait: RRMSD 0.0175 after 54
