@@ -1,7 +1,7 @@
 """Fused CPU kernel (numba) behind `tubes.Path.search`: rays of sources that meet given points behind a front.
 
 Blocks of rays go through the steps of forward.py (launch, front face) and on to their heights.  Broyden's method takes
-steps of all rays of a block until their largest error is below the tolerance; the plain form has steps of all rays.
+steps for all rays of a block until their largest error is below the tolerance.  The plain form does so for all rays.
 """
 
 from __future__ import annotations
