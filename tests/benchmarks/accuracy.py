@@ -38,6 +38,7 @@ from bstcad.report.drawing import new_figure, png, styled
 from bstcad.runs import environment, files
 from bstcad.scene.scene import load
 from bstcad.sweep.cold_run import REFERENCE_EFFORT, round_numbers
+from bstcad.sweep.prediction import pace
 from bstcad.sweep.results import draw_legend, draw_runs
 from tests import markdown
 from tests.benchmarks import growth
@@ -257,16 +258,36 @@ def write(recorded: Mapping[str, Any]) -> None:
     files.put(PAGE, page(recorded).encode())
 
 
+def pace_now() -> float:
+    """Return the pace of the machine, measured at each call."""
+    pace.cache_clear()
+    return pace()
+
+
+def at_usual_speed(design: Record) -> Record:
+    """Return a record whose times are divided by the pace of the machine on which they were measured, where known."""
+    times = {name: design[name] for name in ("seconds", "cpu_seconds") if design[name] is not None}
+    return design | {name: time / design["recorded"].get("pace", 1.0) for name, time in times.items()}
+
+
 def page(recorded: Mapping[str, Any]) -> str:
     """Return the page, each record marked by its day and a letter for its machine and versions."""
+    designs = {scene: {quality: at_usual_speed(found) for quality, found in entries.items()}
+               for scene, entries in recorded["designs"].items()}  # fmt: skip
+    recorded = {**recorded, "designs": designs}
     every = [entry for scene in recorded["designs"].values() for entry in scene.values()]
     every += [*recorded["sweeps"].values(), recorded["mitsuba"], recorded["growth"]]
     circumstances = sorted({_circumstances(entry) for entry in every})
     marks = {each: f"{each[0]} ({chr(ord('a') + k)})" for k, each in enumerate(circumstances)}
     names = ("date", "version", "machine", "versions", "busy")
+    paces: dict[str, list[float]] = {mark: [] for mark in marks.values()}
+    for entry in every:
+        if "pace" in entry["recorded"]:
+            paces[marks[_circumstances(entry)]].append(entry["recorded"]["pace"])
     return markdown.page(
         TEXT, recorded, mark=lambda record: marks[_circumstances(record)], halving=halving, busy=BUSY, peer=PEER,
-        records={mark: dict(zip(names, each, strict=True)) for each, mark in marks.items()}, qualities=QUALITIES,
+        records={mark: dict(zip(names, each, strict=True)) | {"paces": sorted(paces[mark])}
+                 for each, mark in marks.items()}, qualities=QUALITIES,
         scenes=SCENES, figures=FIGURES,
     )  # fmt: skip
 
@@ -292,7 +313,8 @@ def figure(recorded: Mapping[str, Any], scene: str) -> Any:
     sweep = _named(recorded["sweeps"][scene])
     points = _named(recorded["mitsuba"]["points"]) if scene == PEER else []
     paper = recorded["designs"][scene].get("paper")  # by itself: few budgets last for it
-    papers = [*(preset for preset in sweep.presets if preset.name == "paper"), *([_named(paper)] if paper else [])][:1]
+    single = [_named(at_usual_speed(paper))] if paper else []
+    papers = [*(preset for preset in sweep.presets if preset.name == "paper"), *single][:1]
     sweep.presets = [preset for preset in sweep.presets if preset.name != "paper"]
     ends = [Named(seconds=s, rrmsd=e) for s, e in zip(sweep.range.seconds, sweep.range.rrmsd, strict=True)]
     sweep.front_runs = sorted(sweep.front, key=lambda run: run.seconds)
@@ -357,8 +379,9 @@ def main() -> None:
         return
     for name in wanted(all_pieces, asked.only, recorded):
         print(f"recording {name}, about {all_pieces[name].minutes:.1f} min", flush=True)
-        when = circumstances() | {"others": round(psutil.cpu_percent(WATCHED) / 100, 2)}
-        record = all_pieces[name].record() | {"recorded": when}
+        when, before = circumstances() | {"others": round(psutil.cpu_percent(WATCHED) / 100, 2)}, pace_now()
+        record = all_pieces[name].record()
+        record |= {"recorded": when | {"pace": (before + pace_now()) / 2}}
         recorded = known()
         all_pieces[name].keep(recorded, record)
         put(recorded)
