@@ -48,10 +48,11 @@ from bstcad.tailoring.source_image import ExtendedSource
 RoundFractions = tuple[tuple[float, float], ...]  # (tubes per side, evaluations) of rounds, relative to the settings
 # Rounds if the last one has DENSE_TUBES tubes or more per cell of the control net along each axis.
 DENSE_ROUNDS, DENSE_TUBES = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08)), 2.5
-# Rounds if, of these, the first has fewer than DENSE_TUBES tubes per cell, for a lens without bounds on its shape.  The
-# last round corrects what the others distort between the tubes; these end on the plateau FEW_TUBES.  (RRMSD 0.0225 of
-# letters after 73 evaluations and 0.0439 of a portrait after 58; 0.0227 and 0.0447 after 98 in DENSE_ROUNDS.)
-SHORT_ROUNDS, FEW_TUBES = ((1 / 2, 0.37), (2 / 3, 0.21), (1.0, 0.16)), Plateau(5, 0.05)
+# Rounds if, of these, the first has fewer than DENSE_TUBES tubes per cell, for a lens without bounds on its shape and at
+# most SHORT_EVALUATIONS.  The last round corrects what the others distort between the tubes; these end on the plateau
+# FEW_TUBES.  (RRMSD 0.0225 of letters after 73 evaluations and 0.0439 of a portrait after 58; 0.0227 and 0.0447 after 98
+# in DENSE_ROUNDS.  With 300 evaluations, as in fine quality, the short rounds end at 0.0168 instead of 0.0148.)
+SHORT_ROUNDS, FEW_TUBES, SHORT_EVALUATIONS = ((1 / 2, 0.37), (2 / 3, 0.21), (1.0, 0.16)), Plateau(5, 0.05), 150
 # Rounds if the last one has fewer than DENSE_TUBES tubes per cell.  The first rounds then distort the net between the
 # tubes, and the last one has to correct this, with MAX_TUBES tubes per side or fewer, since more need much memory; if
 # these are too few, with as many as the settings state.  (1025 control points, portrait: RRMSD 0.0175 after 54
@@ -214,8 +215,9 @@ def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Steps:
 def _fine_round(task: Task, tubes: int, evaluations: int, is_last: bool) -> TubeRound:
     resolved = resolves_net(task)
     few = tubes < DENSE_TUBES * task.knobs.side
+    ends_early = resolved and few and task.knobs.stage2_iterations <= SHORT_EVALUATIONS
     return TubeRound(
-        task, tubes, evaluations, plateau=FEW_TUBES if resolved and few else PLATEAU, resolved=resolved,
+        task, tubes, evaluations, plateau=FEW_TUBES if ends_early else PLATEAU, resolved=resolved,
         ends_distorted=len(task.goals) > 1 and not task.preview and not is_last,
     )  # fmt: skip
 
@@ -247,6 +249,7 @@ def round_shares(task: Task) -> RoundFractions | None:
         return ((1.0, 1.0),)
     if not task.several:
         few = DENSE_ROUNDS[0][0] * task.knobs.rays < DENSE_TUBES * task.knobs.side  # in the first round
+        few = few and task.knobs.stage2_iterations <= SHORT_EVALUATIONS
         return SHORT_ROUNDS if few and resolves_net(task) else None
     if len(task.goals) == 1:
         return WAVEFRONT_ROUNDS

@@ -264,29 +264,47 @@ def pace_now() -> float:
     return pace()
 
 
-def at_usual_speed(design: Record) -> Record:
-    """Return a record whose times are divided by the pace of the machine on which they were measured, where known."""
-    times = {name: design[name] for name in ("seconds", "cpu_seconds") if design[name] is not None}
-    return design | {name: time / design["recorded"].get("pace", 1.0) for name, time in times.items()}
+def at_usual_speed(recorded: Mapping[str, Any]) -> Record:
+    """Return the designs with times divided by the median pace of their machine on that day, where known.
+
+    The speed of a virtual machine changes from minute to minute, so the pace beside a single run is less certain.
+    """
+    paces = _paces(_entries(recorded))
+
+    def corrected(design: Record) -> Record:
+        times = {name: design[name] for name in ("seconds", "cpu_seconds") if design[name] is not None}
+        usual = float(np.median(paces.get(_circumstances(design), [1.0])))
+        return design | {name: time / usual for name, time in times.items()}
+
+    return {scene: {quality: corrected(found) for quality, found in entries.items()}
+            for scene, entries in recorded["designs"].items()}  # fmt: skip
+
+
+def _entries(recorded: Mapping[str, Any]) -> list[Record]:
+    every = [entry for scene in recorded["designs"].values() for entry in scene.values()]
+    return [*every, *recorded["sweeps"].values(), recorded["mitsuba"], recorded["growth"]]
+
+
+def _paces(entries: Sequence[Record]) -> dict[tuple[str, str, str, str, bool], list[float]]:
+    """Return the paces, ascending, of the records of each day, machine and version."""
+    found: dict[tuple[str, str, str, str, bool], list[float]] = {}
+    for entry in entries:
+        if "pace" in entry["recorded"]:
+            found.setdefault(_circumstances(entry), []).append(entry["recorded"]["pace"])
+    return {key: sorted(each) for key, each in found.items()}
 
 
 def page(recorded: Mapping[str, Any]) -> str:
     """Return the page, each record marked by its day and a letter for its machine and versions."""
-    designs = {scene: {quality: at_usual_speed(found) for quality, found in entries.items()}
-               for scene, entries in recorded["designs"].items()}  # fmt: skip
-    recorded = {**recorded, "designs": designs}
-    every = [entry for scene in recorded["designs"].values() for entry in scene.values()]
-    every += [*recorded["sweeps"].values(), recorded["mitsuba"], recorded["growth"]]
+    every = _entries(recorded)
+    paces = _paces(every)
+    recorded = {**recorded, "designs": at_usual_speed(recorded)}
     circumstances = sorted({_circumstances(entry) for entry in every})
     marks = {each: f"{each[0]} ({chr(ord('a') + k)})" for k, each in enumerate(circumstances)}
     names = ("date", "version", "machine", "versions", "busy")
-    paces: dict[str, list[float]] = {mark: [] for mark in marks.values()}
-    for entry in every:
-        if "pace" in entry["recorded"]:
-            paces[marks[_circumstances(entry)]].append(entry["recorded"]["pace"])
     return markdown.page(
         TEXT, recorded, mark=lambda record: marks[_circumstances(record)], halving=halving, busy=BUSY, peer=PEER,
-        records={mark: dict(zip(names, each, strict=True)) | {"paces": sorted(paces[mark])}
+        records={mark: dict(zip(names, each, strict=True)) | {"paces": paces.get(each, [])}
                  for each, mark in marks.items()}, qualities=QUALITIES,
         scenes=SCENES, figures=FIGURES,
     )  # fmt: skip
@@ -312,8 +330,8 @@ def figure(recorded: Mapping[str, Any], scene: str) -> Any:
     """Draw a sweep as `results.draw_runs` draws a Table, with room for the paper's procedure and Mitsuba's run."""
     sweep = _named(recorded["sweeps"][scene])
     points = _named(recorded["mitsuba"]["points"]) if scene == PEER else []
-    paper = recorded["designs"][scene].get("paper")  # by itself: few budgets last for it
-    single = [_named(at_usual_speed(paper))] if paper else []
+    paper = at_usual_speed(recorded)[scene].get("paper")  # by itself: few budgets last for it
+    single = [_named(paper)] if paper else []
     papers = [*(preset for preset in sweep.presets if preset.name == "paper"), *single][:1]
     sweep.presets = [preset for preset in sweep.presets if preset.name != "paper"]
     ends = [Named(seconds=s, rrmsd=e) for s, e in zip(sweep.range.seconds, sweep.range.rrmsd, strict=True)]
