@@ -25,16 +25,17 @@ AT_TOP = {
     "commands": {"commands", "api", "cli"},  # for scripts and for the terminal
 }
 ENGINE = {
-    "runs", "scene", "optics", "step_text", "transport", "tailoring", "baselines", "cad", "analysis", "verify",
-    "judges", "measured", "report",
+    "runs", "scene", "optics", "photometry", "step_text", "transport", "tailoring", "baselines", "cad", "analysis",
+    "verify", "judges", "measured", "report",
 }  # fmt: skip
 # A part of the package, and the parts it may import besides itself.
 MAY_IMPORT = {
     "runs": {"bstcad"},  # the ground: files, processes, signals, checkpoints; it knows no lens
     "step_text": {"runs"},
     "optics": set(),
+    "photometry": set(),
     "transport": set(),
-    "scene": {"runs", "optics", "step_text"},
+    "scene": {"runs", "optics", "photometry", "step_text"},
     "tailoring": {"scene", "optics", "transport"},
     "baselines": {"scene", "optics", "transport", "tailoring"},
     "cad": {"runs", "scene", "optics", "step_text"},

@@ -1,0 +1,1 @@
+"""Photometric files of lamps and luminaires: intensities over directions."""
