@@ -32,6 +32,7 @@ from bstcad.optics.surfaces import Sphere
 from bstcad.report.figure_jobs import NoPictures
 from bstcad.scene.blank import as_front, net_extent
 from bstcad.scene.errors import SceneError
+from bstcad.scene.lamp import IntensityFile
 from bstcad.sweep.plan import plan
 from bstcad.sweep.prediction import Pilot, pilot_scene, run_pilot, typical_seconds, with_quality
 from tests.conftest import verify_with
@@ -61,6 +62,14 @@ def beam(**more):
     return source
 
 
+def measured(chosen):
+    """The picture of a beam, brighter to a side, that is wider than every rim."""
+    x, y = np.meshgrid(np.linspace(-15, 15, 64), np.linspace(15, -15, 64))
+    light = np.exp(-2 * (x**2 + y**2) / 11.0**2) * (1 + 0.02 * x)
+    profile = {"image": light, "width": 30.0, "origin": "picture"}
+    return beam()(chosen) | {"source.profile": profile}
+
+
 def lamp(**more):
     def source(chosen):
         position = [0.0, 0.0, BEFORE if "mirror" in chosen["front"] else -BEFORE]
@@ -71,6 +80,17 @@ def lamp(**more):
 
 def wall(x, y, tilt=(0.0, 0.0)):
     return {"target.x": x, "target.y": y, "target.tilt": list(tilt)}
+
+
+def directions(chosen):
+    """Radiant intensity over the angles that the square wall has."""
+    ends = [-14.0, 14.0]
+    return {"target.kind": "intensity", "target.z": None, "target.x": ends, "target.y": ends}
+
+
+def part(chosen):
+    """A wall, or angles, that go on beyond the 48 degrees by which glass turns light at most."""
+    return {"target.x": [-18.0, 62.0 if chosen["wall"] == "directions" else 130.0]}
 
 
 def photo(chosen):
@@ -104,6 +124,10 @@ def cut(chosen):
 def two(chosen):
     """A second wall, twice as far away, where light goes on that fills the lens and the first one."""
     own = changes_of(chosen, "targets")
+    if chosen["wall"] == "directions":
+        shown = {key.removeprefix("target."): own[key] for key in own if key.startswith("target.")}
+        far = {key: value for key, value in {**SMALL["target"], **shown}.items() if key != "z"}
+        return {"target": [far, {key: value for key, value in far.items() if key != "kind"} | {"z": BACK + THROW}]}
     near = SMALL["target"] | {key.removeprefix("target."): own[key] for key in own if key.startswith("target.")}
     further = -THROW if chosen["elements"] == "fold mirror behind" else THROW
     halves = zip("xy", (side / 2 for side in SIZES[chosen["rim"]]), strict=True)
@@ -134,11 +158,15 @@ def front(**more):
 CHOICES = {
     "light": {
         "laser": beam(),
-        "Gaussian beam": beam(profile="gaussian", radius_1e2=8.0),
+        "Gaussian beam": beam(profile="gaussian", radius_1e2=[9.0, 7.0], rotate=20.0),
+        "measured beam": measured,
         "tilted beam": beam(tilt=[2.0, -3.0]),
         "sun": beam(divergence=0.53),
         "point": lamp(),
         "cone": lamp(profile="uniform", half_angle=12.0),
+        "intensity file": lamp(
+            intensity=IntensityFile("lamp.csv", b"g,0,90,180,270\n0,9,9,9,9\n20,8,7,6,7\n60,0,0,0,0\n")
+        ),
         "round LED": lamp(diameter=1.0),
         "chip": lamp(width=1.0, height=0.5),
         "spectrum": beam(wavelength=[[486.1, 1.0], [656.3, 1.0]]),
@@ -150,6 +178,7 @@ CHOICES = {
         "tall": wall([-12.0, 12.0], [-24.0, 24.0]),
         "off axis": wall([4.0, 36.0], [-14.0, 18.0]),
         "tilted": wall([-18.0, 18.0], [-18.0, 18.0], tilt=(12.0, -18.0)),
+        "directions": directions,
     },
     "picture": {
         "letters": {"target.text": "HI"},
@@ -199,7 +228,7 @@ CHOICES = {
     "precision": {"float64": {}, "float32": {"tailoring.precision": "float32"}},
     "accuracy": {"none": {}, "asked": {"tailoring.accuracy": 0.3}},
     "time": {"none": {}, "limited": {"tailoring.max_time": 100.0}},
-    "reach": {"whole": {}, "part": {"target.x": [-18.0, 130.0]}},  # glass turns light by 48 degrees at most
+    "reach": {"whole": {}, "part": part},
     "targets": {"one": {}, "two": two},
 }
 PLAIN = {choice: next(iter(values)) for choice, values in CHOICES.items()}
@@ -218,13 +247,16 @@ REFUSED = (  # the least sets of values that no scene has together
         for wave in ("plane", "sphere")
     ),
     {("rim", "circle"), ("net", "pair")},
+    *({("wall", "directions"), ("elements", each)} for each in ("window behind", "fold mirror behind")),
+    *({("wall", "directions"), ("wavefront", wave)} for wave in ("plane", "sphere")),
+    {("wall", "directions"), ("targets", "two")},
     *({("elements", "fold mirror behind"), ("wavefront", wave)} for wave in ("plane", "sphere")),
     *({("front", "mirror"), ("effects", effect)} for effect in ("coating", "absorption", "ghost")),
     {("front", "mirror behind glass"), ("effects", "ghost")},
 )
 NAMED = {  # the key of a choice, as the sentence of a refusal has it
     "light": "source.", "wavefront": "wavefront", "rim": "lens.outline", "net": "lens.back.control_points",
-    "front": ".reflect", "effects": "effects[0]", "elements": "behind",
+    "front": ".reflect", "effects": "effects[0]", "elements": "behind", "wall": "target", "targets": "target",
 }  # fmt: skip
 
 

@@ -22,11 +22,14 @@ from bstcad.runs.files import SentenceError
 
 SHAPES = {"lens.outline": "source.aperture"}  # table of an outline: table that follows it while the two are equal
 BACK_PLANE = "lens.back.z"  # key of the plane from which targets keep their distance
-WIDTHS = {  # key of the beam's width, by (kind of the source, profile)
-    ("collimated", "gaussian"): "radius_1e2",
-    ("point", "gaussian"): "half_angle_1e2",
-    ("point", "uniform"): "half_angle",
+WIDTHS = {  # keys that a profile needs, by (kind of the source, profile)
+    ("collimated", "gaussian"): ("radius_1e2",),
+    ("collimated", "super_gaussian"): ("radius_1e2", "order"),
+    ("collimated", "annular"): ("inner_radius",),
+    ("point", "gaussian"): ("half_angle_1e2",),
+    ("point", "uniform"): ("half_angle",),
 }
+ORDER, DARK_CENTRE = 10.0, 0.25  # order of a super-Gaussian, and radius of a dark centre / lens width, when chosen
 PICTURE_KEYS = ("rotate", "fit", "seen_from", "sample")  # keys whose choices are not tried: each try reads a photo
 
 
@@ -97,22 +100,26 @@ def _profile_widths(data: Mapping[str, Any], profile: Any) -> dict[str, Any]:
     """Return the changes for a beam with another profile: a missing width fills the lens, other widths are removed."""
     source = table_at("source", data)
     kind = source.get("kind")
-    wanted = WIDTHS.get((kind, profile))
-    changes: dict[str, Any] = {
-        f"source.{name}": None for (of, _), name in WIDTHS.items() if of == kind and name in source and name != wanted
-    }
-    if wanted is not None and wanted not in source and (made := _width(data, source, wanted)) is not None:
-        changes[f"source.{wanted}"] = made
+    wanted = WIDTHS.get((kind, profile), ()) if isinstance(profile, str) else ()
+    known = {name for (of, _), names in WIDTHS.items() if of == kind for name in names}
+    changes: dict[str, Any] = {f"source.{name}": None for name in sorted(known - {*wanted}) if name in source}
+    for name in wanted:
+        if name not in source and (made := _width(data, source, name)) is not None:
+            changes[f"source.{name}"] = made
     return changes
 
 
 def _width(data: Mapping[str, Any], source: Mapping[str, Any], name: str) -> float | None:
     """Return the beam width that fills the lens: radius (mm) or half angle to the corners (degrees); None: unknown."""
+    if name == "order":
+        return ORDER
     sizes = extent(table_at("lens.outline", data))
     if sizes is None:
         return None
     if name == "radius_1e2":
         return max(sizes) / 2
+    if name == "inner_radius":
+        return _rounded(DARK_CENTRE * min(sizes) / 2)
     position, front = source.get("position"), value_at("lens.front.z", data)
     start = position[-1] if isinstance(position, list) and position else 0.0
     if not are_numbers(start, front) or front == start:

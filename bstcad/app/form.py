@@ -70,6 +70,7 @@ SECTIONS = {  # labels, by key, of sections whose key would be unclear as a titl
     "tailoring": "computation of the lens (for experts)",
 }  # fmt: skip
 ADDITIONS = {  # labels of buttons that add a table, by key
+    "source.profile": "Use a measured beam (picture or table)",
     "before": "Add a window or mirror before the lens", "behind": "Add a window or mirror behind the lens",
     "wavefront": "Add a required wavefront", "mount": "Add a mount (rim, flange, holes)",
     "effects": "Add an effect (losses, ghosts)", "tolerance": "Add a tolerance",
@@ -208,14 +209,17 @@ def _group(key: str, node: Node, table: Table, data: Table, removable: bool = Fa
     kinds = matching_records(union, table)
     tag, nodes = tags(union[0]), kinds[0]["properties"]
     order = sorted(nodes, key=lambda name: name not in tag) if len(kinds) == 1 else [*tag]
-    required = {*kinds[0].get("required", ()), *(tag if len(union) > 1 else ())}
+    has_default = any("default" in record["properties"][name] for record in union for name in tag)
+    required = {*kinds[0].get("required", ()), *(tag if len(union) > 1 and not has_default else ())}
     fields, groups, additions = [], [], []
     for name in order:
         at, value, inner = f"{key}.{name}".lstrip("."), table.get(name), nodes[name]
         may_be = records(inner)
-        if not may_be:
+        named = choices(inner) if may_be and not isinstance(value, dict) else ()  # names in place of a table
+        if not may_be or named:
             options = [tags(each)[name] for each in union] if name in tag else choices(inner)
             fields.append(_field(at, inner, table, options, required=name in required))
+            additions += [Addition(at, ADDITIONS[at], new_table(at, data))] if named and at in ADDITIONS else []
         elif maximum := _max_tables(inner):
             groups.append(_list(at, inner, value, data, maximum=maximum))
         elif isinstance(value, dict):
@@ -272,7 +276,7 @@ def _field(key: str, node: Node, table: Table, options: list[Any], required: boo
 
 def _control(node: Node, value: Any) -> Control:
     """Return the control that edits a value; it depends on the value if the key allows a number or a list."""
-    if "enum" in node or "const" in node:
+    if "enum" in node or "const" in node or (records(node) and choices(node)):
         return "check" if node.get("const") is True else "choice"
     forms = {form.get("type"): form for form in alternatives(node)}
     if [*forms] in (["boolean"], ["string"]):

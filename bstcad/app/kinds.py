@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from bstcad.scene.dotted_keys import ONE_OF
 from bstcad.scene.schema import Node, records, schema, tags
 
 KEY_PART = re.compile(r"([^.\[\]]+)(?:\[(\d+)\])?")  # part of a dotted key: name, number of a table in its list
@@ -20,7 +21,8 @@ SIZE_MODELS = {  # new outline: (table whose size it gets, factor on this size)
     "target.outline": ("target", 1.0), "target.profile": ("target", 1.0),
 }  # fmt: skip
 FIRST_OPTIONS = {  # first key, by (table, kind), of a new table that needs one of several keys
-    ("target", ""): {"uniform": True},
+    ("target", "plane"): {"uniform": True},
+    ("target", "intensity"): {"uniform": True},
     ("tolerance", ""): {"grade": "precise"},
     ("lens.front", "bspline"): {"optimise": True},
 }
@@ -79,9 +81,16 @@ def kinds_at(key: str, data: Table) -> list[Any]:
 
 
 def matching_records(union: list[Node], table: Table) -> list[Node]:
-    """Return those records (possible tables) of a union that have the kind stated in `table`; all if none has it."""
-    chosen = [record for record in union if tags(record) and tags(record).items() <= _hashable(table).items()]
-    return chosen or union
+    """Return those records (possible tables) of a union that have the kind stated in `table`; all if none has it.
+
+    A table without a kind has the kind that is the default, if one is.
+    """
+
+    def has(record: Node) -> bool:
+        default = {name: record["properties"][name].get("default") for name in tags(record)}
+        return bool(tags(record)) and tags(record).items() <= {**default, **_hashable(table)}.items()
+
+    return [record for record in union if has(record)] or union
 
 
 def alternatives(node: Node) -> list[Node]:
@@ -102,6 +111,8 @@ def cast(node: Node, value: Any) -> Any:
     Ranges are not checked.  ValueError if the node does not allow the value.
     """
     if union := records(node):
+        if isinstance(value, str) and value in choices(node):  # a name in place of a table
+            return value
         return [_cast_table(union, part) for part in value] if isinstance(value, list) else _cast_table(union, value)
     if len(forms := alternatives(node)) > 1:
         for form in forms:
@@ -198,7 +209,7 @@ def _completed(key: str, record: Node, common: Table, data: Table) -> dict[str, 
     options = [option["required"] for option in record.get("oneOf", ())]  # for a circle: radius, or diameter
     if options and not any(name in common for option in options for name in option):
         needed.update(options[-1])
-    table: dict[str, Any] = dict(tags(record))
+    table = {name: tag for name, tag in tags(record).items() if record["properties"][name].get("default") != tag}
     for name, node in record["properties"].items():
         if name in common:
             table[name] = common[name]
@@ -207,7 +218,8 @@ def _completed(key: str, record: Node, common: Table, data: Table) -> dict[str, 
         elif (start := SOURCE_ORIGINS.get(f"{key}.{name}")) and (made := start(data)) is not None:
             table[name] = made
     kind = "".join(tags(record).values())
-    return FIRST_OPTIONS.get((without_numbers(key), kind), {}) | table
+    has_one = any(name in table for name in ONE_OF.get(without_numbers(key), ()))
+    return table if has_one else FIRST_OPTIONS.get((without_numbers(key), kind), {}) | table
 
 
 def _needed_value(key: str, node: Node, data: Table) -> Any:

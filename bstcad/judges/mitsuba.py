@@ -237,7 +237,7 @@ def _plate(source: Collimated, weight: float, lens: Lens, path: Path) -> Entry:
     start = source.start(z)
     (x, y), (a, b), distance = source.shift(z), source.slopes, z - start
     disc = faces.disc(source.aperture, (x - distance * a, y - distance * b, start), source.axes[2])
-    if source.profile == "gaussian":
+    if source.profile != "uniform":
         half_x, half_y = source.aperture.half_extent
         radiance = _texture(_irradiance(source, x + half_x * TEXEL_CENTRES, y + half_y * TEXEL_CENTRES, z) * weight)
     else:

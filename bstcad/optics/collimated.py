@@ -11,21 +11,27 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
-from bstcad.optics.emitters import PROFILE_NAMES, Emitter, TiltKey, WavelengthKey, all_alive
-from bstcad.optics.kernels.records import Beam
+from bstcad.optics.emitters import PROFILE_NAMES, Emitter, OneOrTwo, TiltKey, WavelengthKey, all_alive
+from bstcad.optics.kernels.records import NO_PATTERN, Beam
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
+from bstcad.optics.profiles import GAUSSIAN, MeasuredProfile, Profile, pair_of
 from bstcad.optics.rays import Rays, tilt_of
 
 WIDTHS_BEFORE_LENS = 4.0  # distance of aperture and lens for a rotated beam without z, in diagonals of the aperture
+ProfileName = Literal["uniform", "gaussian", "super_gaussian", "annular"]
 MAX_INCLINATION = 89.0  # limit of the angle between light and the axis of the lens, degrees
 
 
 @dataclass(frozen=True)
 class Collimated(Emitter):
-    """Parallel rays through an aperture, on whose plane z the irradiance is constant, or ∝ exp(-2 r² / radius_1e2²).
+    """Parallel rays through an aperture, on whose plane z the irradiance is that of a profile.
+
+    uniform: constant.  gaussian: ∝ exp(-2 r² / radius_1e2²), or with two radii (w_x, w_y) ∝ exp(-2 q), q = x² / w_x² +
+    y² / w_y².  super_gaussian: ∝ exp(-2 q^(order / 2)).  annular: constant outside inner_radius.  `rotate` turns the
+    profile about the centre, from x towards y.  A record with a `law` (profiles.Profile) is a measured irradiance.
 
     With a tilt the rays go along n = (n_x, n_y, n_z) (rays.axes).  On another plane the light is shifted by
     (n_x, n_y) / n_z times the distance, and its irradiance on planes z = const is unchanged.  With a divergence the
@@ -35,9 +41,10 @@ class Collimated(Emitter):
 
     aperture: Annotated[Outline, Key("Beam outline about source.centre.", example={"shape": "circle", "radius": 12.0})]
     wavelength: WavelengthKey = 587.6
-    profile: Annotated[Literal["uniform", "gaussian"], Key("Irradiance over the aperture.")] = "uniform"
+    profile: Annotated[ProfileName | MeasuredProfile, Key("Irradiance over the aperture.")] = "uniform"
     radius_1e2: Annotated[
-        float | None, Key("Radius at which a gaussian profile is 1/e² of its peak.", "mm", 1e-3, 1e6, example=8.0)
+        OneOrTwo | None,
+        Key("Radius at which the profile is 1/e² of its peak; two: along x, along y.", "mm", 1e-3, 1e6, example=8.0),
     ] = None
     # None: the plane of the lens's first vertex; rays start at z = 0, or below if the front may reach it (`start`)
     z: Annotated[float | None, Key("Plane of the aperture, where rays start.", "mm", -1e8, 1e8, example=0.0)] = None
@@ -49,11 +56,22 @@ class Collimated(Emitter):
     real_divergence: Annotated[
         float | None, Key("Full divergence angle of the real lamp, for estimates only.", "degrees", 0.0, 179.0)
     ] = None
+    order: Annotated[
+        float | None, Key("Order of a super_gaussian: 2 is a Gaussian, 10 is nearly uniform.", "", 2.0, 100.0)
+    ] = None
+    inner_radius: Annotated[
+        float | None, Key("Radius of the dark centre of an annular profile.", "mm", 1e-3, 1e6, example=3.0)
+    ] = None
+    rotate: Annotated[
+        float | None, Key("Rotation of the profile about its centre, from x towards y.", "degrees", -180.0, 180.0)
+    ] = None
     kind: Annotated[Literal["collimated"], Key("Parallel light.")] = "collimated"
 
     __pydantic_config__ = STRICT
     size_key, parallel, simple_name = "divergence", True, "parallel light of one direction"
-    widths = MappingProxyType({"gaussian": "radius_1e2"})
+    widths = MappingProxyType(
+        {"gaussian": ("radius_1e2",), "super_gaussian": ("radius_1e2", "order"), "annular": ("inner_radius",)}
+    )
 
     @property
     def start_plane(self) -> float | None:
@@ -61,7 +79,9 @@ class Collimated(Emitter):
         return self.z
 
     def complaints(self, z: float, optic: str) -> Iterator[str]:
-        """Yield a sentence if directions are inclined too far to the axis."""
+        """Yield a sentence if directions are inclined too far to the axis, or the profile leaves no light."""
+        if self.inner_radius is not None and not self.inner_radius < max(self.aperture.half_extent):
+            yield "inner_radius: the dark centre fills the aperture; make it smaller"
         lean = math.degrees(math.acos(max(-1.0, min(1.0, self.axes[2][2]))))
         if not lean + (self.divergence or 0.0) / 2 < MAX_INCLINATION:
             key, light = ("divergence", "a part of the light") if self.divergence else ("tilt", "the light")
@@ -70,7 +90,17 @@ class Collimated(Emitter):
     def words(self, origin: float) -> str:
         """Return profile, divergence and aperture for a data sheet."""
         spread = f"divergence {self.divergence:.4g}°, " if self.divergence else ""
-        return f"parallel light, {PROFILE_NAMES[self.profile]}, {spread}{self.aperture.words.replace(' x ', ' × ')}"
+        return f"parallel light, {self.profile_words}, {spread}{self.aperture.words.replace(' x ', ' × ')}"
+
+    @property
+    def profile_words(self) -> str:
+        """Name of the profile, with its radii where there are two."""
+        if isinstance(self.profile, MeasuredProfile):
+            return self.profile.words
+        name = PROFILE_NAMES[self.profile]
+        if isinstance(self.radius_1e2, tuple):
+            name += f" {' × '.join(f'{w:.4g}' for w in self.radius_1e2)} mm"
+        return name + (f", rotated by {self.rotate:.4g}°" if self.rotate else "")
 
     def sizes(self) -> Iterator[tuple[str, float, str]]:
         """Yield the divergence, if there is one."""
@@ -79,8 +109,8 @@ class Collimated(Emitter):
 
     @property
     def is_rotation_invariant(self) -> bool:
-        """True if the aperture is round; the cone of directions always is."""
-        return self.aperture.is_round
+        """True if aperture and profile are round; the cone of directions always is."""
+        return self.aperture.is_round and (self.law is None or self.law.is_round)
 
     def moved(self, motion: Motion, entrance: float) -> Collimated:
         """Return the simple beam after a motion; entrance: z of the plane through the first vertex (mm).
@@ -121,11 +151,30 @@ class Collimated(Emitter):
         direction = d_x, d_y, math.sqrt(max(1 - d_x * d_x - d_y * d_y, 0.0))
         return replace(self, divergence=None, tilt=tilt_of(direction))
 
+    @property
+    def can_rotate(self) -> bool:
+        """True if the profile is not round."""
+        return self.law is not None and not self.law.is_round
+
+    @property
+    def law(self) -> Profile | None:
+        """Irradiance over the aperture, from its centre; None: a closed form, uniform or round Gaussian."""
+        pair, turn = pair_of(self.radius_1e2 or 0.0), self.rotate or 0.0
+        if isinstance(self.profile, MeasuredProfile):
+            return replace(self.profile.law, rotate=turn)
+        if self.profile == "annular":
+            return Profile(inner=self.inner_radius or 0.0)
+        if self.profile == "super_gaussian":
+            return Profile(pair, self.order or GAUSSIAN, rotate=turn)
+        return Profile(pair, rotate=turn) if self.profile == "gaussian" and pair[0] != pair[1] else None
+
     def irradiance(self, x: Tensor, y: Tensor, z: float) -> Tensor:
         """Return E(x, y) (1/mm²) of the mean direction on any plane z; the flux through the aperture is 1."""
         if (shift := self.shift(z)) != (0.0, 0.0):
             x, y = x - shift[0], y - shift[1]
         inside = self.aperture.contains(x, y)
+        if (law := self.law) is not None:
+            return torch.where(inside, law.density(x, y) / law.flux(self.aperture), torch.zeros_like(x))
         if self.profile == "uniform":
             return torch.where(inside, torch.full_like(x, 1 / self.aperture.area), torch.zeros_like(x))
         flux, w2 = self._gaussian()
@@ -135,7 +184,7 @@ class Collimated(Emitter):
     def _gaussian(self) -> tuple[float, float]:
         """Return (∫ exp(-2 r² / w²) over the aperture, w²) of a gaussian profile, w: radius_1e2, each in mm²."""
         assert self.radius_1e2 is not None  # a gaussian profile needs it (`widths`)
-        w = self.radius_1e2
+        w = max(pair_of(self.radius_1e2))
         if isinstance(self.aperture, Circle):
             return math.pi * w * w / 2 * -math.expm1(-2 * (self.aperture.radius / w) ** 2), w**2
         a, b = self.aperture.half_extent
@@ -144,11 +193,13 @@ class Collimated(Emitter):
     def beam(self, z: float) -> Beam:
         """Return the parameters of `irradiance` on the plane z (mm) for the kernels."""
         (x, y), (a, b, r2) = map(float, self.shift(z)), map(float, self.aperture.limits)
-        peak, fall, start = 1 / self.aperture.area, 0.0, abs(float(z - self.start(z)))
-        if self.profile == "gaussian":
+        peak, fall, start, pattern = 1 / self.aperture.area, 0.0, abs(float(z - self.start(z))), NO_PATTERN
+        if (law := self.law) is not None:
+            peak, pattern = 1 / law.flux(self.aperture), law.pattern()
+        elif self.profile == "gaussian":
             flux, w2 = self._gaussian()
             peak, fall = 1 / flux, 2 / w2
-        light = Beam(x, y, a, b, limit_r2=r2, peak=peak, fall=fall, start=start)
+        light = Beam(x, y, a, b, limit_r2=r2, peak=peak, fall=fall, start=start, pattern=pattern)
         if not self.tilted:
             return light
         (n_x, n_y, n_z), sense = self.axes[2], 1 if self.start(z) <= z else -1

@@ -24,6 +24,7 @@ from bstcad.optics.kernels.records import Beam
 from bstcad.optics.key import Key
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Outline, Rectangle
+from bstcad.optics.profiles import MeasuredProfile
 from bstcad.optics.rays import Frame, Rays, Vector, axes
 
 Wavelength = float | tuple[tuple[float, float], ...]  # nm; or spectral lines (nm, weight), weights of any sum
@@ -34,7 +35,11 @@ WavelengthKey = Annotated[  # key of every source
 TiltKey = Annotated[
     tuple[float, float] | None, Key("Tilt about x, then about y.", "degrees", -180.0, 180.0, example=[0.0, 10.0])
 ]
-PROFILE_NAMES = {"gaussian": "Gaussian", "lambertian": "Lambertian", "uniform": "uniform"}  # profile names in text
+OneOrTwo = float | tuple[float, float]  # a number, or two along x and y
+PROFILE_NAMES = {  # profile names in text
+    "gaussian": "Gaussian", "super_gaussian": "super-Gaussian", "lambertian": "Lambertian", "annular": "annular",
+    "uniform": "uniform",
+}  # fmt: skip
 
 
 class Emitter(ABC):
@@ -46,16 +51,20 @@ class Emitter(ABC):
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
     wavelength: Wavelength
-    lumens: float | None = None  # total flux, lm; None: not stated, so that fluxes are relative
     tilt: tuple[float, float] | None = None  # rotation of the axis about x, then y (degrees); None: not tilted
-    profile: str = "own"  # name of the distribution of the light
+    profile: str | MeasuredProfile = "own"  # name of the distribution of the light, or a record with its `law`
     size_key: str | None = None  # scene key of the size; the key for the real lamp has the prefix real_; None: no size
     kind: str = "own"  # name of the kind of source
     parallel: bool = False  # True if the light of each point of the extent is parallel
     simple_name: str = "a source without size"  # name of the source without its extent
     start_key: str = "z"  # scene key of the position where the light starts
-    widths: Mapping[str, str] = MappingProxyType({})  # scene key of the width that each profile needs
+    widths: Mapping[str, tuple[str, ...]] = MappingProxyType({})  # scene keys that each profile needs
     unbounded: str | None = None  # name of the profile that needs no width
+
+    @property
+    def lumens(self) -> float | None:
+        """Total flux, lm; None: not stated, so that fluxes are relative."""
+        return None
 
     @property
     def extent(self) -> Outline | None:
@@ -143,6 +152,11 @@ class Emitter(ABC):
     @property
     def is_rotation_invariant(self) -> bool:
         """True if a rotation about the source's axis leaves the light unchanged; else `moved` neglects the rotation."""
+        return False
+
+    @property
+    def can_rotate(self) -> bool:
+        """True if a rotation of the profile about the axis changes the light."""
         return False
 
     @property

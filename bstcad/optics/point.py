@@ -12,13 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics.emitters import PROFILE_NAMES, Emitter, TiltKey, WavelengthKey, all_alive
+from bstcad.optics.emitters import PROFILE_NAMES, Emitter, OneOrTwo, TiltKey, WavelengthKey, all_alive
 from bstcad.optics.kernels.records import Beam
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
 from bstcad.optics.motion import Motion
-from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
-from bstcad.optics.rays import Rays, Vector, point_along, tilt_of
+from bstcad.optics.outlines import EVERYWHERE, STRICT, Circle, Outline, Rectangle
+from bstcad.optics.profiles import MeasuredProfile, Profile, pair_of
+from bstcad.optics.rays import Frame, Rays, Vector, point_along, tilt_of
 from bstcad.optics.wavefront import path_from_sphere
 
 SIZE_KEYS = "diameter", "width", "height"  # scene keys of the size of an emitting disc or rectangle
@@ -30,7 +31,8 @@ MAX_CONE_HALF_ANGLE = math.radians(89.0)  # rad, half angle below which light ha
 class Point(Emitter):
     """Rays from one point into the half space on the side of the lens.
 
-    gaussian: irradiance on z = const ∝ exp(-2 r² / w²), r from the axis, w = distance · tan(half_angle_1e2).
+    gaussian: irradiance on z = const ∝ exp(-2 r² / w²), r from the axis, w = distance · tan(half_angle_1e2); with two
+    angles ∝ exp(-2 (x² / w_x² + y² / w_y²)), turned about the axis by `rotate`, from x towards y.
     lambertian: radiant intensity ∝ cos θ, up to half_angle if stated.  uniform: constant intensity up to half_angle.
     A tilt rotates the whole distribution, with its half space, about the point (`_tilted_irradiance`); light that then
     leads away from the lens misses it.  A disc or rectangle of points is perpendicular to the axis of the source.
@@ -42,9 +44,9 @@ class Point(Emitter):
     wavelength: WavelengthKey = 587.6
     profile: Annotated[Literal["gaussian", "lambertian", "uniform"], Key("Radiant intensity by angle.")] = "lambertian"
     half_angle_1e2: Annotated[
-        float | None,
+        OneOrTwo | None,
         Key(
-            "Angle from the axis at which a gaussian profile's irradiance on a plane is 1/e² of its peak.",
+            "Angle at which a gaussian profile's irradiance on a plane is 1/e² of its peak; two: towards x, towards y.",
             "degrees",
             1e-3,
             89.0,
@@ -62,11 +64,19 @@ class Point(Emitter):
     ] = None
     tilt: TiltKey = None
     real_diameter: Annotated[float | None, Key("Diameter of the real lamp, for estimates only.", "mm", 0.0, 1e6)] = None
+    intensity: Annotated[MeasuredProfile | None, Key("Radiant intensity over directions, in place of a profile.")] = (
+        None
+    )
+    rotate: Annotated[
+        float | None, Key("Rotation of the profile about its axis, from x towards y.", "degrees", -180.0, 180.0)
+    ] = None
     kind: Annotated[Literal["point"], Key("A point, or with a size a disc or rectangle of points.")] = "point"
 
     __pydantic_config__ = STRICT
     size_key, simple_name, start_key = "diameter", "a point", "position"
-    widths = MappingProxyType({"gaussian": "half_angle_1e2", "uniform": "half_angle", "lambertian": "half_angle"})
+    widths = MappingProxyType(
+        {"gaussian": ("half_angle_1e2",), "uniform": ("half_angle",), "lambertian": ("half_angle",)}
+    )
     unbounded = "lambertian"  # without half_angle a lambertian fills the half space
 
     @property
@@ -79,8 +89,15 @@ class Point(Emitter):
         reach = 0.0 if self.extent is None else self.extent.reach(*(axis[2] for axis in self.axes[:2]))
         return self.position[2] + (reach if upwards else -reach)
 
+    @property
+    def lumens(self) -> float | None:
+        """Total flux by the file of the intensity (lm); None: not stated."""
+        return None if self.intensity is None else self.intensity.lumens
+
     def complaints(self, z: float, optic: str) -> Iterator[str]:
         """Yield faults of the sizes as "key: sentence"; z: plane of the first face (mm), optic: "lens" or "mirror"."""
+        if self.intensity is not None and self.profile != "lambertian":
+            yield "profile: the source also has an intensity; remove one of them"
         given = [name for name in ("width", "height") if getattr(self, name) is not None]
         if given and self.diameter is not None:
             yield f"diameter: the source also has a {given[0]}; give a diameter, or width and height"
@@ -102,10 +119,12 @@ class Point(Emitter):
         x, y, z = self.position
         position = ", ".join(f"{round(p, 3) + 0.0:.9g}" for p in (x, y, z - origin)).replace("-", "−")
         angle = self.half_angle or self.half_angle_1e2
-        sizes = [f"half angle {angle:.4g}°"] if angle else []
+        sizes = [f"half angle {' × '.join(f'{a:.4g}°' for a in dict.fromkeys(pair_of(angle)))}"] if angle else []
+        sizes += [f"rotated by {self.rotate:.4g}°"] if self.rotate else []
         sizes += (f"{key} {size:.4g} {unit}" for key, size, unit in self.sizes())
         kind = "disc" if self.diameter else "rectangle" if self.width else "point"
-        return ", ".join([f"{kind} at ({position}) mm", PROFILE_NAMES[self.profile], *sizes])
+        name = PROFILE_NAMES[self.profile] if self.intensity is None else self.intensity.words
+        return ", ".join([f"{kind} at ({position}) mm", name, *sizes])
 
     def sizes(self) -> Iterator[tuple[str, float, str]]:
         """Yield (key, value, unit) of diameter, width and height, if stated."""
@@ -113,8 +132,8 @@ class Point(Emitter):
 
     @property
     def is_rotation_invariant(self) -> bool:
-        """True for a point or a disc."""
-        return self.extent is None or self.extent.is_round
+        """True for a point or a disc with a round profile."""
+        return (self.extent is None or self.extent.is_round) and (self.law is None or self.law.is_round)
 
     def moved(self, motion: Motion, entrance: float) -> Point:
         """Return the point source after a motion; entrance: not used."""
@@ -127,6 +146,9 @@ class Point(Emitter):
         def wider(angle: float) -> float:
             return math.degrees(math.atan((1 + by) * math.tan(math.radians(angle))))
 
+        if isinstance(self.half_angle_1e2, tuple):
+            across, up = map(wider, self.half_angle_1e2)
+            return replace(self, half_angle_1e2=(across, up))
         if self.half_angle_1e2:
             return replace(self, half_angle_1e2=wider(self.half_angle_1e2))
         return replace(self, half_angle=wider(self.half_angle)) if self.half_angle else None
@@ -168,6 +190,8 @@ class Point(Emitter):
         uniform: I = 1 / (2π (1 - cos θ_max)), E = I D / d³.  The last two are zero beyond θ_max, the half angle `edge`.
         """
         distance = abs(z - self.position[2])
+        if self.law is not None:
+            return self._irradiance_of(self.law, x - self.position[0], y - self.position[1], z)
         if self.tilted:
             return self._tilted_irradiance(x - self.position[0], y - self.position[1], distance, self.towards(z))
         r2 = (x - self.position[0]) ** 2 + (y - self.position[1]) ** 2
@@ -184,15 +208,56 @@ class Point(Emitter):
         return e if edge == HALF_SPACE else torch.where(r2 <= (distance * math.tan(edge)) ** 2, e, torch.zeros_like(e))
 
     @property
+    def can_rotate(self) -> bool:
+        """True if the profile is not round."""
+        return self.law is not None and not self.law.is_round
+
+    @property
+    def law(self) -> Profile | None:
+        """Irradiance on a plane at distance 1 across the axis; None: a closed form of its own."""
+        if self.intensity is not None:
+            return replace(self.intensity.law, rotate=self.rotate or 0.0)
+        if self.profile != "gaussian" or not isinstance(self.half_angle_1e2, tuple):
+            return None
+        across, up = (math.tan(math.radians(angle)) for angle in self.half_angle_1e2)
+        return Profile((across, up), rotate=self.rotate or 0.0)
+
+    def _frame_of(self, law: Profile, sense: int) -> Frame:
+        """Return the axes of a profile; sense: of the light.
+
+        An intensity is that of a real lamp, which is rotated about e_x to light a plane below it, not mirrored.
+        """
+        e_x, e_y, n = self.axes
+        return (e_x, (-e_y[0], -e_y[1], -e_y[2]), n) if law.stereographic and sense < 0 else (e_x, e_y, n)
+
+    def _irradiance_of(self, law: Profile, x: Tensor, y: Tensor, z: float) -> Tensor:
+        """Return the irradiance on the plane z at distance D, at p = (x, y, D) from the source.
+
+        It is E(u, v) D / c³, c = n · p, or E(u, v) D / |p|³ if E is an intensity over stereographic coordinates.
+        """
+        distance, sense = abs(z - self.position[2]), 1 if self.position[2] <= z else -1
+        e_x, e_y, _ = self._frame_of(law, sense)
+        n = self.towards(z)
+        c = n[0] * x + n[1] * y + n[2] * distance
+        along = torch.sqrt(x * x + y * y + distance**2)
+        ahead = torch.ones_like(c, dtype=torch.bool) if law.stereographic else c > 0
+        c = c + along if law.stereographic else torch.where(ahead, c, torch.ones_like(c))
+        u, v = ((e[0] * x + e[1] * y + sense * e[2] * distance) / c for e in (e_x, e_y))
+        cube = along**3 if law.stereographic else c * c * c
+        e = law.density(u, v) / law.flux(EVERYWHERE) * distance / cube
+        return torch.where(ahead, e, torch.zeros_like(e))
+
+    @property
     def _spread(self) -> float:
         """1/e² radius of a gaussian profile divided by the distance: tan(half_angle_1e2)."""
         assert self.half_angle_1e2 is not None  # a gaussian profile needs it (`widths`)
-        return math.tan(math.radians(self.half_angle_1e2))
+        return math.tan(math.radians(pair_of(self.half_angle_1e2)[0]))
 
     @property
     def edge(self) -> float:
         """Half angle (rad) at which a uniform or lambertian profile ends; π / 2: the half space."""
-        return HALF_SPACE if self.half_angle is None or self.profile == "gaussian" else math.radians(self.half_angle)
+        limit = self.intensity.half_angle if self.intensity is not None else self.half_angle
+        return HALF_SPACE if limit is None or self.profile == "gaussian" else math.radians(min(limit, 90.0))
 
     @property
     def is_cone(self) -> bool:
@@ -231,6 +296,11 @@ class Point(Emitter):
         """Return the parameters of `irradiance` on the plane z (mm) for the kernels."""
         x, y, from_z = map(float, self.position)
         distance, edge = abs(z - from_z), self.edge
+        if (law := self.law) is not None:
+            sense = 1 if from_z <= z else -1
+            pattern = law.pattern(self._frame_of(law, sense), sense)
+            peak = 1 / law.flux(EVERYWHERE)
+            return Beam(x, y, peak=peak, distance=distance, start=distance, tilted=int(self.tilted), pattern=pattern)
         if self.tilted:
             peak, fall, power, least = self._tilted_law(distance)
             n_x, n_y, n_z = map(float, self.towards(z))

@@ -33,6 +33,12 @@ class Receiver(ABC):
     tilt: tuple[float, float] | None = None  # tilt of a plane about x, then y, degrees; None: not a tilted plane
     names: tuple[str, str] = ("x", "y")  # names of the coordinates
     is_level: bool = False  # True for a plane z = const
+    chart: int = 0  # number of the coordinates of directions (directions.CHARTS); 0: not a receiver of directions
+
+    @property
+    def has_kernel(self) -> bool:
+        """True if the kernels trace rays to the receiver."""
+        return self.axes is not None or self.chart > 0
 
     @property
     def axes(self) -> Frame | None:
@@ -113,6 +119,10 @@ class Receiver(ABC):
         rays = Rays(start, along, torch.ones_like(x), torch.zeros(x.shape, dtype=torch.uint8), z=z)
         path, status = self.path(rays)
         return float(path.min()) if bool((status == Status.ALIVE).all()) else -math.inf
+
+    def drawn(self, lens: float, z: float) -> Receiver:
+        """Return the receiver as pictures show it, behind a lens of width `lens` (mm) whose back is at z (mm)."""
+        return self
 
     def throw(self, z: float) -> float:
         """Return the height (mm) of the centre above the plane z (mm), negative below it."""

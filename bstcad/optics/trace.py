@@ -59,7 +59,7 @@ def through(rays: Rays, interfaces: Sequence[Interface], planes: Sequence[Receiv
     *others, last = interfaces
     for interface in others:
         rays = behind(rays, interface)
-    if all(plane.axes is not None for plane in planes) and (fast := _net_kernel("trace.through", rays, last)):
+    if all(plane.has_kernel for plane in planes) and (fast := _net_kernel("trace.through", rays, last)):
         return fast(rays, last, planes)
     rays = cross(rays, last).rays
     return tuple(plane.land(rays) for plane in planes)
@@ -84,7 +84,7 @@ def whole_kernel(
 
     tables: allow a table of the source's light, which costs as much as some ten thousand rays.
     """
-    fast = ops.whole_kernel(name, lens.interfaces) if plane.axes is not None else None
+    fast = ops.whole_kernel(name, lens.interfaces) if plane.has_kernel else None
     return fast if fast and beam(source, lens, tables) is not None else None
 
 

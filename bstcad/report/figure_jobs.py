@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from dataclasses import replace
 from itertools import groupby, product
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -120,6 +121,7 @@ class NoPictures(Pictures):
 
 def draw_lens(source: Emitter, lens: Lens, screens: Sequence[Screen], view: View) -> Pngs:
     """Return maps of the back and of a tailored front, and a side view of the lens; `view` is not used."""
+    screens = [drawn(screen, lens) for screen in screens]
     farthest = max(screens, key=lambda screen: screen.plane.throw(0.0))
     of_front = {}
     if lens.shapes("front"):
@@ -327,7 +329,8 @@ def light_path_of(scene: Scene, lens: Lens, pictures: Sequence[tuple[np.ndarray,
 
     pictures: (target, irradiance) of each target of the scene, (rows, columns) each.
     """
-    source, screens = scene.source.central, [target.screen for target in scene.targets]
+    source, wanted_screens = scene.source.central, [target.screen for target in scene.targets]
+    screens = [drawn(screen, lens) for screen in wanted_screens]
     rays, flux = bundle(source, lens, max(screens, key=lambda screen: screen.plane.throw(0.0)).plane, RAYS)
     if not len(rays):
         return None
@@ -344,7 +347,7 @@ def light_path_of(scene: Scene, lens: Lens, pictures: Sequence[tuple[np.ndarray,
         seen_along=1 if scene.target.seen_from == "lens" else -1,
         mirror=not lens.passes.enters,
         title=scene.title or scene.name,
-        words=f"{_sizes(screens)}\n{len(rays)} rays {of}, true to scale",
+        words=f"{_sizes(wanted_screens)}\n{len(rays)} rays {of}, true to scale",
     )
 
 
@@ -355,6 +358,12 @@ def _sizes(screens: Sequence[Screen]) -> str:
         for plane, x, y in ((screen.plane, screen.x, screen.y) for screen in screens)
     )
     return f"Target{'s' * (len(screens) > 1)} {', '.join(sizes)}"
+
+
+def drawn(screen: Screen, lens: Lens) -> Screen:
+    """Return the screen as pictures show it: directions at a distance of a few lens widths."""
+    place = screen.plane.drawn(2 * max(lens.outline.half_extent), lens.back.z)
+    return screen if place == screen.plane else replace(screen, surface=place)
 
 
 def corners(screen: Screen) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import Any
 
 from bstcad.scene.errors import SceneError
 
-PICTURE_KEYS = ("text", "image", "sample", "uniform", "profile")  # keys of which a target has exactly one
+PICTURE_KEYS = ("text", "image", "sample", "uniform", "profile", "intensity")  # keys of which a target has exactly one
 OUTLINES = ("source.aperture", *(f"{table}.outline" for table in ("lens", "target", "lens.front", "before", "behind")))
 ONE_OF: dict[str, tuple[str, ...]] = {  # alternative keys of a table; setting one removes the others
     "target": PICTURE_KEYS,

@@ -9,22 +9,37 @@ from bstcad.optics.emitters import Emitter
 from bstcad.optics.outlines import Outline
 from bstcad.scene.blank import INDICES, LensBlank
 
+UNITS = {
+    "radius_1e2": " in mm",
+    "inner_radius": " in mm",
+    "order": ", such as order = 10",
+}  # units of keys, in messages
 MIN_BEAM_COVERAGE = 0.9  # ratio of the widths of beam and lens below which a warning calls the rest of the lens dark
 IRRADIANCE_SAMPLES = 200  # points per side of the lens at which the irradiance is sampled
 
 
 def complaints(source: Emitter, lens: LensBlank) -> Iterator[str]:
     """Yield complaints about the profile and the spectrum of the source, and those by source.complaints."""
-    width = source.widths.get(source.profile)
-    if width and source.profile != source.unbounded and getattr(source, width) is None:
-        unit = "mm" if width == "radius_1e2" else "degrees"
-        yield f"source.{width}: missing, and a {source.profile} profile needs it; add it in {unit}"
-    for other in source.widths.values():
-        if other != width and getattr(source, other) is not None:
-            yield f"source.{other}: a {source.profile} profile does not use this key; remove it, or change the profile"
+    yield from _of_profile(source)
     yield from _spectrum(source, lens)
     first = getattr(lens, lens.passes.faces[0])
     yield from (f"source.{complaint}" for complaint in source.complaints(first.z, lens.optic))
+
+
+def _of_profile(source: Emitter) -> Iterator[str]:
+    """Yield complaints about keys that the profile of the source needs, and about keys that it does not use."""
+    name = source.profile if isinstance(source.profile, str) else "measured"
+    needed = source.widths.get(name, ())
+    for key in needed:
+        if name != source.unbounded and getattr(source, key) is None:
+            unit = UNITS.get(key, " in degrees")
+            yield f"source.{key}: missing, and a {name} profile needs it; add it{unit}"
+    for other in dict.fromkeys(key for keys in source.widths.values() for key in keys):
+        if other not in needed and getattr(source, other) is not None:
+            yield f"source.{other}: a {name} profile does not use this key; remove it, or change the profile"
+    turns = source.can_rotate  # reads a measured profile, whose faults are refused here
+    if getattr(source, "rotate", None) and not turns:
+        yield "source.rotate: the profile is round, and a rotation does not change it; remove this key"
 
 
 def _spectrum(source: Emitter, lens: LensBlank) -> Iterator[str]:

@@ -22,23 +22,23 @@ import torch
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_serializer, model_validator
 
 from bstcad.optics.channels import Channel, channels_of, drawn_channels, merge_wavelengths
-from bstcad.optics.collimated import Collimated
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
 from bstcad.optics.key import Key
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
-from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.sides import Sides, as_pair
 from bstcad.optics.wavefront import MAX_RAY_ANGLE, PlaneWave, Wave, ZernikeWave
 from bstcad.runs import files
 from bstcad.scene import effects, elements, lighting, mount, picture, quality, scene_file
+from bstcad.scene.beam import Collimated
 from bstcad.scene.blank import LensBlank, as_front, net_extent
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
 from bstcad.scene.effects import Effects
 from bstcad.scene.elements import Around, Elements, LightPath
 from bstcad.scene.errors import SceneError, explain, line_of, toml_positions, with_target_key
+from bstcad.scene.lamp import Point
 from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture
 from bstcad.scene.quality import VERIFICATION_DRAW, VERIFICATION_POINTS, Tailoring, Tolerance
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from bstcad.optics.measure import Draw, GhostTracer
 
 MESH_TOLERANCE = 1e-3  # mm; default maximum distance of mesh facets from a lens up to 100 mm wide
-IMAGE_KEY = re.compile(r"target(\[\d+\])?\.image")  # dotted keys of images
+IMAGE_KEY = re.compile(r"target(\[\d+\])?\.image|source\.profile\.image")  # dotted keys of images
 SEARCH_RANGE = 0.999  # fraction of the possible range of a front's sag at the rim that tailoring searches
 FLOAT32_ROUNDING = 2.0**-24  # largest relative rounding error of a coordinate in float32
 FINEST_MESH = 4 * FLOAT32_ROUNDING  # smallest tolerance of a mesh, as a fraction of the largest coordinate
@@ -139,6 +139,11 @@ class Scene(Record):
             yield from lighting.unlit_complaints(source.central, lens, self.rim)
         if not self.light_path.is_folded:
             yield from self._of_targets(lambda target: target.unfaced(lens))
+        if len(self.targets) > 1 or self.wavefront is not None:
+            for key, target in zip(self.target_keys, self.targets, strict=True):
+                if target.screen.plane.frame is None:
+                    several = "several targets, or a wavefront, need targets on planes"
+                    yield f"{key}: {several}; make it a plane, or keep one target without a wavefront"
         yield from coplanar_complaints(self.targets)
         if self.wavefront is not None and self.light_path.is_folded:
             yield "wavefront: cannot be set with a mirror in [[behind]], which reverses the wave; remove one of them"

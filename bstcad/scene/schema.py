@@ -32,6 +32,10 @@ OneOrTwo = Annotated[
     Annotated[int, Tag("number")] | Annotated[tuple[int, int], Tag("pair")],
     Discriminator(lambda given: "pair" if isinstance(given, list | tuple) else "number"),
 ]
+OneOrTwoWidths = Annotated[
+    Annotated[float, Tag("number")] | Annotated[tuple[float, float], Tag("pair")],
+    Discriminator(lambda given: "pair" if isinstance(given, list | tuple) else "number"),
+]
 
 
 class Record(BaseModel):
@@ -241,7 +245,8 @@ def _union(union: list[Node], table: str) -> list[Row]:
         for row in rows(record, table):
             found.setdefault(row, []).append(kind)
     meaning = " ".join(f"{kind}: {record['properties'][name]['description']}" for kind, record in pairs)
-    tag = Row(f"{table}.{name}", "none", " | ".join(kinds), "required", meaning=meaning, example=kinds[0])
+    default = next((each for _, record in pairs if (each := record["properties"][name].get("default"))), "required")
+    tag = Row(f"{table}.{name}", "none", " | ".join(kinds), default, meaning=meaning, example=kinds[0])
     others = (row if of == kinds or row.kinds else replace(row, kinds=tuple(of)) for row, of in found.items())
     return [tag, *(row for row in others if row.key != tag.key)]
 
@@ -251,7 +256,8 @@ def span(node: Node) -> str:
     if "const" in node or "enum" in node:
         return " | ".join(json.dumps(value).strip('"') for value in node.get("enum", [node.get("const")]))
     if records(node):
-        return "table" if node.get("type") != "array" else "tables"
+        names = [span(part) for part in _parts(node) if "enum" in part or "const" in part]  # names in place of a table
+        return " or ".join([*names, "table"]) if node.get("type") != "array" else "tables"
     if parts := [*_parts(node), *node.get("prefixItems", ())[:1]]:
         return " or ".join(dict.fromkeys(map(span, parts)))
     if "minimum" in node:

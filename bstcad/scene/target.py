@@ -9,13 +9,15 @@ import functools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, TypeAlias
 
 import numpy as np
 import torch
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag
 from scipy.sparse import csr_array
 
+from bstcad.optics.directions import Angles, Directions
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.key import Key
 from bstcad.optics.outlines import Circle, Outline
@@ -25,13 +27,15 @@ from bstcad.scene import picture
 from bstcad.scene.blank import LensBlank, Outlined
 from bstcad.scene.dotted_keys import PICTURE_KEYS
 from bstcad.scene.errors import SceneError
+from bstcad.scene.lamp import IntensityFile, read_intensity
 from bstcad.scene.picture import Picture, PixelBox, strips
 from bstcad.scene.profile import Pixels, Profile, Size
 from bstcad.scene.schema import COORDINATES, OneOrTwo, Record, from_file, leaving_out
 
 MIN_PIXELS = 8  # smallest number of pixels along a side of a target
 MIN_EXTENT = 1e-3  # smallest side of a target, mm or another unit of its receiver
-WITHOUT_GAMMA = ("text", "uniform", "profile")  # picture keys that allow no gamma and no crop
+FAR_Z = 1e8  # z (mm) of a target over directions, which has no position
+WITHOUT_GAMMA = ("text", "uniform", "profile", "intensity")  # picture keys that allow no gamma and no crop
 MAX_TARGETS = 8  # largest number of targets of a scene
 NOTICEABLE = 0.01  # RRMSD between two readings of a picture above which a remark states the reading
 PLANE_DISTANCE = 1e-3  # mm; smallest distance between the planes of two targets
@@ -58,6 +62,7 @@ AIM = (
 class Target(Record):
     """The picture over the rectangle x by y on the plane z, or on a plane tilted about the centre of the rectangle."""
 
+    kind: Annotated[Literal["plane"], Key("Irradiance of a plane.")] = "plane"
     z: Annotated[float, Key("Position of the target; if tilted, of its centre.", "mm", *COORDINATES, example=1000.0)]
     x: Annotated[tuple[float, float], Key("Ends of the target along x.", "mm", *COORDINATES, example=[-200.0, 200.0])]
     y: Annotated[tuple[float, float], Key("Ends of the target along y.", "mm", *COORDINATES, example=[-200.0, 200.0])]
@@ -85,14 +90,15 @@ class Target(Record):
     unreachable: Annotated[Literal["dark", "refuse"], Key("Parts that light cannot reach: dark, or refused.")] = "dark"
     weight: Annotated[float, Key("Weight of its squared error among the targets.", "", 1e-6, 1e6, example=2.0)] = 1.0
 
-    written = leaving_out(weight=1.0)
+    written = leaving_out(kind="plane", weight=1.0)
+    picture_keys: ClassVar[tuple[str, ...]] = tuple(key for key in PICTURE_KEYS if key != "intensity")
 
     def complaints(self) -> Iterator[str]:
         """Yield the faults of the table [target], each as "key: sentence"."""
         given = self._pictures
         if len(given) != 1:
             names = " and ".join(given) or "none"
-            yield f"target: needs exactly one of {', '.join(PICTURE_KEYS)}, and has {names}; give exactly one"
+            yield f"target: needs exactly one of {', '.join(self.picture_keys)}, and has {names}; give exactly one"
         for axis, (low, high) in (("x", self.x), ("y", self.y)):
             if not low < high:
                 yield f"target.{axis}: [{low:g}, {high:g}] is not an interval; write the smaller end first"
@@ -136,7 +142,7 @@ class Target(Record):
 
     @property
     def _pictures(self) -> list[str]:
-        return [name for name in PICTURE_KEYS if getattr(self, name) is not None]
+        return [name for name in self.picture_keys if getattr(self, name) is not None]
 
     @property
     def photo(self) -> Picture | str | None:
@@ -260,6 +266,76 @@ class Target(Record):
         return drawing(self).remarks
 
 
+class AngularTarget(Target):
+    """The radiant intensity over a rectangle of two angles; for a file, row 0 of the picture is y max as on a plane."""
+
+    kind: Annotated[  # type: ignore[assignment]  # each kind of target has a tag of its own
+        Literal["intensity"], Key("Radiant intensity over directions, x and y in degrees.")
+    ]
+    z: Annotated[float, Key("Not used: directions have no position.", "mm", *COORDINATES)] = FAR_Z
+    x: Annotated[
+        tuple[float, float],
+        Key("Ends of the target along x, as angles.", "degrees", -180.0, 180.0, example=[-30.0, 30.0]),
+    ]
+    y: Annotated[
+        tuple[float, float],
+        Key("Ends of the target along y, as angles.", "degrees", -180.0, 180.0, example=[-30.0, 30.0]),
+    ]
+    angles: Annotated[
+        Angles,
+        Key("Coordinates: C angle from the axis, A horizontal angle and elevation, B angles to the side and upwards."),
+    ] = "C"
+    intensity: Annotated[
+        Annotated[IntensityFile, *from_file(IntensityFile, read_intensity, "intensity = 'wanted.ldt'")] | None,
+        Key("Intensity to be reached, from a file (.ies, .ldt, .csv).", example="wanted.ldt"),
+    ] = None
+
+    outline: Annotated[Outlined | None, Key("Outline in angles; the picture is dark outside.")] = None
+    profile: Annotated[
+        Profile | None, Key("Intensity of this shape, its lengths in degrees, instead of a picture.")
+    ] = None
+
+    written = leaving_out(z=FAR_Z, weight=1.0)
+    picture_keys = PICTURE_KEYS
+
+    @property
+    def screen(self) -> Screen:
+        """The receiver with its pixels."""
+        return Screen(0.0, self.x, self.y, self.columns_rows, surface=Directions(self.angles))
+
+    def complaints(self) -> Iterator[str]:
+        """Yield the faults of the table, each as "key: sentence"."""
+        for key, given in (("z", self.z != FAR_Z), ("tilt", self.tilt is not None)):
+            if given:
+                yield f"target.{key}: directions have no {'position' if key == 'z' else key}; remove this key"
+        limits = {"C": (180.0, 180.0), "A": (180.0, 90.0), "B": (90.0, 180.0)}[self.angles]
+        for axis, ends, limit in zip("xy", (self.x, self.y), limits, strict=True):
+            if max(map(abs, ends)) > limit:
+                yield f"target.{axis}: an angle is beyond {limit:g} degrees; make the target smaller"
+        yield from super().complaints()
+
+    def behind(self, lens: LensBlank) -> Iterator[str]:
+        """Yield nothing: directions have no position."""
+        yield from ()
+
+    def metres(self, lens: LensBlank) -> Iterator[str]:
+        """Yield nothing: angles are no lengths."""
+        yield from ()
+
+    def unfaced(self, lens: LensBlank) -> Iterator[str]:
+        """Yield nothing: every lens faces all directions."""
+        yield from ()
+
+    def light_of_file(self) -> np.ndarray:
+        """Return the file's intensity at the centres of the pixels, (rows, columns); row 0 is y max, column 0 x min."""
+        assert self.intensity is not None
+        (left, right), (low, high) = self.x, self.y
+        columns, rows = self.columns_rows
+        x = left + (np.arange(columns) + 0.5) * (right - left) / columns
+        y = high - (np.arange(rows) + 0.5) * (high - low) / rows
+        return self.intensity.table.at(*Directions(self.angles).direction(*np.meshgrid(x, y)))
+
+
 def is_faced(plane: PlaneReceiver, vertex: Vector) -> bool:
     """Return True if the line from `vertex` (mm) to the plane's middle meets its front at more than 1° (EDGE_ON)."""
     return -plane.height(vertex) > EDGE_ON * math.dist(plane.middle, vertex)
@@ -336,9 +412,15 @@ def _corner_heights(screen: Screen, other: Screen) -> list[float]:
 if TYPE_CHECKING:
     Targets: TypeAlias = tuple[Target, ...]
 else:
+    OneTarget = Annotated[
+        Annotated[Target, Tag("plane")] | Annotated[AngularTarget, Tag("intensity")],
+        Discriminator(
+            lambda given: (given.get if isinstance(given, dict) else partial(getattr, given))("kind", "plane")
+        ),
+    ]
     Targets = Annotated[  # one table of a file, or a list of them; validated to a tuple
-        Annotated[Target, Tag("table")]
-        | Annotated[tuple[Target, ...], Tag("list"), Field(min_length=1, max_length=MAX_TARGETS)],
+        Annotated[OneTarget, Tag("table")]
+        | Annotated[tuple[OneTarget, ...], Tag("list"), Field(min_length=1, max_length=MAX_TARGETS)],
         Discriminator(lambda given: "list" if isinstance(given, list | tuple) else "table"),
         AfterValidator(with_distinct_names),
     ]
@@ -369,6 +451,8 @@ def _drawing(target: Target) -> Drawing:
             light, remarks = _photo_light(target, given, pixels, size)
     elif target.profile is not None:
         light = target.profile.light(pixels, size)
+    elif isinstance(target, AngularTarget) and target.intensity is not None:
+        light = target.light_of_file()[:, ::-1]  # as seen from the lens
     else:
         light = np.ones(pixels[::-1])
     light = np.rot90(light, target.rotate // 90)

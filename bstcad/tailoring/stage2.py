@@ -48,10 +48,10 @@ from bstcad.tailoring.source_image import ExtendedSource
 RoundFractions = tuple[tuple[float, float], ...]  # (tubes per side, evaluations) of rounds, relative to the settings
 # Rounds if the last one has DENSE_TUBES tubes or more per cell of the control net along each axis.
 DENSE_ROUNDS, DENSE_TUBES = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08)), 2.5
-# Rounds if, of these, the first has fewer than DENSE_TUBES tubes per cell, for a lens without bounds on its shape and at
-# most SHORT_EVALUATIONS.  The last round corrects what the others distort between the tubes; these end on the plateau
-# FEW_TUBES.  (RRMSD 0.0225 of letters after 73 evaluations and 0.0439 of a portrait after 58; 0.0227 and 0.0447 after 98
-# in DENSE_ROUNDS.  With 300 evaluations, as in fine quality, the short rounds end at 0.0168 instead of 0.0148.)
+# Rounds if, of these, the first has fewer than DENSE_TUBES tubes per cell, for a lens without bounds on its shape and
+# at most SHORT_EVALUATIONS.  The last round corrects what the others distort between the tubes; these end on the
+# plateau FEW_TUBES.  (RRMSD 0.0225 of letters after 73 evaluations and 0.0439 of a portrait after 58; 0.0227 and 0.0447
+# after 98 in DENSE_ROUNDS.  With 300 evaluations, as in fine quality, short rounds end at 0.0168 instead of 0.0148.)
 SHORT_ROUNDS, FEW_TUBES, SHORT_EVALUATIONS = ((1 / 2, 0.37), (2 / 3, 0.21), (1.0, 0.16)), Plateau(5, 0.05), 150
 # Rounds if the last one has fewer than DENSE_TUBES tubes per cell.  The first rounds then distort the net between the
 # tubes, and the last one has to correct this, with MAX_TUBES tubes per side or fewer, since more need much memory; if

@@ -81,6 +81,7 @@ def test_a_choice_that_is_offered_is_possible_or_told_why_not(name, monkeypatch)
             done = fault(take(text, field.key, choice, valid_text=text)[0])
             assert done == greyed.get(field.key, {}).get(choice), (field.key, choice)
     usual = {"two_pictures": {"tailoring.quality": {"paper"}, "tailoring.method": {"adam", "integration"}}}
+    usual["two_pictures"] |= {f"target[{k}].kind": {"intensity"} for k in (0, 1)}
     usual["mirror"] = {"lens.front.kind": {"bspline"}}
     usual["led"] = {"effects[0].kind": {"own"}}
     assert {key: {*choices} for key, choices in greyed.items()} == usual.get(name, {})

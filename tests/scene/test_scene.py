@@ -9,17 +9,17 @@ import torch
 from PIL import Image
 
 from bstcad.cad.mounting import wire
-from bstcad.optics.collimated import Collimated
 from bstcad.optics.losses import CoatingLayer, FresnelLoss
 from bstcad.optics.media import refractive_index
 from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.point import Point
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.surfaces import Plane, Recess, Sphere
 from bstcad.optics.trace import ghost_light
 from bstcad.report.record import simulated
+from bstcad.scene.beam import Collimated
 from bstcad.scene.blank import Back, LensBlank, PlaneFront, SphereFront
 from bstcad.scene.errors import SceneError, line_of, toml_positions
+from bstcad.scene.lamp import Point
 from bstcad.scene.mount import LENS_COLOUR, MIRROR_COLOUR, Box, Part, Round
 from bstcad.scene.picture import Picture
 from bstcad.scene.quality import PRESETS, VERIFICATION_POINTS, Tailoring, coarse_to_fine

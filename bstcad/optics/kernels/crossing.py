@@ -230,10 +230,42 @@ def _add_tilted(faces, throw, tilted, g, status, first, count, work):
 
 
 @njit(error_model="numpy", fastmath={"contract"})
+def _add_directions(tilted, g, status, first, count, work):
+    """Add ∂L/∂(direction behind the face) of rays that are collected by their directions (`forward.angles`).
+
+    C: with r = hypot(x, y), s = θ / r and θ = atan2(r, z), ds = (dθ - s dr) / r and dθ = (z dr - r dz) / (r² + z²).
+    """
+    for r in range(count):
+        at, ex, ey, ez = first + r, work[E_X + r], work[E_Y + r], tilted.n_z * work[E_Z + r]
+        gx, gy = (g[0, at], g[1, at]) if status[at] == 0 else (0.0, 0.0)
+        gx, gy = forward.DEGREES * gx, forward.DEGREES * gy
+        if tilted.chart == 1:
+            r2 = max(ex * ex + ey * ey, 1e-30)
+            radius = math.sqrt(r2)
+            norm2 = r2 + ez * ez
+            s, along = math.atan2(radius, ez) / radius, (gx * ex + gy * ey) / r2
+            by_radius = along * (radius * ez / norm2 - s * radius)  # ∂L/∂r beside that of x and y
+            by_x, by_y = s * gx + by_radius * ex / radius, s * gy + by_radius * ey / radius
+            by_z = -along * r2 / norm2
+        else:
+            one, other, g_one, g_other = (ex, ey, gx, gy) if tilted.chart == 2 else (ey, ex, gy, gx)
+            flat = one * one + ez * ez
+            by_one, by_z = g_one * ez / flat, -g_one * one / flat
+            by_other = g_other / math.sqrt(max(1.0 - other * other, 1e-12))
+            by_x, by_y = (by_one, by_other) if tilted.chart == 2 else (by_other, by_one)
+        work[G_DX + r] += by_x
+        work[G_DY + r] += by_y
+        work[G_DZ + r] += tilted.n_z * by_z
+
+
+@njit(error_model="numpy", fastmath={"contract"})
 def _add_landing(faces, throw, tilted, g, status, first, count, work):
     """Add ∂L/∂(hit, direction behind the face) of rays that land on a screen; g (2, n): ∂L/∂landing."""
     if tilted is not None:
-        _add_tilted(faces, throw, tilted, g, status, first, count, work)
+        if tilted.chart > 0:
+            _add_directions(tilted, g, status, first, count, work)
+        else:
+            _add_tilted(faces, throw, tilted, g, status, first, count, work)
         return
     for r in range(count):
         at, ez = first + r, work[E_Z + r]

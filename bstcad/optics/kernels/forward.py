@@ -195,6 +195,29 @@ def at_back(faces, count, work):
         work[FATE + r] = fate if met | (fate != 0.0) else faces.fates.missed_back
 
 
+DEGREES = 180.0 / math.pi
+
+
+@njit(error_model="numpy")
+def angles(chart, x, y, z):
+    """Return the coordinates (degrees) of a unit vector, as `Directions.coordinates` does."""
+    if chart == 1:
+        r = math.sqrt(max(x * x + y * y, 1e-30))
+        scale = DEGREES * math.atan2(r, z) / r
+        return scale * x, scale * y
+    if chart == 2:
+        return DEGREES * math.atan2(x, z), DEGREES * math.asin(min(max(y, -1.0), 1.0))
+    return DEGREES * math.asin(min(max(x, -1.0), 1.0)), DEGREES * math.atan2(y, z)
+
+
+@njit(error_model="numpy")
+def to_directions(tilted, count, work):
+    """Replace the places of rays by the coordinates of their directions."""
+    for r in range(count):
+        dx, dy, dz = work[DX + r], work[DY + r], tilted.n_z * work[DZ + r]
+        work[X + r], work[Y + r] = angles(tilted.chart, dx, dy, dz)
+
+
 @njit(error_model="numpy")
 def to_tilted(faces, throw, tilted, count, work):
     """Move rays from the back face to a tilted screen, as `TiltedPlane.land` does."""
@@ -216,7 +239,10 @@ def to_tilted(faces, throw, tilted, count, work):
 def to_screen(faces, throw, tilted, count, work):
     """Move rays from the back face to the screen; store x and y on it.  throw: as `Faces.throw`."""
     if tilted is not None:
-        to_tilted(faces, throw, tilted, count, work)
+        if tilted.chart > 0:
+            to_directions(tilted, count, work)
+        else:
+            to_tilted(faces, throw, tilted, count, work)
         return
     sense, grazing, turned = -1.0 if faces.reflects else 1.0, faces.rules.grazing, faces.fates.turned
     for r in range(count):
@@ -295,6 +321,45 @@ def tilt(beam, count, work):
 
 
 @njit(error_model="numpy")
+def shape(beam, count, work):
+    """Multiply the flux density, 1 where there is light, by the irradiance of a profile, as `Profile.density` does.
+
+    The irradiance of a point source on a plane at the distance D is E D / c³, c = n · p, or E D / |p|³ for an
+    intensity.
+    """
+    pattern, net = beam.pattern, beam.pattern.net
+    for r in range(count):
+        if not work[FLUX + r] > 0.0:
+            continue
+        x, y, factor = work[X + r] - beam.x, work[Y + r] - beam.y, 1.0
+        u, v = x * pattern.x.x + y * pattern.x.y, x * pattern.y.x + y * pattern.y.y
+        if beam.distance > 0.0:
+            c = x * pattern.axis.x + y * pattern.axis.y + beam.distance * pattern.axis.z
+            u, v = u + beam.distance * pattern.x.z, v + beam.distance * pattern.y.z
+            if pattern.stereographic:
+                d2 = x * x + y * y + beam.distance * beam.distance
+                d = math.sqrt(d2)
+                factor, c = beam.distance / (d2 * d), c + d
+            elif c > 0.0:
+                factor = beam.distance / (c * c * c)
+            else:
+                work[FLUX + r] = 0.0
+                continue
+            u, v = u / c, v / c
+        if u * u + v * v < pattern.inner2:
+            factor = 0.0
+        if pattern.fall_u > 0.0:
+            a, b = u * pattern.fall_u, v * pattern.fall_v
+            factor *= math.exp(-2.0 * (a * a + b * b) ** pattern.power)
+        if net.m > 0:
+            e = 0.0
+            if (u >= net.u_min) & (u <= net.u_max) & (v >= net.v_min) & (v <= net.v_max):
+                e, _, _ = sag(net.values, net.m, net.n, (u - net.u_min) * net.per_u, (v - net.v_min) * net.per_v)
+            factor *= max(e, 0.0)
+        work[FLUX + r] *= factor
+
+
+@njit(error_model="numpy")
 def _look_up(peak, table, count, work):
     """Store flux density and direction of the rays through the points from the splines of a table."""
     last_u, last_v = table.m - 1.0, table.n - 1.0
@@ -346,7 +411,9 @@ def _trace(net, beam, faces, tilted, losses, count, work, active):
         _look_up(beam.peak, beam.table, count, work)
     else:
         launch(beam, count, work)
-    if beam.tilted == 1 and beam.distance > 0.0:
+    if beam.pattern.present:
+        shape(beam, count, work)
+    elif beam.tilted == 1 and beam.distance > 0.0:
         tilt(beam, count, work)
     if faces.reflects:  # there is no front: rays start at the source
         for r in range(count):

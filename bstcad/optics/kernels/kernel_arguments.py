@@ -163,9 +163,12 @@ def _table_of_light(source: Emitter, window: Rectangle, z: float) -> Beam | None
 
 def _tilted(plane: Receiver, before: int, behind: int) -> records.TiltedScreen:
     """Return a plane as numbers; before, behind: sense of light on the net's two sides."""
+    if plane.chart:  # the coordinates of the direction, whose z component is `before` times that in the kernels' frame
+        return records.TiltedScreen._make([*floats([0.0, 0.0, 0.0, 0.0, before, *6 * [0.0]]), plane.chart])
     assert plane.axes is not None  # no kernel traces to other receivers
     along_x, along_y, normal = ((*axis[:2], before * axis[2]) for axis in plane.axes)
-    return records.TiltedScreen(*floats([*plane.middle[:2], *(behind * n for n in normal), *along_x, *along_y]))
+    numbers = floats([*plane.middle[:2], *(behind * n for n in normal), *along_x, *along_y])
+    return records.TiltedScreen._make([*numbers, 0])
 
 
 def cells(window: Rectangle, n: int, seed: int) -> RayCells:

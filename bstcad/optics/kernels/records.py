@@ -36,6 +36,53 @@ class LightTable(NamedTuple):
 NO_TABLE = LightTable(0, 0, 0.0, 0.0, 0.0, 0.0, *3 * (np.zeros(0),))
 
 
+class Frame3(NamedTuple):
+    """Vector in the frame in which light starts along +z."""
+
+    x: float
+    y: float
+    z: float
+
+
+class NetTable(NamedTuple):
+    """Net of a quadratic B-spline in (u, v), as `profiles.Net`."""
+
+    m: int  # control points along u; 0: no net
+    n: int  # control points along v
+    u_min: float  # range of u
+    u_max: float
+    v_min: float  # range of v
+    v_max: float
+    per_u: float  # spans per unit
+    per_v: float
+    values: np.ndarray  # (m n,)
+
+
+NO_NET = NetTable._make([0, 0, *6 * (0.0,), np.zeros(0)])
+
+
+class Pattern(NamedTuple):
+    """Irradiance E(u, v) as `profiles.Profile`; u = p · x / (p · axis), v likewise, for a ray p of a point source.
+
+    For parallel light u = p · x and v = p · y for the place p from the centre of the beam, on any plane z = const.
+    """
+
+    present: int  # 1: the irradiance is this profile; 0: the formula of `Beam`
+    x: Frame3  # direction of u
+    y: Frame3  # direction of v
+    axis: Frame3  # axis of a point source
+    fall_u: float  # 1 / w_u; 0: no fall
+    fall_v: float
+    power: float  # order / 2
+    inner2: float  # square of the radius of the dark disc
+    stereographic: int  # 1: u = p · x / (d + p · axis), and E is the intensity, so that it is E D / d³ on a plane
+    net: NetTable
+
+
+_UNIT = Frame3(0.0, 0.0, 1.0)
+NO_PATTERN = Pattern._make([0, _UNIT, _UNIT, _UNIT, 0.0, 0.0, 1.0, 0.0, 0, NO_NET])
+
+
 class Beam(NamedTuple):
     """Irradiance E = peak exp(-fall r²) / d^power on the first vertex's plane; r, d: distances from (x, y) and source.
 
@@ -59,6 +106,7 @@ class Beam(NamedTuple):
     n_z: float = 1.0
     least: float = 0.0  # smallest cosine of the angle to the axis at which there is light
     table: LightTable = NO_TABLE  # table of the light
+    pattern: Pattern = NO_PATTERN  # irradiance by a profile of its own, inside the limits
 
 
 class Rules(NamedTuple):
@@ -84,7 +132,7 @@ class Fates(NamedTuple):
 
 
 class TiltedScreen(NamedTuple):
-    """Tilted plane as numbers, in the frame in which light starts along +z; `Faces.throw`: height of C over the net."""
+    """Tilted plane or directions, in the frame where light starts along +z; `Faces.throw`: height of C over the net."""
 
     x: float  # position of the centre C of the rotation (mm), also the coordinates of C on the plane
     y: float
@@ -97,6 +145,7 @@ class TiltedScreen(NamedTuple):
     y_x: float  # y axis of the plane
     y_y: float
     y_z: float
+    chart: int = 0  # directions.CHARTS, for the coordinates of the direction (x, y, n_z z); 0: a plane
 
 
 class Screens(NamedTuple):

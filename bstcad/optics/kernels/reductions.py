@@ -62,11 +62,15 @@ class Quotient(torch.autograd.Function):
         return g / whole, -total(g * divided) / whole
 
 
-def elementary(function: Callable[[Tensor], Tensor], t: Tensor) -> Tensor:
-    """Apply exp, sin, cos … to each number of t, differentiable, with the same rounding for any number of threads."""
-    if t.device.type != "cpu" or t.numel() <= ELEMENTARY:
-        return function(t)
-    return torch.cat([function(part) for part in t.reshape(-1).split(ELEMENTARY)]).view(t.shape)
+def elementary(function: Callable[..., Tensor], *t: Tensor) -> Tensor:
+    """Apply exp, sin, atan2 … to each number of t, or to numbers of tensors of one shape; differentiable.
+
+    The rounding is the same for any number of threads.
+    """
+    if t[0].device.type != "cpu" or t[0].numel() <= ELEMENTARY:
+        return function(*t)
+    parts = zip(*(each.reshape(-1).split(ELEMENTARY) for each in t), strict=True)
+    return torch.cat([function(*part) for part in parts]).view(t[0].shape)
 
 
 def dot(a: Tensor, b: Tensor) -> float:

@@ -1,0 +1,109 @@
+"""Measured beams: moments of known beams under noise, and the light of a scene with one, from its file to its copy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import bstcad
+from bstcad.optics.outlines import EVERYWHERE
+from bstcad.scene.beam import background, lit, moments
+from bstcad.scene.errors import SceneError
+
+SIDE, WIDTH = 400, 12.0  # pixels, mm
+
+
+def camera(w=(1.5, 0.8), turn=30.0, at=(0.4, -0.7), rows=300):
+    """A Gaussian in 12 bits over a background of 40 with noise of 3; row 0 at the top."""
+    pitch = WIDTH / SIDE
+    x, y = np.meshgrid((np.arange(SIDE) - (SIDE - 1) / 2) * pitch, ((rows - 1) / 2 - np.arange(rows)) * pitch)
+    cos, sin = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+    u, v = cos * (x - at[0]) + sin * (y - at[1]), cos * (y - at[1]) - sin * (x - at[0])
+    light = 3000 * np.exp(-2 * (u**2 / w[0] ** 2 + v**2 / w[1] ** 2))
+    return light + 40 + 3 * np.random.default_rng(0).standard_normal(light.shape)
+
+
+@pytest.mark.parametrize("turn", [30.0, -40.0, 0.0])
+def test_moments_are_those_of_the_gaussian_under_the_noise(turn):
+    """d4σ = 2 w along both axes; what lies below three standard deviations of the background is lost."""
+    picture = camera(turn=turn)
+    mean, deviation = background(picture)
+    assert (mean, deviation) == (pytest.approx(40, abs=0.3), pytest.approx(3, rel=0.05))
+    found = moments(lit(picture), WIDTH)
+    assert found.centre == pytest.approx((0.4, -0.7), abs=0.005)
+    assert found.widths == pytest.approx((3.0, 1.6), rel=0.02)
+    assert found.rotate == pytest.approx(turn, abs=0.5)
+    assert found.words.startswith("2.98 × 1.59 mm") or found.words.startswith("2.97")
+
+
+def scene(folder, name, **more):
+    asked = {"source.profile": {"image": str(folder / name), "width": WIDTH, **more}, "target.uniform": True}
+    return bstcad.load("templates/thu.toml").changed(asked)
+
+
+def test_the_light_of_a_scene_is_the_picture_of_the_beam(tmp_path):
+    """A picture of 16 bits and a table give it upright, on its centroid, and the same from its copy."""
+    picture = camera()
+    Image.fromarray(np.clip(picture * 16, 0, 65535).astype(np.uint16)).save(tmp_path / "beam.tif")
+    np.savetxt(tmp_path / "beam.csv", picture, delimiter=",", fmt="%.1f")
+    lights = []
+    for name in ("beam.tif", "beam.csv"):
+        source = scene(tmp_path, name).source
+        x, y = torch.meshgrid(*2 * (torch.linspace(-4, 4, 321, dtype=torch.float64),), indexing="ij")
+        light = source.irradiance(x, y, 0.0)
+        assert float(light.sum()) * (8 / 320) ** 2 == pytest.approx(1, abs=0.01)
+        lights.append(light)
+        peak = np.unravel_index(int(light.argmax()), light.shape)
+        assert (float(x[peak]), float(y[peak])) == pytest.approx((0.0, 0.0), abs=0.1)
+        cos, sin = math.cos(math.pi / 6), math.sin(math.pi / 6)
+        places = (torch.tensor([0.7 * cos, 0.7 * cos]), torch.tensor([0.7 * sin, -0.7 * sin]))
+        along = source.irradiance(*places, 0.0)
+        assert along[0] > 1.3 * along[1]  # the long axis rises to the right
+        assert "centroid at (0.4, -0.7) mm" in source.words(0.0)
+    torch.testing.assert_close(*lights, rtol=0.02, atol=1e-3)
+    there = scene(tmp_path, "beam.tif", origin="picture").source
+    assert float(there.irradiance(torch.tensor(0.4), torch.tensor(-0.7), 0.0)) > 0.99 * float(lights[0].max())
+
+
+def test_an_array_is_a_measured_beam(tmp_path):
+    picture = np.maximum(camera() - 40, 0.0)
+    made = bstcad.load("templates/thu.toml").changed({"source.profile": {"image": picture, "width": WIDTH}})
+    assert made.source.law.flux(EVERYWHERE) > 0
+    (tmp_path / "scene.toml").write_text(made.toml(), encoding="utf-8")
+    for name, content in made.files.items():
+        (tmp_path / name).write_bytes(content.copy)
+    again = bstcad.load(tmp_path / "scene.toml")
+    x = torch.linspace(-3, 3, 50, dtype=torch.float64)
+    assert torch.equal(again.source.irradiance(x, 0 * x, 0.0), made.source.irradiance(x, 0 * x, 0.0))
+
+
+@pytest.mark.parametrize(("content", "sentence"), [
+    (b"1,2,3\n4,5\n", "is not a table of numbers"),
+    (b"a,b\n", "is not a table of numbers"),
+    (b"1 2\n3 4\n", "at least 5 x 5"),
+    (b"\n".join([b"7,7,7,7,7,7,7,7"] * 8), "shows no light above its background"),
+    (b"\n".join([b"nan,7,7,7,7,7,7,7"] * 8), "all finite"),
+])  # fmt: skip
+def test_wrong_tables_are_refused(content, sentence, tmp_path):
+    (tmp_path / "beam.csv").write_bytes(content)
+    with pytest.raises(SceneError, match=rf"^source\.profile\.image: 'beam.csv' .*{sentence}"):
+        scene(tmp_path, "beam.csv")
+
+
+@pytest.mark.parametrize(("changes", "sentence"), [
+    ({"source.profile": "super_gaussian", "source.radius_1e2": 8.0}, r"source\.order: missing"),
+    ({"source.profile": "annular"}, r"source\.inner_radius: missing"),
+    ({"source.profile": "annular", "source.inner_radius": 90.0}, r"source\.inner_radius: the dark centre fills"),
+    ({"source.rotate": 10.0}, r"source\.rotate: the profile is round"),
+    ({"source.profile": "gaussian", "source.radius_1e2": [8.0, 4.0, 2.0]}, r"source\.radius_1e2: .*"),
+    ({"source.profile": "gausian"}, r"source\.profile: 'gausian' is not possible; did you mean 'gaussian'"),
+    ({"source.profile": {"image": "none.tif", "width": 12.0}}, r"source\.profile\.image: .* not found"),
+    ({"source.profile": {"image": "none.tif"}}, r"source\.profile\.image: .* not found|source\.profile\.width"),
+])  # fmt: skip
+def test_wrong_profiles_are_refused(changes, sentence):
+    with pytest.raises(SceneError, match=f"^{sentence}"):
+        bstcad.load("templates/thu.toml").changed(changes)

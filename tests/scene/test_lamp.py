@@ -1,0 +1,76 @@
+"""Intensity files of lamps: the light of a scene with one, its flux, orientation and copy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import bstcad
+from bstcad.optics import sampling
+from bstcad.optics.outlines import Rectangle
+from bstcad.photometry import eulumdat, ies
+from bstcad.photometry.intensity import Luminaire, checked
+from bstcad.scene.errors import SceneError
+
+
+def table():
+    """A cone of 30 degrees about γ = 20, C = 30."""
+    planes, along = np.arange(0.0, 360.0, 5.0), np.linspace(0.0, 90.0, 37)
+    c, g = np.radians(planes)[:, None], np.radians(along)[None]
+    aim = math.sin(math.radians(20)), math.radians(30)
+    cos = aim[0] * np.sin(g) * np.cos(c - aim[1]) + math.cos(math.radians(20)) * np.cos(g)
+    return checked("C", planes, along, 500 * np.exp(-((np.arccos(np.clip(cos, -1, 1)) / math.radians(30)) ** 2)), None)
+
+
+@pytest.fixture(params=["lamp.ies", "lamp.ldt"])
+def scene(request, tmp_path):
+    write = ies.write if request.param.endswith("ies") else eulumdat.write
+    (tmp_path / request.param).write_bytes(write(table(), Luminaire()))
+    changes = {
+        "source": {"kind": "point", "intensity": str(tmp_path / request.param), "position": [0.0, 0.0, -20.0]},
+        "target.uniform": True,
+    }
+    return bstcad.load("templates/disk.toml").changed(changes)
+
+
+def test_the_light_of_a_lamp_is_the_file_s(scene, tmp_path):
+    """Intensities by the irradiance on a plane, E d³ / D; C from x towards -y; flux by the file's own integral."""
+    source, given = scene.source, table()
+    assert source.lumens == pytest.approx(given.lumens, rel=1e-4)
+    assert f"{given.lumens:.4g}"[:4] in source.words(0.0)
+    for c, g in ((30.0, 20.0), (120.0, 10.0), (270.0, 45.0), (0.0, 0.0)):
+        x, y = (20 * math.tan(math.radians(g)) * p for p in (math.cos(math.radians(c)), -math.sin(math.radians(c))))
+        light = float(source.irradiance(torch.tensor(x).double(), torch.tensor(y).double(), 0.0))
+        d = math.hypot(x, y, 20.0)
+        assert light * d**3 / 20 * source.lumens == pytest.approx(given.between(np.array(c), np.array(g)), rel=0.01)
+    x, y = sampling.grid(Rectangle(1200.0, 1200.0), 2000)
+    assert float(source.irradiance(x, y, 0.0).sum()) * (1200 / 2000) ** 2 == pytest.approx(1, abs=0.003)
+    again = bstcad.load(saved(scene, tmp_path / "copy"))
+    assert torch.equal(again.source.irradiance(x, y, 0.0), source.irradiance(x, y, 0.0))
+
+
+def saved(scene, folder):
+    folder.mkdir()
+    (folder / "scene.toml").write_text(scene.toml(), encoding="utf-8")
+    for name, content in scene.files.items():
+        (folder / name).write_bytes(content.copy)
+    return folder / "scene.toml"
+
+
+def test_a_rotation_turns_the_light_about_the_axis(scene):
+    turned = scene.changed({"source.rotate": 90.0}).source
+    x, y = torch.tensor([5.0, 3.0]).double(), torch.tensor([-2.0, 4.0]).double()
+    torch.testing.assert_close(turned.irradiance(-y, x, 0.0), scene.source.irradiance(x, y, 0.0), rtol=2e-3, atol=0)
+
+
+def test_wrong_intensities_are_refused(scene, tmp_path):
+    (tmp_path / "bad.ies").write_bytes(b"IESNA:LM-63-2002\nTILT=NONE\n1 -1 1 3 1 1 2 0 0 0\n1 1 10\n0 45 90\n0\n1 1\n")
+    with pytest.raises(SceneError, match=r"^source\.intensity: 'bad.ies' ends after .* not complete"):
+        scene.changed({"source.intensity": str(tmp_path / "bad.ies")})
+    with pytest.raises(SceneError, match=r"^source\.intensity: .* cannot be read"):
+        scene.changed({"source.intensity": str(tmp_path / "none.ies")})
+    with pytest.raises(SceneError, match=r"^source\.profile: the source also has an intensity"):
+        scene.changed({"source.profile": "uniform", "source.half_angle": 20.0})
