@@ -24,6 +24,7 @@ import numpy as np
 
 import bstcad
 from bstcad import folder as folders
+from bstcad.analysis.far_field import FarField
 from bstcad.folder import Made
 from bstcad.judges import comparison
 from bstcad.judges.comparison import Comparison
@@ -468,8 +469,9 @@ def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> Exp
 def _export(made: Made, kinds: Sequence[str], folder: Path, points: int | None = None) -> Exported:
     scene, lens = made.scene, made.lens
     light = GridLight(scene.source.central, tuple(target.screen for target in scene.targets))
+    far = FarField(scene.verification_channels(), scene.source.luminous_flux)
     return exports.export(
-        lens, kinds, folder, points=points, label=folders.label(scene), mount=scene.mount, light=light
+        lens, kinds, folder, points=points, label=folders.label(scene), mount=scene.mount, light=light, far=far
     )
 
 

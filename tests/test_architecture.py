@@ -39,11 +39,11 @@ MAY_IMPORT = {
     "tailoring": {"scene", "optics", "transport"},
     "baselines": {"scene", "optics", "transport", "tailoring"},
     "cad": {"runs", "scene", "optics", "step_text"},
-    "analysis": {"optics"},
+    "analysis": {"optics", "photometry"},
     "verify": {"runs", "scene", "optics", "step_text", "cad", "analysis"},
     "judges": {"scene", "optics", "verify"},
     "measured": {"runs", "optics", "analysis", "verify"},
-    "report": {"runs", "scene", "optics", "cad", "analysis", "verify", "judges", "measured"},
+    "report": {"runs", "scene", "optics", "photometry", "cad", "analysis", "verify", "judges", "measured"},
     "designs": {*ENGINE, "bstcad"} - {"judges", "measured"},
     # Designs come about in processes of their own; a sweep times and judges with the engine's tools.
     "sweep": {"runs", "scene", "optics", "tailoring", "analysis", "verify", "report", "designs", "bstcad"},

@@ -103,6 +103,8 @@ def _profile_widths(data: Mapping[str, Any], profile: Any) -> dict[str, Any]:
     wanted = WIDTHS.get((kind, profile), ()) if isinstance(profile, str) else ()
     known = {name for (of, _), names in WIDTHS.items() if of == kind for name in names}
     changes: dict[str, Any] = {f"source.{name}": None for name in sorted(known - {*wanted}) if name in source}
+    if "rotate" in source and not isinstance(source.get("radius_1e2", source.get("half_angle_1e2")), list):
+        changes["source.rotate"] = None
     for name in wanted:
         if name not in source and (made := _width(data, source, name)) is not None:
             changes[f"source.{name}"] = made

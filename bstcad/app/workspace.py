@@ -226,7 +226,7 @@ class Workspace:
                 files.put(self.path(name), changed(_renamed(commented, name), "name", name).encode())
                 return name
             for key, content in contents(loaded):
-                if isinstance(content, picture.Picture):
+                if isinstance(content, picture.Picture) and not content.name.endswith(".csv"):
                     file = f"{PICTURES}/{self.keep(content.data)}"
                 else:
                     files.put(self.scenes / (file := f"{name}-{content.name}"), content.copy)

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
-from bstcad.optics.emitters import PROFILE_NAMES, Emitter, OneOrTwo, TiltKey, WavelengthKey, all_alive
+from bstcad.optics.emitters import PROFILE_NAMES, Emitter, LumensKey, OneOrTwo, TiltKey, WavelengthKey, all_alive
 from bstcad.optics.kernels.records import NO_PATTERN, Beam
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
@@ -65,6 +65,7 @@ class Collimated(Emitter):
     rotate: Annotated[
         float | None, Key("Rotation of the profile about its centre, from x towards y.", "degrees", -180.0, 180.0)
     ] = None
+    lumens: LumensKey = None
     kind: Annotated[Literal["collimated"], Key("Parallel light.")] = "collimated"
 
     __pydantic_config__ = STRICT
@@ -80,8 +81,10 @@ class Collimated(Emitter):
 
     def complaints(self, z: float, optic: str) -> Iterator[str]:
         """Yield a sentence if directions are inclined too far to the axis, or the profile leaves no light."""
-        if self.inner_radius is not None and not self.inner_radius < max(self.aperture.half_extent):
-            yield "inner_radius: the dark centre fills the aperture; make it smaller"
+        if self.inner_radius is not None and not self.inner_radius < min(self.aperture.half_extent):
+            yield "inner_radius: the dark centre reaches the rim of source.aperture; make it smaller"
+        elif self.law is not None and not self.law.flux(self.aperture) > 0:
+            yield "profile: the beam has no light inside source.aperture; move it, or widen the aperture"
         lean = math.degrees(math.acos(max(-1.0, min(1.0, self.axes[2][2]))))
         if not lean + (self.divergence or 0.0) / 2 < MAX_INCLINATION:
             key, light = ("divergence", "a part of the light") if self.divergence else ("tilt", "the light")

@@ -10,6 +10,7 @@ A unit vector d has the angle θ from +z, and the coordinates
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -33,6 +34,7 @@ NAMES = {
 }  # fmt: skip
 TINY = 1e-30
 DRAWN_WIDTHS = 3.0  # distance at which directions are drawn, in widths of the lens
+MAX_VALUES = 1 << 22  # number of solid angles that are computed at a time
 NODES = 4  # Gauss-Legendre nodes per side of a cell, for its solid angle
 
 Angles = Literal["C", "A", "B"]
@@ -127,15 +129,21 @@ class Directions(Receiver):
 
     def areas(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray | None:
         """Return the solid angles of (rows, columns) cells of ranges x, y, divided by their mean; row 0 is y max."""
+        return _areas(self, x, y, shape=shape)
+
+    def computed_areas(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray:
+        """Return `areas`, computed anew, a few rows at a time."""
         rows, columns = shape
         node, weight = np.polynomial.legendre.leggauss(NODES)
         at_x, at_y = (
             np.radians(low + (np.arange(n)[:, None] + (node + 1) / 2) * (high - low) / n)
             for (low, high), n in ((x, columns), (y, rows))
         )
-        density = self._density(at_x[None, None], at_y[:, :, None, None])
-        cells = (density * (weight[:, None, None] * weight / 4)).sum((1, 3))[::-1]
-        return cells / cells.mean()
+        cells, strip = np.empty(shape), max(MAX_VALUES // (columns * NODES**2), 1)
+        for first in range(0, rows, strip):
+            density = self._density(at_x[None, None], at_y[first : first + strip, :, None, None])
+            cells[first : first + strip] = (density * (weight[:, None, None] * weight / 4)).sum((1, 3))
+        return cells[::-1] / cells.mean()
 
     def _density(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return the solid angle per dx dy at coordinates in rad."""
@@ -143,3 +151,8 @@ class Directions(Receiver):
         if self.angles == "A":
             return np.cos(y)
         return np.cos(x) if self.angles == "B" else np.sinc(np.hypot(x, y) / np.pi)  # sin θ / θ
+
+
+@functools.lru_cache(maxsize=4)
+def _areas(receiver: Directions, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray:
+    return receiver.computed_areas(x, y, shape)

@@ -32,6 +32,9 @@ WavelengthKey = Annotated[  # key of every source
     Wavelength,
     Key("One wavelength, or lines [[nm, weight], ...] of a spectrum, weights of any sum.", "nm", 100.0, 20_000.0),
 ]
+LumensKey = Annotated[
+    float | None, Key("Luminous flux of the source; that of its file if absent.", "lm", 1e-6, 1e9, example=500.0)
+]
 TiltKey = Annotated[
     tuple[float, float] | None, Key("Tilt about x, then about y.", "degrees", -180.0, 180.0, example=[0.0, 10.0])
 ]
@@ -51,6 +54,7 @@ class Emitter(ABC):
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
     wavelength: Wavelength
+    lumens: float | None = None  # stated luminous flux, lm
     tilt: tuple[float, float] | None = None  # rotation of the axis about x, then y (degrees); None: not tilted
     profile: str | MeasuredProfile = "own"  # name of the distribution of the light, or a record with its `law`
     size_key: str | None = None  # scene key of the size; the key for the real lamp has the prefix real_; None: no size
@@ -62,9 +66,9 @@ class Emitter(ABC):
     unbounded: str | None = None  # name of the profile that needs no width
 
     @property
-    def lumens(self) -> float | None:
-        """Total flux, lm; None: not stated, so that fluxes are relative."""
-        return None
+    def luminous_flux(self) -> float | None:
+        """Luminous flux, lm; None: not stated, so that fluxes are relative."""
+        return self.lumens
 
     @property
     def extent(self) -> Outline | None:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics.emitters import PROFILE_NAMES, Emitter, OneOrTwo, TiltKey, WavelengthKey, all_alive
+from bstcad.optics.emitters import PROFILE_NAMES, Emitter, LumensKey, OneOrTwo, TiltKey, WavelengthKey, all_alive
 from bstcad.optics.kernels.records import Beam
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
@@ -70,6 +70,7 @@ class Point(Emitter):
     rotate: Annotated[
         float | None, Key("Rotation of the profile about its axis, from x towards y.", "degrees", -180.0, 180.0)
     ] = None
+    lumens: LumensKey = None
     kind: Annotated[Literal["point"], Key("A point, or with a size a disc or rectangle of points.")] = "point"
 
     __pydantic_config__ = STRICT
@@ -90,14 +91,15 @@ class Point(Emitter):
         return self.position[2] + (reach if upwards else -reach)
 
     @property
-    def lumens(self) -> float | None:
-        """Total flux by the file of the intensity (lm); None: not stated."""
-        return None if self.intensity is None else self.intensity.lumens
+    def luminous_flux(self) -> float | None:
+        """Luminous flux as stated, or by the file of the intensity (lm); None: not stated."""
+        return self.lumens or (None if self.intensity is None else self.intensity.lumens)
 
     def complaints(self, z: float, optic: str) -> Iterator[str]:
         """Yield faults of the sizes as "key: sentence"; z: plane of the first face (mm), optic: "lens" or "mirror"."""
-        if self.intensity is not None and self.profile != "lambertian":
-            yield "profile: the source also has an intensity; remove one of them"
+        if self.intensity is not None:
+            others = {"profile": self.profile != "lambertian", "half_angle": self.half_angle is not None}
+            yield from (f"{key}: the source also has an intensity; remove one of them" for key in others if others[key])
         given = [name for name in ("width", "height") if getattr(self, name) is not None]
         if given and self.diameter is not None:
             yield f"diameter: the source also has a {given[0]}; give a diameter, or width and height"
@@ -146,6 +148,8 @@ class Point(Emitter):
         def wider(angle: float) -> float:
             return math.degrees(math.atan((1 + by) * math.tan(math.radians(angle))))
 
+        if self.intensity is not None:
+            return None
         if isinstance(self.half_angle_1e2, tuple):
             across, up = map(wider, self.half_angle_1e2)
             return replace(self, half_angle_1e2=(across, up))
@@ -222,13 +226,15 @@ class Point(Emitter):
         across, up = (math.tan(math.radians(angle)) for angle in self.half_angle_1e2)
         return Profile((across, up), rotate=self.rotate or 0.0)
 
-    def _frame_of(self, law: Profile, sense: int) -> Frame:
-        """Return the axes of a profile; sense: of the light.
+    def _placed(self, law: Profile, sense: int) -> tuple[Profile, Frame]:
+        """Return a profile and its axes; sense: of the light.
 
         An intensity is that of a real lamp, which is rotated about e_x to light a plane below it, not mirrored.
         """
         e_x, e_y, n = self.axes
-        return (e_x, (-e_y[0], -e_y[1], -e_y[2]), n) if law.stereographic and sense < 0 else (e_x, e_y, n)
+        if not law.stereographic or sense > 0:
+            return law, (e_x, e_y, n)
+        return replace(law, rotate=-law.rotate), (e_x, (-e_y[0], -e_y[1], -e_y[2]), n)
 
     def _irradiance_of(self, law: Profile, x: Tensor, y: Tensor, z: float) -> Tensor:
         """Return the irradiance on the plane z at distance D, at p = (x, y, D) from the source.
@@ -236,7 +242,7 @@ class Point(Emitter):
         It is E(u, v) D / c³, c = n · p, or E(u, v) D / |p|³ if E is an intensity over stereographic coordinates.
         """
         distance, sense = abs(z - self.position[2]), 1 if self.position[2] <= z else -1
-        e_x, e_y, _ = self._frame_of(law, sense)
+        law, (e_x, e_y, _) = self._placed(law, sense)
         n = self.towards(z)
         c = n[0] * x + n[1] * y + n[2] * distance
         along = torch.sqrt(x * x + y * y + distance**2)
@@ -298,8 +304,8 @@ class Point(Emitter):
         distance, edge = abs(z - from_z), self.edge
         if (law := self.law) is not None:
             sense = 1 if from_z <= z else -1
-            pattern = law.pattern(self._frame_of(law, sense), sense)
-            peak = 1 / law.flux(EVERYWHERE)
+            placed, frame = self._placed(law, sense)
+            pattern, peak = placed.pattern(frame, sense), 1 / law.flux(EVERYWHERE)
             return Beam(x, y, peak=peak, distance=distance, start=distance, tilted=int(self.tilted), pattern=pattern)
         if self.tilted:
             peak, fall, power, least = self._tilted_law(distance)

@@ -36,7 +36,7 @@ def read(data: bytes) -> Intensity:
     if not (1 <= planes <= MAX_ANGLES and 2 <= angles <= MAX_ANGLES and planes * angles <= MAX_INTENSITIES):
         raise PhotometricError(f"states {planes} planes of {angles} angles in lines 4 and 6; correct them")
     quarter, part = STATED[symmetry]
-    if part and planes % part:
+    if part and planes % (4 if symmetry >= 3 else part):
         raise PhotometricError(f"has {planes} planes in line 4, which the symmetry {symmetry} does not divide")
     sets = _whole(lines, FIRST_SET - 1)
     if not 1 <= sets <= MAX_SETS:
@@ -81,10 +81,11 @@ def write(table: Intensity, luminaire: Luminaire, lamp_lumens: float | None = No
     step = float(np.diff(table.along)[0]) if np.ptp(np.diff(table.along)) < SAME_ANGLE else 0.0
     across, along, height = luminaire.size
     below = Intensity("C", table.around, table.along, candela=np.where(table.along <= 90.0, table.candela, 0.0))
+    opening = (across, 0) if luminaire.is_round else (along, across)  # length, width; of a circle: diameter, 0
     numbers = [
         luminaire.maker, 1 if kind == "rotational" else 3, CODES[kind], planes, TURN / planes, len(table.along), step,
         "simulation", luminaire.name, "", f"{luminaire.name}.ldt"[:12], f"{luminaire.date} {luminaire.laboratory}",
-        along, 0 if luminaire.is_round else across, height, along, 0 if luminaire.is_round else across, *4 * (height,),
+        *opening, height, *opening, *4 * (height,),
         100 * below.lumens / table.lumens, 100 * table.lumens / lumens, 1, 0, 1,
         -1 if absolute else 1, luminaire.lamp, lumens, "", "", luminaire.watts, *RATIOS * (0,),
     ]  # fmt: skip

@@ -16,7 +16,6 @@ from bstcad.photometry.intensity import (
     MAX_ANGLES,
     MAX_INTENSITIES,
     SAME_ANGLE,
-    TURN,
     Intensity,
     Luminaire,
     PhotometricError,
@@ -68,25 +67,26 @@ LINE = 130  # largest length of a line of numbers
 VERSIONS = {"2002": "IESNA:LM-63-2002", "2019": "IES:LM-63-2019"}
 
 
-def write(table: Intensity, luminaire: Luminaire, version: str = "2002") -> bytes:
-    """Return a file of absolute photometry, type C, that states the planes which the table's symmetry needs.
+def write(table: Intensity, luminaire: Luminaire, version: str = "2002", lamp_lumens: float | None = None) -> bytes:
+    """Return a file of type C that states the planes which the table's symmetry needs.
 
-    In LM-63-2019 the number 1.01000 tells that the file comes from a simulation.
+    lamp_lumens: flux of the lamp to which the intensities refer; None: absolute photometry, stated as -1.  In
+    LM-63-2019 the number 1.00010 tells that the file comes from a simulation.
     """
     span = SPANS[symmetry(table)]
-    planes = table.around[table.around <= span + SAME_ANGLE] if span else np.zeros(1)
-    if span == TURN:
-        planes = np.append(planes, planes[0] + TURN)
+    inside = table.around[(table.around > SAME_ANGLE) & (table.around < span - SAME_ANGLE)]
+    planes = np.concatenate([[0.0], inside, [span]]) if span else np.zeros(1)
     candela = table.between(planes[:, None], table.along[None])
-    width, length, height = (side / 1000 for side in luminaire.size)
+    length, width, height = (side / 1000 for side in luminaire.size)  # C = 0 is along the length
     opening = (-width, -width, height) if luminaire.is_round else (width, length, height)  # negative: round
     keywords = {
         "TEST": "simulation", "TESTLAB": luminaire.laboratory, "ISSUEDATE": luminaire.date,
         "MANUFAC": luminaire.maker, "LUMCAT": luminaire.name, "LUMINAIRE": luminaire.name, "LAMP": luminaire.lamp,
     }  # fmt: skip
     lines = [VERSIONS[version], *(f"[{key}] {_plain(text)}" for key, text in keywords.items()), "TILT=NONE"]
-    lines.append(f"1 -1 1 {len(table.along)} {len(planes)} 1 2 {' '.join(f'{side:.6g}' for side in opening)}")
-    lines.append(f"1 {'1' if version == '2002' else '1.01000'} {luminaire.watts:.6g}")
+    lumens = -1 if lamp_lumens is None else lamp_lumens
+    lines.append(f"1 {lumens:g} 1 {len(table.along)} {len(planes)} 1 2 {' '.join(f'{side:.6g}' for side in opening)}")
+    lines.append(f"1 {'1' if version == '2002' else '1.00010'} {luminaire.watts:.6g}")
     for row in (table.along, planes, *candela):
         lines += _wrapped(row)
     return ("\r\n".join(lines) + "\r\n").encode("ascii")
@@ -123,12 +123,11 @@ def _whole(kind: str, around: np.ndarray, along: np.ndarray, candela: np.ndarray
         around, candela = mirrored(around, candela, 0.0)
     elif is_same(around, 90.0, 270.0):
         around, candela = mirrored(around, candela, 90.0)
-    elif around[-1] - around[0] < 180.0:
-        raise PhotometricError(f"has horizontal angles from {around[0]:g} to {around[-1]:g}; they must span a symmetry")
     return around, along, candela
 
 
 def _numbers(text: str) -> np.ndarray:
+    text = text.rstrip("\x1a\0 \n")  # end of a file under DOS
     if len(text) > 40 * MAX_INTENSITIES:
         raise PhotometricError("is too large")
     try:

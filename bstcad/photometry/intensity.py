@@ -21,6 +21,7 @@ import numpy as np
 MAX_ANGLES = 100_000  # largest number of angles along each coordinate of a file
 MAX_INTENSITIES = 4_000_000  # largest number of intensities of a file
 SYMMETRIC = 1e-3  # largest difference of intensities of a symmetric table, as a fraction of the largest intensity
+MAX_GAP = 1.5  # largest gap between the last plane and the first / largest step of the planes
 TURN, SAME_ANGLE = 360.0, 1e-6  # degrees: full turn; difference of angles that are equal
 
 
@@ -155,6 +156,9 @@ def _faults(kind: str, around: np.ndarray, along: np.ndarray, candela: np.ndarra
         yield f"has vertical angles beyond {low:g} to {high:g} degrees; correct them"
     if around[-1] - around[0] > (TURN if kind == "C" else 2 * TURN / 4) + SAME_ANGLE:
         yield "has horizontal angles over more than a turn; correct them"
+    steps = np.diff(around)
+    if kind == "C" and len(around) > 1 and TURN - (around[-1] - around[0]) > MAX_GAP * steps.max():
+        yield f"has horizontal angles from {around[0]:g} to {around[-1]:g}, which neither close nor span a symmetry"
     if (candela < 0).any():
         yield "has a negative intensity; correct it"
 

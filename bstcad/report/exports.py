@@ -19,17 +19,21 @@ from typing import Any
 import numpy as np
 import torch
 
+from bstcad.analysis.far_field import NOMINAL_LUMENS, FarField
 from bstcad.cad.mesh import DEFAULT_LABEL, Label, preview_files
 from bstcad.optics.bspline import is_net
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Surface, sag
+from bstcad.photometry import eulumdat, ies
+from bstcad.photometry.intensity import Luminaire
 from bstcad.report.grid_sag import MAX_POINTS, MIN_POINTS, GridLight, GridSag, axes, table_note
 from bstcad.report.units import environment, paragraphs
 from bstcad.runs import files
 from bstcad.scene.mount import Mount
 
 SIDECAR = ".txt"  # suffix of a text file that states how far interpolation of a table moves the light
+PHOTOMETRIC = ("ies", "ldt")  # kinds of intensity files
 SHEET = "datasheet"  # kind of export that `export` omits: the caller draws it from the report in the design's folder
 
 OUTLINE, RIM, FLANGE, SCREWS, HOLES = "OUTLINE", "RIM", "FLANGE", "SCREW_HOLES", "HOLES"  # layers of edges
@@ -70,14 +74,15 @@ class Exported:
 
 def export(
     lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = None, label: Label = DEFAULT_LABEL,
-    mount: Mount | None = None, light: GridLight | None = None,
+    mount: Mount | None = None, light: GridLight | None = None, far: FarField | None = None,
 ) -> Exported:  # fmt: skip
     """Write the files of `kinds` (files.EXPORTS; nothing for SHEET) to the folder, each completely or not at all.
 
     points: number of points along the wider side of a grid; None: as many as the back has control points along its
     longer side (OpticStudio: at the knots).  label: name of a mesh or part.  mount: mount in drawings; None: drawings
     show the outline of the lens.  light: light that is traced to compute the error of grids and tables; None: the error
-    is not computed.  ValueError: a kind is unknown, or points is out of range.
+    is not computed.  far: light for intensity files; None: they cannot be exported.  ValueError: a kind is unknown, or
+    points is out of range.
     """
     for kind in kinds:
         if kind not in files.EXPORTS:
@@ -86,7 +91,9 @@ def export(
         raise ValueError(f"points = {points} is not possible; give a number from {MIN_POINTS} to {MAX_POINTS}")
     lens, paths, notes = lens.plain(), [], []
     for kind in dict.fromkeys(kinds):
-        for name, data in _files(kind, lens, points, label=label, mount=mount, light=light):
+        if kind in PHOTOMETRIC and far is None:
+            raise ValueError(f"'{kind}' needs the light of a scene; export it from the folder of a design")
+        for name, data in _files(kind, lens, points, label=label, mount=mount, light=light, far=far):
             files.put(folder / name, data.encode("utf-8") if isinstance(data, str) else data)
             paths.append(folder / name)
             if name.endswith(SIDECAR):
@@ -95,7 +102,14 @@ def export(
 
 
 def _files(
-    kind: str, lens: Lens, points: int | None, *, label: Label, mount: Mount | None, light: GridLight | None
+    kind: str,
+    lens: Lens,
+    points: int | None,
+    *,
+    label: Label,
+    mount: Mount | None,
+    light: GridLight | None,
+    far: FarField | None,
 ) -> Iterator[tuple[str, str | bytes]]:
     count = min(max(lens.back_net.shape), MAX_POINTS) if points is None else points
     match kind:
@@ -122,6 +136,24 @@ def _files(
             yield "outline.svg", svg(lens.outline, mount, label)
         case "preview":
             yield from preview_files(lens, label)
+        case "ies" | "ldt" if far is not None:
+            yield f"intensity.{kind}", photometric_file(kind, lens, far, label)
+
+
+# --- photometric files ---------------------------------------------------------------------------------------------
+
+
+def photometric_file(kind: str, lens: Lens, far: FarField, label: Label) -> bytes:
+    """Return the intensity of the light behind the lens as an IES or EULUMDAT file.
+
+    If the flux of the source is known, the intensities are absolute; otherwise they are for a lamp of 1000 lm.
+    """
+    width, height = (2 * half for half in lens.outline.half_extent)
+    luminaire = Luminaire(label.name, size=(width, height, 0.0), is_round=isinstance(lens.outline, Circle))
+    table, lamp = far.table(lens), NOMINAL_LUMENS if far.lumens is None else None
+    if kind == "ies":
+        return ies.write(table, luminaire, lamp_lumens=lamp)
+    return eulumdat.write(table, luminaire, lamp_lumens=far.lumens or lamp)
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import contextlib
 import functools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -29,7 +29,9 @@ from bstcad.scene.picture import Picture
 from bstcad.scene.schema import LENGTHS, OneOrTwoWidths, Record, from_file
 
 KEY = "source.profile.image"  # key of the file, for messages
+PREFIX = "beam-"  # beginning of the name of the copy
 MAX_TABLE_SIZE = 50_000_000  # largest table of a beam (bytes)
+MIN_SIDE = 5  # smallest number of rows and columns
 MAX_NET = 512  # largest number of control points along a side; pictures with more pixels are averaged
 CORNER = 0.035  # side of the corners of a picture that show the background, as a fraction of its sides (ISO 11146-3)
 NOISE_FACTOR = 3.0  # values below the mean background plus so many standard deviations are background
@@ -42,7 +44,7 @@ SETTLED = 1e-3  # relative change of the widths at which the rectangle has settl
 def values_of(image: Picture) -> np.ndarray:
     """Return the irradiance (rows, columns) of a picture or table on any scale, row 0 at the top."""
     if image.name.endswith(".csv"):
-        return table(image.data, image.name)
+        return table(image.data, shown(image))
     with _naming_the_beam(), picture.decoding(image):
         photo = picture.photo(image, gamma=1.0)
         return np.concatenate([photo.light(box) for box in picture.strips((0, 0, *photo.image.size))])
@@ -61,12 +63,22 @@ def read_beam(path: Path) -> Picture:
     """Read the file of a beam, a picture or a table with the suffix .csv; SceneError if it cannot be read."""
     if path.suffix.lower() != ".csv":
         with _naming_the_beam():
-            return picture.read_picture(path)
+            return of_beam(picture.read_picture(path))
     try:
         data = files.contents(path, MAX_TABLE_SIZE)
     except ValueError as error:
         raise SceneError(f"{KEY}: {str(path)!r} cannot be read ({error}); give a path relative to the scene") from None
-    return Picture(f"{picture.safe_name(path.stem)[:70] or 'beam'}.csv", data)
+    return of_beam(Picture(f"{picture.safe_name(path.stem)[:70] or 'beam'}.csv", data))
+
+
+def of_beam(image: Picture) -> Picture:
+    """Return the file with a name for its copy that no picture of a target and no exported file has."""
+    return image if image.name.startswith(PREFIX) else replace(image, name=f"{PREFIX}{image.name}"[-80:])
+
+
+def shown(image: Picture) -> str:
+    """Return the name of the file for messages, without that of its copy."""
+    return image.name.removeprefix(PREFIX)
 
 
 def table(data: bytes, name: str) -> np.ndarray:
@@ -74,7 +86,8 @@ def table(data: bytes, name: str) -> np.ndarray:
     refused = f"{KEY}: {name!r} is not a table of numbers; give rows of as many numbers each"
     try:
         lines = data.decode("utf-8-sig").splitlines()
-        rows = [line.replace(";", " ").replace(",", " ").split() for line in lines if line.split("#")[0].strip()]
+        lines = [line.partition("#")[0].replace(";", " ").replace(",", " ") for line in lines]
+        rows = [line.split() for line in lines if line.strip()]
         values = np.array([[float(number) for number in row] for row in rows])
     except ValueError:
         raise SceneError(refused) from None
@@ -173,8 +186,7 @@ class MeasuredBeam(Record, MeasuredProfile):
     @property
     def law(self) -> Profile:
         """The irradiance as a spline."""
-        x, y = self.moments.centre if self.origin == "centroid" else (0.0, 0.0)
-        return _law(self.image, self.subtract, self.width, (x, y))
+        return _law(self.image, self.subtract, self.width, origin=self.origin)
 
     @property
     def moments(self) -> Moments:
@@ -185,7 +197,7 @@ class MeasuredBeam(Record, MeasuredProfile):
     def words(self) -> str:
         """Name of the file and the moments in words."""
         c_x, c_y = self.moments.centre
-        return f"measured beam {self.image.name}, {self.moments.words}, centroid at ({c_x:.3g}, {c_y:.3g}) mm"
+        return f"measured beam {shown(self.image)}, {self.moments.words}, centroid at ({c_x:.3g}, {c_y:.3g}) mm"
 
 
 @functools.lru_cache(maxsize=4)
@@ -193,20 +205,26 @@ def _light(image: Picture, subtract: bool) -> np.ndarray:
     values = values_of(image)
     found = lit(values) if subtract else np.maximum(values, 0.0)
     if not found.max() > 0:
-        raise SceneError(f"{KEY}: {image.name!r} shows no light above its background")
+        raise SceneError(f"{KEY}: {shown(image)!r} shows no light above its background")
     return found
 
 
 @functools.lru_cache(maxsize=4)
-def _law(image: Picture, subtract: bool, width: float, origin: tuple[float, float]) -> Profile:
+def _law(image: Picture, subtract: bool, width: float, origin: str) -> Profile:
     light = _light(image, subtract)
+    centre = moments(light, width).centre if origin == "centroid" else (0.0, 0.0)
     rows, columns = light.shape
     several = math.ceil(max(rows, columns) / MAX_NET)
-    rows, columns = rows // several, columns // several  # a rest of less than `several` pixels is left out
+    rest = columns % several, rows % several  # pixels on the right and below that are left out
+    rows, columns = rows // several, columns // several
+    if min(rows, columns) < MIN_SIDE:
+        raise SceneError(f"{KEY}: {shown(image)!r} has fewer than {MIN_SIDE} rows or columns; give a larger picture")
     mean = light[: rows * several, : columns * several].reshape(rows, several, columns, several).mean((1, 3))
     pitch = width / light.shape[1] * several
-    spans = ((side - 1) / 2 * pitch for side in (columns, rows))
-    u, v = ((-half - at, half - at) for half, at in zip(spans, origin, strict=True))
+    pixel = width / light.shape[1]
+    middle = -rest[0] / 2 * pixel - centre[0], rest[1] / 2 * pixel - centre[1]
+    half_u, half_v = ((side - 1) / 2 * pitch for side in (columns, rows))
+    u, v = (middle[0] - half_u, middle[0] + half_u), (middle[1] - half_v, middle[1] + half_v)
     return Profile(net=Net(mean[::-1].T, u, v))
 
 

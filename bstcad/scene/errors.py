@@ -20,7 +20,6 @@ DOTTED = rf"(?:{KEY_NAME})(?:\s*\.\s*(?:{KEY_NAME}))*"
 HEADER, KEY = re.compile(rf"\s*(\[\[?)\s*({DOTTED})\s*\]"), re.compile(rf"\s*({DOTTED})\s*=")
 
 NOT_BUILT = {  # beginnings of sentences about features that bstcad does not have yet, by a word for the feature
-    **dict.fromkeys(("ies", "ldt", "eulumdat", "intensity"), "files of luminous intensity (IES, EULUMDAT) are"),
     **dict.fromkeys(("rayfile", "ray_file", "rayset", "ray_set"), "files of measured rays are"),
     **dict.fromkeys(("diffraction", "coherent", "interference"), "wave optics is"),
     **dict.fromkeys(("scatter", "scattering", "bsdf", "haze"), "scattering is"),
@@ -139,7 +138,7 @@ def _type_sentence(kind: str, location: _Location, value: Any, context: Mapping[
     """Return the sentence on an error of type `kind` by pydantic; value: refused value; context: `ctx` of the error."""
     key, last = location.key, location.key.rpartition(".")[2]
     shown = _value_text(value)
-    tag, name = str(context.get("tag")), context.get("discriminator", "").strip("'")
+    tag, name = str(context.get("tag")), context.get("discriminator", "").strip("'").removesuffix("()")
     if kind in UNKNOWN_KEY:
         known = sorted({name for owner in location.owners for name in owner["properties"]})
         return f"{key}: unknown key; {nearest(last, known, 'the keys here are')}"

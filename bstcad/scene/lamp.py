@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +21,7 @@ from bstcad.runs import files
 from bstcad.scene.picture import safe_name
 from bstcad.scene.schema import FileContent, OneOrTwoWidths, from_file
 
+PREFIXES = ("lamp-", "wanted-")  # beginnings of the names of copies: of a lamp, of a target
 MAX_FILE_SIZE = 100_000_000  # largest intensity file (bytes)
 NET_SIDES = 257, 513, 1025  # control points per side, for tables of wider and narrower spacing
 POINTS_PER_SPACING = 4.0  # control points per spacing of the table's angles, if NET_SIDES allow it
@@ -40,7 +42,12 @@ class IntensityFile(FileContent, MeasuredProfile):
         try:
             return intensity_files.read(self.name, self.data)
         except PhotometricError as fault:
-            raise ValueError(f"{self.name!r} {fault}") from None
+            raise ValueError(f"{self.shown!r} {fault}") from None
+
+    @property
+    def shown(self) -> str:
+        """Name of the file for messages, without the prefix of its copy."""
+        return next((self.name.removeprefix(each) for each in PREFIXES if self.name.startswith(each)), self.name)
 
     @functools.cached_property
     def law(self) -> Profile:
@@ -71,16 +78,20 @@ class IntensityFile(FileContent, MeasuredProfile):
     @property
     def words(self) -> str:
         """Name of the file and its flux."""
-        return f"intensity of {self.name}, {self.lumens:.5g} lm"
+        return f"intensity of {self.shown}, {self.lumens:.5g} lm"
 
 
-def read_intensity(path: Path) -> IntensityFile:
-    """Read an intensity file; ValueError, without the key, if it is missing, too large or damaged."""
+def read_intensity(path: Path, prefix: str) -> IntensityFile:
+    """Read an intensity file; ValueError, without the key, if it is missing, too large or damaged.
+
+    prefix: beginning of the name of the copy, so that no other file of a scene has this name.
+    """
     try:
         data = files.contents(path, MAX_FILE_SIZE)
     except ValueError as error:
         raise ValueError(f"{str(path)!r} cannot be read ({error}); give a path relative to the scene file") from None
-    found = IntensityFile((safe_name(path.stem)[:70] or "lamp") + path.suffix.lower(), data)
+    stem = safe_name(path.stem)[:60]
+    found = IntensityFile((stem if stem.startswith(prefix) else f"{prefix}{stem}") + path.suffix.lower(), data)
     _ = found.table
     return found
 
@@ -97,7 +108,10 @@ class Point(point.Point):
         ),
     ] = None  # fmt: skip
     intensity: Annotated[
-        Annotated[IntensityFile, *from_file(IntensityFile, read_intensity, "intensity = 'led.ies'")] | None,
+        Annotated[
+            IntensityFile, *from_file(IntensityFile, partial(read_intensity, prefix="lamp-"), "intensity = 'led.ies'")
+        ]
+        | None,
         Key("Intensity over directions from a file (.ies, .ldt, .csv), in place of a profile.", example="led.ies"),
     ] = None
 

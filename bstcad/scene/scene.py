@@ -32,7 +32,7 @@ from bstcad.optics.sides import Sides, as_pair
 from bstcad.optics.wavefront import MAX_RAY_ANGLE, PlaneWave, Wave, ZernikeWave
 from bstcad.runs import files
 from bstcad.scene import effects, elements, lighting, mount, picture, quality, scene_file
-from bstcad.scene.beam import Collimated
+from bstcad.scene.beam import Collimated, of_beam
 from bstcad.scene.blank import LensBlank, as_front, net_extent
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
 from bstcad.scene.effects import Effects
@@ -43,7 +43,7 @@ from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture
 from bstcad.scene.quality import VERIFICATION_DRAW, VERIFICATION_POINTS, Tailoring, Tolerance
 from bstcad.scene.schema import FILE, FileContent, Record, contents, of_model
-from bstcad.scene.target import Target, Targets, coplanar_complaints
+from bstcad.scene.target import FAR_Z, AngularTarget, Target, Targets, coplanar_complaints
 
 if TYPE_CHECKING:
     from bstcad.optics.measure import Draw, GhostTracer
@@ -122,7 +122,7 @@ class Scene(Record):
             yield f"name: {self.name!r} cannot be the name of a folder; use letters a-z, digits, '-' or '_'"
         if not (self.title.isprintable() and len(self.title) <= 200):  # the terminal prints the title too
             yield "title: must be one line of up to 200 printable characters; shorten it"
-        yield from self._of_targets(Target.complaints)
+        yield from self._of_targets(lambda target: target.complaints())
         yield from lens.complaints()
         yield from lighting.complaints(source, lens)
         yield from effects.complaints(self.effects, lens)
@@ -377,7 +377,8 @@ class Scene(Record):
         made = _validated(data, Path("."), given)
         if any(key.startswith("source") for key in changes):
             own = {}
-        if any(type(target) is not Target for target in self.targets) and "target" not in changes:
+        own_class = any(type(target) not in (Target, AngularTarget) for target in self.targets)
+        if own_class and "target" not in changes:
             pairs = zip(self.targets, made.targets, strict=True)
             own["targets"] = tuple(before.model_copy(update=dict(after)) for before, after in pairs)
         if own:
@@ -546,11 +547,14 @@ def _from_python(value: Any, key: str, given: dict[str, FileContent]) -> Any:
     """
     if hasattr(value, "__array__") and np.ndim(value) and IMAGE_KEY.fullmatch(key):
         value = _image(np.asarray(value), key.removesuffix(".image"))
+        value = of_beam(value) if key.startswith("source") else value
     if isinstance(value, FileContent):
         name = f"\0{len(given)}"
         given[name] = value
         return name
-    if isinstance(value, BaseModel):
+    if isinstance(value, AngularTarget):
+        value = {**dict(value), "z": None if value.z == FAR_Z else value.z}
+    elif isinstance(value, BaseModel):
         value = {field.alias or name: getattr(value, name) for name, field in type(value).model_fields.items()}
     elif is_dataclass(value) and not isinstance(value, type):
         value = {field.name: getattr(value, field.name) for field in fields(value)}

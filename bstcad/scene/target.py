@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -34,6 +34,7 @@ from bstcad.scene.schema import COORDINATES, OneOrTwo, Record, from_file, leavin
 
 MIN_PIXELS = 8  # smallest number of pixels along a side of a target
 MIN_EXTENT = 1e-3  # smallest side of a target, mm or another unit of its receiver
+HALF_TURN = 180.0  # degrees
 FAR_Z = 1e8  # z (mm) of a target over directions, which has no position
 WITHOUT_GAMMA = ("text", "uniform", "profile", "intensity")  # picture keys that allow no gamma and no crop
 MAX_TARGETS = 8  # largest number of targets of a scene
@@ -286,7 +287,11 @@ class AngularTarget(Target):
         Key("Coordinates: C angle from the axis, A horizontal angle and elevation, B angles to the side and upwards."),
     ] = "C"
     intensity: Annotated[
-        Annotated[IntensityFile, *from_file(IntensityFile, read_intensity, "intensity = 'wanted.ldt'")] | None,
+        Annotated[
+            IntensityFile,
+            *from_file(IntensityFile, partial(read_intensity, prefix="wanted-"), "intensity = 'wanted.ldt'"),
+        ]
+        | None,
         Key("Intensity to be reached, from a file (.ies, .ldt, .csv).", example="wanted.ldt"),
     ] = None
 
@@ -308,6 +313,17 @@ class AngularTarget(Target):
         for key, given in (("z", self.z != FAR_Z), ("tilt", self.tilt is not None)):
             if given:
                 yield f"target.{key}: directions have no {'position' if key == 'z' else key}; remove this key"
+        changed = {
+            "seen_from": self.seen_from != "lens",
+            "rotate": self.rotate != 0,
+            "mirror": self.mirror,
+            "invert": self.invert,
+        }
+        for key in changed if self.intensity is not None else ():
+            if changed[key]:
+                yield f"target.{key}: the file of an intensity has an orientation of its own; remove this key"
+        if self.angles == "C" and math.hypot(*(max(map(abs, ends)) for ends in (self.x, self.y))) > HALF_TURN:
+            yield f"target.x: a corner of the target is more than {HALF_TURN:g} degrees from the axis; make it smaller"
         limits = {"C": (180.0, 180.0), "A": (180.0, 90.0), "B": (90.0, 180.0)}[self.angles]
         for axis, ends, limit in zip("xy", (self.x, self.y), limits, strict=True):
             if max(map(abs, ends)) > limit:
@@ -409,14 +425,18 @@ def _corner_heights(screen: Screen, other: Screen) -> list[float]:
     return [plane.height(own.point(x, y)) for x in screen.x for y in screen.y]
 
 
+def kind(given: Any) -> str:
+    """Return the record of a target's table, or of a record, by its kind; an unknown kind is returned itself."""
+    named = given.get("kind", "plane") if isinstance(given, dict) else getattr(given, "kind", "plane")
+    return {"plane": "Target", "intensity": "AngularTarget"}.get(named, str(named))
+
+
 if TYPE_CHECKING:
     Targets: TypeAlias = tuple[Target, ...]
 else:
     OneTarget = Annotated[
-        Annotated[Target, Tag("plane")] | Annotated[AngularTarget, Tag("intensity")],
-        Discriminator(
-            lambda given: (given.get if isinstance(given, dict) else partial(getattr, given))("kind", "plane")
-        ),
+        Annotated[Target, Tag("Target")] | Annotated[AngularTarget, Tag("AngularTarget")],
+        Discriminator(kind),
     ]
     Targets = Annotated[  # one table of a file, or a list of them; validated to a tuple
         Annotated[OneTarget, Tag("table")]

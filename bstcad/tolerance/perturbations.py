@@ -196,6 +196,8 @@ def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
 
 def _motions(setup: Setup) -> Iterator[Kind]:
     sources, without_effect = [channel.source for channel in setup.channels], {"source.clocking"}
+    if setup.screen.plane.chart:  # directions, which a shift does not change
+        without_effect |= {"screen.decentre_x", "screen.decentre_y", "screen.axial"}
     if all(source.is_shift_invariant for source in sources):
         without_effect.add("source.axial")  # a shift of collimated light along the axis has no effect
     if not all(source.is_rotation_invariant for source in sources):

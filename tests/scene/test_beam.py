@@ -81,12 +81,29 @@ def test_an_array_is_a_measured_beam(tmp_path):
     assert torch.equal(again.source.irradiance(x, 0 * x, 0.0), made.source.irradiance(x, 0 * x, 0.0))
 
 
+def test_a_beam_and_a_picture_may_have_one_name(tmp_path):
+    """Files of one name in two folders, and two arrays: each copy has its own name."""
+    light = np.maximum(camera() - 40, 0.0)
+    made = bstcad.load("templates/thu.toml").changed({
+        "source.profile": {"image": light, "width": WIDTH}, "target.image": light.T,
+    })  # fmt: skip
+    assert len(made.files) == 2 and len({content.data for content in made.files.values()}) == 2
+
+
+def test_an_off_centre_beam_that_the_aperture_does_not_show_is_refused(tmp_path):
+    light = np.maximum(camera(w=(0.2, 0.2), at=(4.0, 3.0)) - 60, 0.0)
+    profile = {"image": light, "width": WIDTH, "origin": "picture"}
+    with pytest.raises(SceneError, match=r"^source\.profile: the beam has no light inside source\.aperture"):
+        bstcad.load("templates/thu.toml").changed({"source.aperture.radius": 2.0, "source.profile": profile})
+
+
 @pytest.mark.parametrize(("content", "sentence"), [
     (b"1,2,3\n4,5\n", "is not a table of numbers"),
     (b"a,b\n", "is not a table of numbers"),
     (b"1 2\n3 4\n", "at least 5 x 5"),
     (b"\n".join([b"7,7,7,7,7,7,7,7"] * 8), "shows no light above its background"),
     (b"\n".join([b"nan,7,7,7,7,7,7,7"] * 8), "all finite"),
+    (b"\n".join([b",".join([*[b"0"] * 1400, *[b"9"] * 200, *[b"0"] * 1400])] * 5), "fewer than 5 rows"),
 ])  # fmt: skip
 def test_wrong_tables_are_refused(content, sentence, tmp_path):
     (tmp_path / "beam.csv").write_bytes(content)
@@ -97,7 +114,7 @@ def test_wrong_tables_are_refused(content, sentence, tmp_path):
 @pytest.mark.parametrize(("changes", "sentence"), [
     ({"source.profile": "super_gaussian", "source.radius_1e2": 8.0}, r"source\.order: missing"),
     ({"source.profile": "annular"}, r"source\.inner_radius: missing"),
-    ({"source.profile": "annular", "source.inner_radius": 90.0}, r"source\.inner_radius: the dark centre fills"),
+    ({"source.profile": "annular", "source.inner_radius": 90.0}, r"source\.inner_radius: the dark centre reaches"),
     ({"source.rotate": 10.0}, r"source\.rotate: the profile is round"),
     ({"source.profile": "gaussian", "source.radius_1e2": [8.0, 4.0, 2.0]}, r"source\.radius_1e2: .*"),
     ({"source.profile": "gausian"}, r"source\.profile: 'gausian' is not possible; did you mean 'gaussian'"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,13 +40,15 @@ def scene(request, tmp_path):
 def test_the_light_of_a_lamp_is_the_file_s(scene, tmp_path):
     """Intensities by the irradiance on a plane, E d³ / D; C from x towards -y; flux by the file's own integral."""
     source, given = scene.source, table()
-    assert source.lumens == pytest.approx(given.lumens, rel=1e-4)
+    assert source.luminous_flux == pytest.approx(given.lumens, rel=1e-4)
     assert f"{given.lumens:.4g}"[:4] in source.words(0.0)
     for c, g in ((30.0, 20.0), (120.0, 10.0), (270.0, 45.0), (0.0, 0.0)):
         x, y = (20 * math.tan(math.radians(g)) * p for p in (math.cos(math.radians(c)), -math.sin(math.radians(c))))
         light = float(source.irradiance(torch.tensor(x).double(), torch.tensor(y).double(), 0.0))
         d = math.hypot(x, y, 20.0)
-        assert light * d**3 / 20 * source.lumens == pytest.approx(given.between(np.array(c), np.array(g)), rel=0.01)
+        assert light * d**3 / 20 * source.luminous_flux == pytest.approx(
+            given.between(np.array(c), np.array(g)), rel=0.01
+        )
     x, y = sampling.grid(Rectangle(1200.0, 1200.0), 2000)
     assert float(source.irradiance(x, y, 0.0).sum()) * (1200 / 2000) ** 2 == pytest.approx(1, abs=0.003)
     again = bstcad.load(saved(scene, tmp_path / "copy"))
@@ -74,3 +77,38 @@ def test_wrong_intensities_are_refused(scene, tmp_path):
         scene.changed({"source.intensity": str(tmp_path / "none.ies")})
     with pytest.raises(SceneError, match=r"^source\.profile: the source also has an intensity"):
         scene.changed({"source.profile": "uniform", "source.half_angle": 20.0})
+
+
+def test_a_lamp_above_a_mirror_is_turned_not_mirrored(scene):
+    """C = 90 degrees points along +y for light along -z, and rotate still turns from x towards y."""
+    source = scene.source
+    above = replace(source, position=(0.0, 0.0, 20.0))
+    x, y = torch.tensor([5.0, 3.0]).double(), torch.tensor([-2.0, 4.0]).double()
+    torch.testing.assert_close(above.irradiance(x, -y, 0.0), source.irradiance(x, y, 0.0), rtol=1e-9, atol=0)
+    turned = replace(above, rotate=90.0)
+    torch.testing.assert_close(turned.irradiance(-y, x, 0.0), above.irradiance(x, y, 0.0), rtol=2e-3, atol=0)
+
+
+def test_a_target_of_directions_is_changed_and_written(scene, tmp_path):
+    """The kind of a target may be changed; the file of an intensity has the orientation of its own."""
+    wanted = {"kind": "intensity", "x": [-40.0, 40.0], "y": [-30.0, 30.0], "pixels": 32}
+    over = scene.changed({"target": wanted | {"text": "L"}})
+    assert over.target.unit == "degrees" and "\nz = " not in over.toml().partition("[target]")[2].partition("[")[0]
+    assert bstcad.load(saved(over, tmp_path / "over")) == over
+    plane = over.changed({"target.kind": "plane", "target.z": 500.0, "target.angles": None})
+    assert plane.target.screen.plane.is_level
+    with pytest.raises(SceneError, match=r"^target\.z: "):
+        over.changed({"target.kind": "plane", "target.angles": None})
+    file = str(tmp_path / "wanted.ldt")
+    (tmp_path / "wanted.ldt").write_bytes(eulumdat.write(table(), Luminaire()))
+    shown = scene.changed({"target": wanted | {"intensity": file}})
+    light = shown.target.irradiance() / shown.target.screen.areas
+    row, column = np.unravel_index(light.argmax(), light.shape)
+    columns, rows = shown.target.columns_rows
+    x, y = 80 * (column + 0.5) / columns - 40, 30 - 60 * (row + 0.5) / rows
+    assert math.degrees(math.atan2(-y, x)) % 360 == pytest.approx(30, abs=8)
+    for key, value in {"rotate": 90, "mirror": True, "seen_from": "behind", "invert": True}.items():
+        with pytest.raises(SceneError, match=rf"^target\.{key}: the file of an intensity has an orientation"):
+            scene.changed({"target": wanted | {"intensity": file, key: value}})
+    with pytest.raises(SceneError, match=r"^target\.x: a corner of the target is more than 180 degrees"):
+        scene.changed({"target": wanted | {"text": "L", "x": [-150.0, 150.0], "y": [-150.0, 150.0]}})

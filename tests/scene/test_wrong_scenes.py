@@ -28,7 +28,8 @@ def flange(changed):
 WRONG = {
     "thu": [
         ({"target.pixel": 3}, "target.pixel: unknown key; did you mean 'pixels'"),
-        ({"target.ies": "'led.ies'"}, r"target.ies: unknown key; files of .*\(IES, EULUMDAT\) are not built yet; the"),
+        ({"target.kind": "'wall'"}, r"target.kind: 'wall' is not possible; choose one of plane, intensity"),
+        ({"target.kind": "'intensity'"}, r"target.x: 400 degrees is not between -180 and 180 degrees"),
         ({"source.aperture": '{shape="oval"}'}, "source.aperture.shape: must be"),
         ({"source.aperture": '{shape="circle"}'}, "source.aperture.radius: missing; add for example radius = 12.0"),
         ({"lens.outline": "3"}, "lens.outline: 3 is not a table; write for example outline = "),
