@@ -174,9 +174,10 @@ class MeasuredBeam(Record, MeasuredProfile):
     ]
     width: Annotated[float, Key("Width of the whole picture in the beam.", "mm", *LENGTHS, example=12.0)]
     origin: Annotated[
-        Literal["centroid", "picture"], Key("Place of the picture on source.centre: its centroid, or its centre.")
+        Literal["centroid", "picture"],
+        Key("Place of the picture on source.centre: its centroid, or its centre.", example="picture"),
     ] = "centroid"
-    subtract: Annotated[bool, Key("Whether to subtract the background that the corners show.")] = True
+    subtract: Annotated[bool, Key("Whether to subtract the background that the corners show.", example=False)] = True
 
     @property
     def light(self) -> np.ndarray:

@@ -284,7 +284,10 @@ class AngularTarget(Target):
     ]
     angles: Annotated[
         Angles,
-        Key("Coordinates: C angle from the axis, A horizontal angle and elevation, B angles to the side and upwards."),
+        Key(
+            "Coordinates: C angle from the axis, A horizontal angle and elevation, B angles to the side and upwards.",
+            example="A",
+        ),
     ] = "C"
     intensity: Annotated[
         Annotated[
