@@ -30,6 +30,7 @@ from bstcad.optics.kernels.forward import (
     launch,
     meet_front,
     refract,
+    shape,
     tilt,
 )  # fmt: skip
 from bstcad.optics.rays import Rays
@@ -58,7 +59,9 @@ def _arrive(beam, front, cosine, rise, state, shift_x, shift_y, count, work):
     for r in range(count):
         work[X + r], work[Y + r], work[Z + r], work[FATE + r] = state[P, r] + shift_x, state[Q, r] + shift_y, 0.0, 0.0
     launch(beam, count, work)
-    if beam.tilted == 1 and beam.distance > 0.0:
+    if beam.pattern.present:
+        shape(beam, count, work)
+    elif beam.tilted == 1 and beam.distance > 0.0:
         tilt(beam, count, work)
     if front.present:
         meet_front(front, beam.distance == 0.0 and beam.tilted == 0, count, work)
