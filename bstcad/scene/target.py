@@ -475,7 +475,7 @@ def _drawing(target: Target) -> Drawing:
     elif target.profile is not None:
         light = target.profile.light(pixels, size)
     elif isinstance(target, AngularTarget) and target.intensity is not None:
-        light = target.light_of_file()[:, ::-1]  # as seen from the lens
+        light = target.light_of_file()[:, ::-1]  # columns in the order that a viewer at the lens sees
     else:
         light = np.ones(pixels[::-1])
     light = np.rot90(light, target.rotate // 90)

@@ -7,6 +7,8 @@ import random
 import tracemalloc
 
 import numpy as np
+import photompy
+import pyldt
 import pytest
 
 from bstcad.photometry import eulumdat, ies, intensity_files
@@ -91,7 +93,6 @@ def test_a_table_that_is_written_is_read_again(kind, form):
 
 def test_packages_of_others_read_what_is_written(tmp_path):
     """A hot spot at C = 30, γ = 40 degrees, in the same place by three readers; lumens by one's own integral."""
-    photompy, pyldt = pytest.importorskip("photompy"), pytest.importorskip("pyldt")
     given = table("none")
     luminaire = Luminaire("lens", "maker", date="2026-11-28")
     for version in ("2002", "2019"):
@@ -112,7 +113,6 @@ def test_packages_of_others_read_what_is_written(tmp_path):
 
 @pytest.mark.parametrize("kind", SYMMETRIES)
 def test_another_package_expands_each_symmetry_as_we_do(kind, tmp_path):
-    pyldt = pytest.importorskip("pyldt")
     given = table(kind)
     (tmp_path / "a.ldt").write_bytes(eulumdat.write(given, Luminaire(), lamp_lumens=1000.0))
     theirs = np.array(pyldt.LdtReader.read(tmp_path / "a.ldt").intensities)
