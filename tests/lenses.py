@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -10,6 +11,7 @@ from torch import Tensor
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline, Rectangle
+from bstcad.optics.profiles import MeasuredProfile, Profile
 from bstcad.optics.rays import Rays
 from bstcad.optics.sides import Sides, as_pair
 from bstcad.optics.surfaces import Sphere, Surface
@@ -97,3 +99,15 @@ def places(rays: Rays) -> Tensor:
     """Return positions (3, …) with z from the origin, in float64."""
     x, y, _ = rays.position.double()
     return torch.stack([x, y, rays.position[2].double() + rays.z])
+
+
+@dataclass(frozen=True)
+class Measured(MeasuredProfile):
+    """A profile of any law, as if it came from a file."""
+
+    own: Profile
+    words = "measured"
+
+    @property
+    def law(self):
+        return self.own

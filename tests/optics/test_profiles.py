@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +13,8 @@ from bstcad.optics import sampling
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle, Rounded
 from bstcad.optics.point import Point
-from bstcad.optics.profiles import MeasuredProfile, Net, Profile
+from bstcad.optics.profiles import Net, Profile
+from tests.lenses import Measured
 
 APERTURES = [Circle(5.0), Rectangle(8.0, 3.0), Rounded(9.0, 7.0, corner_radius=2.0)]
 PROFILES = {
@@ -91,16 +92,6 @@ def test_all_light_of_an_elliptical_cone_crosses_a_plane(tilt):
         assert 2 * wide == pytest.approx(10 * math.tan(math.radians(35.0)), rel=1e-4)
 
 
-@dataclass(frozen=True)
-class Table(MeasuredProfile):
-    own: Profile
-    words = "a table"
-
-    @property
-    def law(self):
-        return self.own
-
-
 @pytest.mark.parametrize("tilt", [None, (25.0, -40.0)])
 def test_an_intensity_over_stereographic_coordinates_lights_a_plane_as_its_closed_form(tilt):
     """A Lambertian: cos θ = (1 - t²) / (1 + t²), t = tan(θ / 2), sampled as finely as tables of files are."""
@@ -109,7 +100,7 @@ def test_an_intensity_over_stereographic_coordinates_lights_a_plane_as_its_close
     r2 = u * u + v * v
     net = Net(np.maximum((1 - r2) / (1 + r2), 0.0), (-half, half), (-half, half))
     point = Point((1.0, -2.0, 3.0), tilt=tilt)
-    table = replace(point, intensity=Table(Profile(net=net, stereographic=True, whole=math.pi)))
+    table = replace(point, intensity=Measured(Profile(net=net, stereographic=True, whole=math.pi)))
     for z in (13.0, -7.0):
         x, y = sampling.grid(Rectangle(40.0, 40.0), 100)
         light = point.irradiance(x, y, z)

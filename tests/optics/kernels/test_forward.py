@@ -18,12 +18,12 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.point import Point
-from bstcad.optics.profiles import MeasuredProfile, Net, Profile
+from bstcad.optics.profiles import Net, Profile
 from bstcad.optics.rays import Landed
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.optics.trace import simulate, simulate_plain, whole_kernel, window
-from tests.lenses import SQUARE, lens_of, net, tilted, wavy
+from tests.lenses import SQUARE, Measured, lens_of, net, tilted, wavy
 from tests.optics.test_mirror import LIGHTS, bumpy, mirror
 from tests.tracing import from_first_net_plain, simulated, simulated_plain, stratified
 
@@ -44,18 +44,6 @@ ASIDE = Point(position=(1.0, -2.0, 3.0), profile="gaussian", half_angle_1e2=30.0
 LEANING = replace(NARROW, tilt=(-10.0, 25.0), z=-6.0, centre=(-9.0, -3.0))
 HOT = Net(np.random.default_rng(3).random((12, 9)), (-10.0, 11.0), (-9.0, 12.0))
 TABLE = Net(np.random.default_rng(4).random((14, 11)), (-0.5, 0.4), (-0.45, 0.5))
-
-
-@dataclass(frozen=True)
-class Measured(MeasuredProfile):
-    """A net of any numbers, as from a file."""
-
-    own: Profile
-    words = "measured"
-
-    @property
-    def law(self):
-        return self.own
 
 
 SCENES = {  # source, lens, the fates of rays through a window larger than the lens
