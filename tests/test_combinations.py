@@ -148,7 +148,7 @@ def elements(where, **more):
 def fold(chosen):
     """A mirror half way to the wall, which is as far from the lens as without it."""
     mirror = elements("behind", kind="mirror", z=BACK + 50.0, outline={"shape": "circle", "diameter": 200.0})
-    return mirror(chosen) | {"target.z": BACK + 2 * 50.0 - THROW}
+    return mirror(chosen) | ({} if chosen["wall"] == "directions" else {"target.z": BACK + 2 * 50.0 - THROW})
 
 
 def front(**more):
