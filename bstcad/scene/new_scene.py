@@ -8,10 +8,12 @@ import os
 import re
 import textwrap
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from bstcad.scene.errors import SceneError, nearest
@@ -191,7 +193,8 @@ def new_scene(
         if (picture, light, size, distance) != (None,) * 4:
             given = "a template has its own light, picture and sizes"
             raise SceneError(f"--template {template}: {given}; remove --template, or the other options")
-        _write_scene(path, _template(template, name))
+        text = _template(template, name)
+        _write_scene(path, text, _pictures(text))
         return Written(path)
     if picture is not None:
         picture = Path(os.path.expanduser(picture))
@@ -263,23 +266,36 @@ def _template(template: str, name: str) -> str:
     return text
 
 
+def _pictures(text: str) -> dict[str, bytes]:
+    """Return the contents, by name, of the files of the templates' folder that the text of a template names."""
+    pictures = (path for path in _folder().iterdir() if path.name.endswith(".png"))
+    return {path.name: path.read_bytes() for path in pictures if f'"{path.name}"' in text}
+
+
 def _folder() -> Traversable:
     """Return the folder of the templates: in an installed package, or beside the package in the source tree."""
     package = resources.files("bstcad")
     return inside if (inside := package / "templates").is_dir() else package / ".." / "templates"
 
 
-def _write_scene(path: Path, text: str) -> Scene:
-    """Write a new file of a scene and load it; remove the file again if the scene does not load."""
+def _write_scene(path: Path, text: str, pictures: Mapping[str, bytes] = MappingProxyType({})) -> Scene:
+    """Write a new file of a scene and its pictures, and load it; remove the new files if the scene does not load."""
     from bstcad.scene.scene import load
 
+    contents = {path: text.encode("utf-8")} | {path.with_name(name): data for name, data in pictures.items()}
+    made: list[Path] = []
     try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        raise SceneError(f"{path}: the file exists already and is not changed; give another name") from None
-    try:
+        for each, data in contents.items():
+            if each != path and each.is_file() and each.read_bytes() == data:
+                continue  # an equal picture of an earlier copy
+            with each.open("xb") as file:
+                made.append(each)
+                file.write(data)
         return load(path)
-    except BaseException:
-        path.unlink(missing_ok=True)
+    except BaseException as error:
+        for each in made:
+            each.unlink(missing_ok=True)
+        if isinstance(error, FileExistsError):
+            kept = "the file exists already and is not changed"
+            raise SceneError(f"{error.filename}: {kept}; give another name, or move the file") from None
         raise

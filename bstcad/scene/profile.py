@@ -14,7 +14,7 @@ from pydantic import Field
 from scipy.special import erf
 
 from bstcad.optics.key import Key
-from bstcad.scene.schema import LENGTHS, Record
+from bstcad.scene.schema import LENGTHS, Record, leaving_out
 
 # Gauss-Legendre nodes per cell of a super-Gaussian of radius w and order n: in cells up to w / n wide; below w / (4 n).
 NODES, FEWER_NODES = 8, 4
@@ -60,22 +60,42 @@ class DiscProfile(_Profile):
 
 
 class RectangleProfile(_Profile):
-    """A uniform rectangle: E = 1 for |x| < width / 2 and |y| < height / 2, else 0."""
+    """A uniform rectangle, whose edge may be soft: E = s(x, width) s(y, height).
+
+    s(x, a) is 1 for |x| < (a - e) / 2, 0 for |x| > (a + e) / 2, and linear in between, with e the width of the edge.
+    """
 
     shape: Annotated[Literal["rectangle"], Key("A uniform rectangle.")] = "rectangle"
     width: Annotated[float, Key("Width along x.", "mm", *LENGTHS, example=8.0)]
     height: Annotated[float, Key("Height along y.", "mm", *LENGTHS, example=6.0)]
+    edge: Annotated[
+        float, Key("Width of the edge, over which E falls to zero; half of it lies outside.", "mm", 0.0, LENGTHS[1])
+    ] = 0.0
+
+    written = leaving_out(edge=0.0)
 
     @property
     def half_extent(self) -> tuple[float, float]:
-        """Half the width and height (mm)."""
-        return self.width / 2, self.height / 2
+        """Half the width and height (mm), with the outer half of the edge."""
+        return (self.width + self.edge) / 2, (self.height + self.edge) / 2
 
     def light(self, pixels: Pixels, size: Size) -> np.ndarray:
-        """Return the exact fraction of each pixel inside the rectangle."""
-        ends = zip(edges(pixels, size), self.half_extent, strict=True)
-        along_x, along_y = (np.abs(np.diff(np.clip(at, -half, half))) for at, half in ends)
+        """Return the exact means of E over the pixels."""
+        ends = zip(edges(pixels, size), (self.width / 2, self.height / 2), strict=True)
+        along_x, along_y = (np.abs(np.diff(_below(at, half, self.edge))) for at, half in ends)
         return np.outer(along_y, along_x) / cell(pixels, size)
+
+
+def _below(at: np.ndarray, half: float, edge: float) -> np.ndarray:
+    """Return ∫_0^x s(t, 2 half) dt (mm) for the x in `at`: the mean of clip(t, -half, half) over x ± edge / 2."""
+
+    def primitive(t: np.ndarray) -> np.ndarray:
+        within = np.clip(np.abs(t), 0.0, half)
+        return within * (np.abs(t) - within / 2)
+
+    if edge == 0.0:
+        return np.clip(at, -half, half)
+    return (primitive(at + edge / 2) - primitive(at - edge / 2)) / edge
 
 
 class GaussianProfile(_Profile):

@@ -21,10 +21,11 @@ SIZE = 20.0, 16.0  # mm
 MADE = {
     "disc": {"shape": "disc", "radius": 6.0},
     "rectangle": {"shape": "rectangle", "width": 8.0, "height": 6.0},
+    "soft": {"shape": "rectangle", "width": 8.0, "height": 6.0, "edge": 1.5},
     "gaussian": {"shape": "gaussian", "radius_1e2": 3.0},
     "super_gaussian": {"shape": "super_gaussian", "radius_1e2": 6.0, "order": 10.0},
 }
-EVEN = {"disc": math.pi * 36.0, "rectangle": 48.0}  # areas (mm²)
+EVEN = {"disc": math.pi * 36.0, "rectangle": 48.0, "soft": 48.0}  # areas (mm²)
 THU = "templates/thu.toml"
 
 
@@ -62,6 +63,13 @@ def test_the_area_of_a_corner_is_a_quarter_disc_beyond_it():
     far = np.array([7.0, -7.0])
     np.testing.assert_allclose(corner_area(far, far[::-1], 6.0), [-9 * math.pi] * 2, rtol=1e-15)
     assert corner_area(np.array(3.0), np.array(2.0), 6.0) == 6.0  # inside, a rectangle
+
+
+def test_a_soft_edge_falls_linearly_from_one_to_zero():
+    """s = 1/2 + (a/2 - x) / e across the edge, so that the mean over a pixel inside it is s at the pixel's centre."""
+    light = made("rectangle", width=8.0, height=6.0, edge=2.0).light((80, 64), SIZE)  # pixels of 0.25 mm
+    x = np.arange(-40, 40) * 0.25 + 0.125
+    np.testing.assert_allclose(light[32], np.clip(0.5 + (4.0 - np.abs(x)) / 2.0, 0.0, 1.0), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("order", [2.0, 3.0, 10.0, 40.0, 100.0])
