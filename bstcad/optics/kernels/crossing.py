@@ -235,27 +235,31 @@ def _add_directions(tilted, g, status, first, count, work):
 
     C: with r = hypot(x, y), s = θ / r and θ = atan2(r, z), ds = (dθ - s dr) / r and dθ = (z dr - r dz) / (r² + z²).
     """
+    n_z = tilted.n_z
+    if tilted.chart == 1:  # a loop of its own is vectorised
+        for r in range(count):
+            at, ex, ey, ez = first + r, work[E_X + r], work[E_Y + r], n_z * work[E_Z + r]
+            alive = status[at] == 0
+            gx, gy = forward.DEGREES * g[0, at] if alive else 0.0, forward.DEGREES * g[1, at] if alive else 0.0
+            r2 = max(ex * ex + ey * ey, 1e-30)
+            s, along = forward.angle_by_radius(r2, ez), (gx * ex + gy * ey) / r2
+            by_radius = along * (ez / (r2 + ez * ez) - s)  # ∂L/∂r / r beside that of x and y
+            work[G_DX + r] += s * gx + by_radius * ex
+            work[G_DY + r] += s * gy + by_radius * ey
+            work[G_DZ + r] -= n_z * along * r2 / (r2 + ez * ez)
+        return
     for r in range(count):
-        at, ex, ey, ez = first + r, work[E_X + r], work[E_Y + r], tilted.n_z * work[E_Z + r]
+        at, ex, ey, ez = first + r, work[E_X + r], work[E_Y + r], n_z * work[E_Z + r]
         gx, gy = (g[0, at], g[1, at]) if status[at] == 0 else (0.0, 0.0)
         gx, gy = forward.DEGREES * gx, forward.DEGREES * gy
-        if tilted.chart == 1:
-            r2 = max(ex * ex + ey * ey, 1e-30)
-            radius = math.sqrt(r2)
-            norm2 = r2 + ez * ez
-            s, along = math.atan2(radius, ez) / radius, (gx * ex + gy * ey) / r2
-            by_radius = along * (radius * ez / norm2 - s * radius)  # ∂L/∂r beside that of x and y
-            by_x, by_y = s * gx + by_radius * ex / radius, s * gy + by_radius * ey / radius
-            by_z = -along * r2 / norm2
-        else:
-            one, other, g_one, g_other = (ex, ey, gx, gy) if tilted.chart == 2 else (ey, ex, gy, gx)
-            flat = one * one + ez * ez
-            by_one, by_z = g_one * ez / flat, -g_one * one / flat
-            by_other = g_other / math.sqrt(max(1.0 - other * other, 1e-12))
-            by_x, by_y = (by_one, by_other) if tilted.chart == 2 else (by_other, by_one)
+        one, other, g_one, g_other = (ex, ey, gx, gy) if tilted.chart == 2 else (ey, ex, gy, gx)
+        flat = one * one + ez * ez
+        by_one, by_z = g_one * ez / flat, -g_one * one / flat
+        by_other = g_other / math.sqrt(max(1.0 - other * other, 1e-12))
+        by_x, by_y = (by_one, by_other) if tilted.chart == 2 else (by_other, by_one)
         work[G_DX + r] += by_x
         work[G_DY + r] += by_y
-        work[G_DZ + r] += tilted.n_z * by_z
+        work[G_DZ + r] += n_z * by_z
 
 
 @njit(error_model="numpy", fastmath={"contract"})

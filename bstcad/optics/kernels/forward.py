@@ -196,14 +196,46 @@ def at_back(faces, count, work):
 
 
 DEGREES = 180.0 / math.pi
+# Coefficients of atan(t) / t in powers of t², by interpolation at Chebyshev points of t² in [0, 1], to 2e-16.  Loops
+# with this polynomial are vectorised, and take a fraction of the time of those with math.atan2.
+ARC_TANGENT = (
+    1.0, -0.333333333333307, 0.1999999999964796, -0.14285714266926733, 0.11111110578002083, -0.09090899793217341,
+    0.07692198997458294, -0.06665764910689723, 0.058768281144872724, -0.052374234719188166, 0.04668745304848529,
+    -0.040811247503178855, 0.03387126702700675, -0.02556862364437174, 0.01671959606350739, -0.00899108054265826,
+    0.003751138483965141, -0.0011252544302234645, 0.00021423810738603946, -1.93423475928923e-05,
+)  # fmt: skip
+
+
+@njit(error_model="numpy", fastmath={"contract"})
+def angle_by_radius(r2, z):
+    """Return θ / r, θ = atan2(r, z), of the components r = sqrt(r2) > 0 and z of a vector.
+
+    tan(θ / 2) = r / (n + z) with n its length, so that θ = 2 atan t for t = tan(θ / 2) <= 1, else π - 2 atan(1 / t).
+    """
+    whole = math.sqrt(r2 + z * z) + z
+    w = r2 / max(whole * whole, 1e-300)
+    backwards = w > 1.0
+    w = 1.0 / w if backwards else w
+    c = ARC_TANGENT  # a chain of products, since no loop over them is vectorised
+    value = (c[19] * w + c[18]) * w + c[17]
+    value = (value * w + c[16]) * w + c[15]
+    value = (value * w + c[14]) * w + c[13]
+    value = (value * w + c[12]) * w + c[11]
+    value = (value * w + c[10]) * w + c[9]
+    value = (value * w + c[8]) * w + c[7]
+    value = (value * w + c[6]) * w + c[5]
+    value = (value * w + c[4]) * w + c[3]
+    value = (value * w + c[2]) * w + c[1]
+    value = value * w + c[0]
+    past = (math.pi - 2.0 * value * math.sqrt(w)) / math.sqrt(r2)
+    return past if backwards else 2.0 * value / whole
 
 
 @njit(error_model="numpy")
 def angles(chart, x, y, z):
     """Return the coordinates (degrees) of a unit vector, as `Directions.coordinates` does."""
     if chart == 1:
-        r = math.sqrt(max(x * x + y * y, 1e-30))
-        scale = DEGREES * math.atan2(r, z) / r
+        scale = DEGREES * angle_by_radius(max(x * x + y * y, 1e-30), z)
         return scale * x, scale * y
     if chart == 2:
         return DEGREES * math.atan2(x, z), DEGREES * math.asin(min(max(y, -1.0), 1.0))
@@ -213,6 +245,11 @@ def angles(chart, x, y, z):
 @njit(error_model="numpy")
 def to_directions(tilted, count, work):
     """Replace the places of rays by the coordinates of their directions."""
+    if tilted.chart == 1:  # a loop of its own is vectorised
+        for r in range(count):
+            dx, dy, dz = work[DX + r], work[DY + r], tilted.n_z * work[DZ + r]
+            work[X + r], work[Y + r] = angles(1, dx, dy, dz)
+        return
     for r in range(count):
         dx, dy, dz = work[DX + r], work[DY + r], tilted.n_z * work[DZ + r]
         work[X + r], work[Y + r] = angles(tilted.chart, dx, dy, dz)
@@ -278,7 +315,7 @@ def _points(cells, i, j, count, work):
 
 @njit(error_model="numpy")
 def launch(beam, count, work):
-    """Store flux density and direction of the rays through the points, as `source.irradiance` and `source.rays` do."""
+    """Store flux density and direction of rays through the points, as `irradiance` and `rays_through` give them."""
     for r in range(count):
         x, y = work[X + r] - beam.x, work[Y + r] - beam.y
         r2 = x * x + y * y
@@ -606,7 +643,7 @@ def _is_same(one: Lens, other: Lens) -> bool:
 def land(source: Emitter, lens: Lens, plane: Receiver, x: Tensor, y: Tensor) -> Landed:
     """Trace rays through (x, y) of the first vertex's plane, each (n,) float64, to `plane`; flux: density at (x, y).
 
-    Equal to `trace.trace` of these `source.rays` without losses, except for the status of rays without flux.
+    Equal to `trace.trace` of these `source.rays_through` without losses, except for the status of rays without flux.
     """
     scene = *_scene(source, lens, plane), NO_LOSS_TABLES
     landing, flux, fate = np.empty((2, x.numel())), np.empty(x.numel()), np.empty(x.numel(), np.uint8)

@@ -140,7 +140,7 @@ def _table_of_light(source: Emitter, window: Rectangle, z: float) -> Beam | None
     for side in TABLE_SIDES:
         along = np.linspace(-0.5, 0.5, 2 * side - 1)
         x, y = (torch.from_numpy(p) for p in np.meshgrid(along * window.width, along * window.height, indexing="ij"))
-        rays = source.rays(x, y, z, 1.0)
+        rays = source.rays_through(x, y, z, 1.0)
         ahead, starts = rays.sense * rays.direction[2], (rays.sense * -rays.above(z)).max()
         if not bool(rays.alive.all() & (ahead > 0).all()):
             return None
