@@ -24,7 +24,6 @@ import numpy as np
 
 import bstcad
 from bstcad import folder as folders
-from bstcad.analysis.far_field import FarField
 from bstcad.folder import Made
 from bstcad.judges import comparison
 from bstcad.judges.comparison import Comparison
@@ -39,9 +38,10 @@ from bstcad.report import data_sheet, exports, prescription, record, rendering, 
 from bstcad.report.data_sheet import DataSheet
 from bstcad.report.exports import Exported
 from bstcad.report.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, draw_wavefront, light_path_of
-from bstcad.report.goal_figures import GoalFigures, figures_of
+from bstcad.report.goal_figures import GoalFigures, figures_of, photometry
 from bstcad.report.grid_sag import GridLight
 from bstcad.report.light_figures import draw_judges, draw_part
+from bstcad.report.photometric_figures import draw_isolux, far_field_of
 from bstcad.report.prescription import SHEET, Order
 from bstcad.report.record import Contents, Examined, LeftOut, Report, StageRecord, contents_of, with_part
 from bstcad.report.rendering import LightPath
@@ -223,6 +223,8 @@ def _prove_files(made: Made, folder: Path, drawn: Pictures, options: ProofOption
 
     def draw(light: Light, lines: tuple[SpectralLine, ...], number: int) -> None:
         drawn.begin(draw_light, made.goals[number].picture, light, lines, number=number)
+        if (lumens := made.scene.source.luminous_flux) is not None:
+            drawn.begin(draw_isolux, light, lumens, number=number)
 
     proof = checks.verify(folder, made, processes.submit, on_lens=drawn.lens, on_light=draw, effort=options.effort)
     if proof.wavefront is not None:
@@ -399,6 +401,7 @@ def _sheet(
     """Return the data sheet of a design from its proof or report; irradiance: light on the first target."""
     light: dict[str, Any] = {"target": made.goals[0].picture, "irradiance": irradiance, "figures": figures}
     found: dict[str, Any] = {"shape": proof.shape, "passed": proof.passed, "version": bstcad.__version__}
+    found["photometry"] = proof.photometry if isinstance(proof, Contents) else tuple(photometry(made.scene, proof))
     return DataSheet(scene=made.scene, designed=made.lens, order=order, **light, **found)
 
 
@@ -469,7 +472,7 @@ def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> Exp
 def _export(made: Made, kinds: Sequence[str], folder: Path, points: int | None = None) -> Exported:
     scene, lens = made.scene, made.lens
     light = GridLight(scene.source.central, tuple(target.screen for target in scene.targets))
-    far = FarField(scene.verification_channels(), scene.source.luminous_flux)
+    far = far_field_of(scene)
     return exports.export(
         lens, kinds, folder, points=points, label=folders.label(scene), mount=scene.mount, light=light, far=far
     )

@@ -33,7 +33,7 @@ MAY_IMPORT = {
     "runs": {"bstcad"},  # the ground: files, processes, signals, checkpoints; it knows no lens
     "step_text": {"runs"},
     "optics": set(),
-    "photometry": set(),
+    "photometry": {"optics"},  # its hash, by which rays are drawn
     "transport": set(),
     "scene": {"runs", "optics", "photometry", "step_text"},
     "tailoring": {"scene", "optics", "transport"},

@@ -267,7 +267,7 @@ class Oval(Emitter):
     def window(self, outline, z, sags):
         return Rectangle(*(2 * half for half in outline.half_extent))
 
-    def rays(self, x, y, z, area):
+    def rays_through(self, x, y, z, area):
         place = torch.stack([x, y, torch.zeros_like(x)])
         along = torch.stack([torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)])
         return Rays(place, along, self.irradiance(x, y, z) * area, all_alive(x), axial=True, z=z - 20.0)
@@ -449,7 +449,7 @@ def test_an_installed_package_brings_an_effect_along(scene, tmp_path):
     (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: dusty-lenses\nVersion: 1\n")
     (facts / "entry_points.txt").write_text("[bstcad.effects]\nspray = dusty_lenses:Dust\n")
     path = tmp_path / "scene.toml"
-    path.write_text(scene.toml().replace("effects = []", 'effects = [{ kind = "own", name = "spray" }]'))
+    path.write_text('effects = [{ kind = "own", name = "spray" }]\n' + scene.toml())
     script = "import sys, bstcad; c, = bstcad.load(sys.argv[1]).channels(); print(c.losses.own[0].line)"
     told = subprocess.run(
         [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=True,

@@ -53,7 +53,7 @@ def test_rays_in_space_draw_the_letter_as_it_is_to_whom_looks_along_z(made):
     half_x, half_y = lens.outline.half_extent
     line = (torch.arange(500, dtype=torch.float64) + 0.5) / 250 - 1
     x, y = (p.reshape(-1) for p in torch.meshgrid(half_x * line, half_y * line, indexing="ij"))
-    leaving = scene.source.rays(x, y, lens.entrance.z, 1.0)
+    leaving = scene.source.rays_through(x, y, lens.entrance.z, 1.0)
     for interface in lens.interfaces:
         leaving = bstcad.cross(leaving, interface).rays
     target, b = scene.target, np.radians(scene.target.tilt[1])

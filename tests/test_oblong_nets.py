@@ -83,7 +83,7 @@ def test_sags_along_the_longer_side_are_those_along_the_shorter_one_of_the_net_t
 def test_landings_and_their_gradient_are_those_of_the_plain_form_and_of_differences():
     lens = Lens(Sphere(15.0, -0.02), bowl(), Rectangle(22.0, 11.0), 1.6)
     x, y = stratified(Rectangle(20.0, 10.0), 40, 0, torch.float64)
-    in_glass = trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens)
+    in_glass = trace.to_first_net(Point().rays_through(x, y, 15.0, 1.0), lens)
 
     def merit(form, heights):
         landed = form(in_glass, replace(lens, back=replace(lens.back, heights=heights)), LevelPlane(200.0))

@@ -72,7 +72,7 @@ def test_the_person_meant_reads_an_f_and_the_other_one_its_mirror_image(scenes):
     lens = bstcad.design(scene, progress=False).lens
     line = (torch.arange(RAYS, dtype=torch.float64) + 0.5) * 20.0 / RAYS - 10.0
     x, y = torch.meshgrid(line, line, indexing="ij")
-    landed = trace(scene.source.rays(x, y, lens.front.z, 1.0), lens, LevelPlane(320.0))
+    landed = trace(scene.source.rays_through(x, y, lens.front.z, 1.0), lens, LevelPlane(320.0))
     arrived = (landed.status == Status.ALIVE).flatten()
     points = np.stack([*landed.position.flatten(1)[:, arrived].numpy(), np.full(int(arrived.sum()), 320.0)], axis=1)
     assert len(points) > 0.95 * RAYS**2

@@ -46,7 +46,7 @@ def fan(source: Emitter, lens: Lens, plane: Receiver) -> np.ndarray:
     """Return polylines (rays, points, 3) in mm from the source to the plane, via (x, 0) on the first vertex plane."""
     half = clear_window(source, lens).width / 2
     x = torch.linspace(-0.98 * half, 0.98 * half, FAN_RAYS, dtype=torch.float64)
-    return _polylines(source.rays(x, torch.zeros_like(x), lens.entrance.z, 1.0), lens, plane)[0]
+    return _polylines(source.rays_through(x, torch.zeros_like(x), lens.entrance.z, 1.0), lens, plane)[0]
 
 
 def bundle(source: Emitter, lens: Lens, plane: Receiver, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -56,7 +56,7 @@ def bundle(source: Emitter, lens: Lens, plane: Receiver, n: int) -> tuple[np.nda
     """
     area = clear_window(source, lens)
     x, y = (p.reshape(-1).to(torch.float64) for p in sampling.grid(area, n))
-    return _polylines(source.rays(x, y, lens.entrance.z, area.area / n**2), lens, plane)
+    return _polylines(source.rays_through(x, y, lens.entrance.z, area.area / n**2), lens, plane)
 
 
 def _polylines(rays: Rays, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +76,7 @@ def ray_map(source: Emitter, lens: Lens, plane: Receiver) -> tuple[np.ndarray, n
     area = clear_window(source, lens)
     line = torch.linspace(-0.499, 0.499, GRID_LINES, dtype=torch.float64)
     x, y = torch.meshgrid(line * area.width, line * area.height, indexing="ij")
-    landed = trace(source.rays(x, y, lens.entrance.z, 1.0), lens, plane)
+    landed = trace(source.rays_through(x, y, lens.entrance.z, 1.0), lens, plane)
     start, end = torch.stack([x, y], dim=-1), landed.position.permute(1, 2, 0).clone()
     lost = ~(landed.alive & (landed.flux > 0))
     start[lost] = end[lost] = torch.nan
@@ -112,7 +112,7 @@ def _hits(source: Emitter, lens: Lens) -> Tensor:
     area = clear_window(source, lens)
     line = torch.linspace(-0.5, 0.5, NEEDED_RAYS, dtype=torch.float64) * (1 - 1e-9)
     x, y = (p.reshape(-1) for p in torch.meshgrid(line * area.width, line * area.height, indexing="ij"))
-    _, *behind = _at_interfaces(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    _, *behind = _at_interfaces(source.rays_through(x, y, lens.entrance.z, 1.0), lens)
     through = behind[-1].alive & (behind[-1].flux > 0)
     return torch.stack([rays.position[:2, through] for rays in behind])
 
@@ -173,7 +173,7 @@ def mount_losses(lens: Lens, channels: Sequence[Channel], flange: tuple[float, f
         bare = replace(own, clear=None)
         area = window(channel.source, bare)
         x, y = sampling.grid(area, n)
-        rays = channel.source.rays(x, y, own.entrance.z, channel.weight * area.area / n**2)
+        rays = channel.source.rays_through(x, y, own.entrance.z, channel.weight * area.area / n**2)
         solid = slice(own.solid.start, own.solid.stop + 1)  # rays before, in and behind the solid
         whole, through = _at_interfaces(rays, bare)[solid][-1], _at_interfaces(rays, own)[solid]
         out = through[-1]

@@ -169,7 +169,7 @@ class Reference:
             return None
         lens, source = channel.through(self.lens), channel.source
         area, n = clear_window(source, lens), GHOST_RAYS_PER_SIDE
-        rays = source.rays(*sampling.grid(area, n), lens.entrance.z, area.area / n**2)
+        rays = source.rays_through(*sampling.grid(area, n), lens.entrance.z, area.area / n**2)
         straight = float(landed_flux(trace(rays, lens, self.screen.plane)).sum())
         landed = self.screen.plane.land(trace_ghost(rays, lens)[0])
         flux = torch.where(landed.alive, landed.flux, torch.zeros_like(landed.flux)).numpy() / straight
@@ -269,7 +269,7 @@ def _trace_through(
     """Trace light through points of the last face; return (landed rays, of flux 1 before losses; flux per cell)."""
     lens, source = channel.through(lens), channel.source
     p, q, _ = rays_to(source, lens, *points)
-    rays = source.rays(p, q, lens.entrance.z, 1.0)
+    rays = source.rays_through(p, q, lens.entrance.z, 1.0)
     (p_x, p_y), (q_x, q_y) = (torch.gradient(c) for c in (p, q))
     density = rays.flux * (p_x * q_y - p_y * q_x).abs()
     return trace(replace(rays, flux=torch.ones_like(rays.flux)), lens, screen.plane), density

@@ -53,7 +53,7 @@ def needed_steepness(
         _, _, at = rays_to(source, lens, p, q, number=number)
     else:
         before = lens.unbounded().interfaces[:number]
-        coming = across(source.rays(p, q, lens.entrance.z, 1.0), before)
+        coming = across(source.rays_through(p, q, lens.entrance.z, 1.0), before)
         at, _, _ = intersect(face.surface, coming, face.outline, face.status_if_missed)
     aim = torch.stack(torch.meshgrid(torch.from_numpy(x), torch.from_numpy(y), indexing="ij"))
     out, eta = screen.plane.vector_to(at, aim), face.law.eta

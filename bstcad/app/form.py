@@ -74,6 +74,7 @@ ADDITIONS = {  # labels of buttons that add a table, by key
     "before": "Add a window or mirror before the lens", "behind": "Add a window or mirror behind the lens",
     "wavefront": "Add a required wavefront", "mount": "Add a mount (rim, flange, holes)",
     "effects": "Add an effect (losses, ghosts)", "tolerance": "Add a tolerance",
+    "accept.point": "Add a test point", "accept.cut_off": "Limit the sharpness of a cut-off",
 }  # fmt: skip
 LOCKED_SIDES = {"x": "y", "y": "x", "width": "height", "height": "width"}  # side: the other side, which a lock changes
 OPTIONAL_TABLES = ("mount",)  # tables that a button adds, though no key in them is required; others are always shown

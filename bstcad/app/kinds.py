@@ -25,6 +25,8 @@ FIRST_OPTIONS = {  # first key, by (table, kind), of a new table that needs one 
     ("target", "intensity"): {"uniform": True},
     ("tolerance", ""): {"grade": "precise"},
     ("lens.front", "bspline"): {"optimise": True},
+    ("accept.point", ""): {"least": 0.5},
+    ("accept.cut_off", ""): {"least": 0.13},
 }
 
 # Python types of a value, by its type in the schema.
@@ -279,6 +281,14 @@ def _screw_circle(data: Table) -> float | None:
     return None if None in sizes else (min(sizes[0]) + min(sizes[1])) / 2
 
 
+def _target_centre(data: Table) -> list[float] | None:
+    """Return the centre [x, y] of the first target, in its unit; None if its ends are not stated."""
+    ends = [table_at("target", data).get(axis) for axis in "xy"]
+    if all(isinstance(pair, list) and len(pair) == 2 and are_numbers(*pair) for pair in ends):
+        return [sum(pair) / 2 for pair in ends]
+    return None
+
+
 def _source_z(data: Table) -> float | None:
     """Return z (mm) of a new source before the lens, or on the light's side of a mirror; None: keep the default."""
     source, front, back = table_at("source", data), _scaled_z(data, "lens.front"), _scaled_z(data, "lens.back")
@@ -305,4 +315,6 @@ VALUES: Mapping[str, Callable[[Table], Any]] = {  # functions that return the va
     "wavefront.focus": lambda data: _on_axis(_scaled_z(data, "target", times=2.0)),
     "mount.flange.z": lambda data: _scaled_z(data, "lens.front", more=0.5),
     "mount.flange.screws.circle": _screw_circle,
+    "accept.point.at": _target_centre,
+    "accept.cut_off.at": lambda data: (_target_centre(data) or [None])[0],
 }

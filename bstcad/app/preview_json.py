@@ -42,7 +42,8 @@ def of_preview(found: Preview) -> dict[str, Any]:
 def figures(found: Preview) -> Rows:
     """Return the figures of a lens's light and shape as rows (name, value)."""
     apart, optic = SHAPE_ERROR if found.lit_fraction >= MIN_LIT_FRACTION else DARK_SHAPE_ERROR, found.scene.optic
-    shown = tables("preview_figures.txt.j2", flux=found.flux, shape=found.shape, optic=optic, apart=apart)
+    light = {"flux": found.flux, "lumens": found.scene.source.luminous_flux}
+    shown = tables("preview_figures.txt.j2", **light, shape=found.shape, optic=optic, apart=apart)
     return shown["figures"]
 
 

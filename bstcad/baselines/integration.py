@@ -81,7 +81,7 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
     source, exact, z = task.heaviest.source, lens.plain(), lens.back.z
     area, n = clear_window(source, exact), knobs.rays // 2 * 2 + 1  # odd: one ray through the centre
     x, y = sampling.grid(area, n)
-    coming = to_first_net(source.rays(x, y, exact.entrance.z, area.area / n**2), exact)
+    coming = to_first_net(source.rays_through(x, y, exact.entrance.z, area.area / n**2), exact)
     aim, plane = slope_map.aim_points(mapping, exact, screen, x=x, y=y), image_from_last_net(exact, screen.plane)
     for _ in range(MAX_STARTS):
         start = exact.back.z

@@ -78,7 +78,7 @@ def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: 
     """Run or resume stage 1 on the net of `lens`: minimise the miss of rays through `area` by heights and front."""
     n = min(task.knobs.rays, MAX_RAYS_PER_CONTROL_POINT * max(lens.back_net.shape))
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
-    rays = task.heaviest.source.rays(x, y, lens.entrance.z, area.area / n**2)
+    rays = task.heaviest.source.rays_through(x, y, lens.entrance.z, area.area / n**2)
     screen, shape = task.goals[0].receiver, lens.front.parameters()
     aim = slope_map.aim_points(mapping, lens, screen, x=x, y=y)
     start = [lens.back_net.heights, *(torch.as_tensor(shape[name]).to(lens.like) for name in task.free)]
@@ -184,7 +184,7 @@ def random_bundles(channels: tuple[Channel, ...], lens: Lens, count: int, seed: 
     def bundle(channel: Channel) -> Rays:
         area = clear_window(channel.source, channel.through(lens))
         x, y = (t.to(lens.like) for t in sampling.random(area, count, seed))
-        return channel.source.rays(x, y, lens.entrance.z, area.area / count)
+        return channel.source.rays_through(x, y, lens.entrance.z, area.area / count)
 
     return tuple(map(bundle, channels))
 

@@ -40,6 +40,18 @@ class Channel:
         return replace(lens, index=self.index, losses=self.losses, before=before, behind=behind)
 
 
+@dataclass(frozen=True)
+class Draw:
+    """Samples of a source: its channels for a set of rays, by (number of points of an extended source, seed)."""
+
+    sample: Callable[[int, int], Sequence[Channel]]
+    largest_side: int | None = None  # rays per side that a set can have, as a file has no more; None: any number
+
+    def __call__(self, points: int, seed: int) -> Sequence[Channel]:
+        """Return the channels."""
+        return self.sample(points, seed)
+
+
 def channels_of(source: Emitter, index: Callable[[float], float], points: int, draw: int = 0) -> tuple[Channel, ...]:
     """Return the channels of a source; index(nm) is the refractive index of the lens.
 
@@ -70,6 +82,30 @@ def drawn_channels(source: Emitter, index: Callable[[float], float], points: int
         return sampling.shifted_lattice(extent, max(1, round(fraction * points)), (seed << 8) + k)
 
     return _sample_extent(source, index, points_of)
+
+
+@dataclass(frozen=True, eq=False)
+class GivenChannels:
+    """Channels of the rays of a file, one for each spectral line, from a part that the seed selects."""
+
+    source: Emitter
+    index: Callable[[float], float]
+
+    def __call__(self, seed: int) -> tuple[Channel, ...]:
+        """Return the channels."""
+        numbered = enumerate(self.source.lines)
+        bundles = ((self.source.bundle(k, seed), nm, fraction) for k, (nm, fraction) in numbered)
+        return tuple(Channel(bundle, self.index(nm), fraction) for bundle, nm, fraction in bundles if bundle)
+
+    @property
+    def largest_side(self) -> int:
+        """Number n for which n x n rays of each line are about all rays of a part."""
+        return max(channel.source.largest_side for channel in self(0))
+
+
+def given_channels(source: Emitter, index: Callable[[float], float]) -> GivenChannels | None:
+    """Return the channels of the rays of a file; None: a source without such rays."""
+    return None if source.bundle(0) is None else GivenChannels(source, index)
 
 
 def _sample_extent(source: Emitter, index: Callable[[float], float], points_of: Callable) -> tuple[Channel, ...]:

@@ -239,7 +239,7 @@ class Collimated(Emitter):
         """Return (aperture, centre in mm) of the light on the plane z."""
         return self.aperture, self.shift(z)
 
-    def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
+    def rays_through(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
         """Return rays through (x, y) of the plane z, which start on a plane before it (`start`)."""
         start = self.start(z)
         sense = 1 if start <= z else -1

@@ -48,7 +48,7 @@ class Directions(Receiver):
     start: float = 0.0  # z (mm) of the point from which directions are drawn
     distance: float = FAR  # distance (mm) at which directions are drawn, and from which on rays are not followed
 
-    unit, light = "degrees", "radiant intensity"
+    unit, light, photometric_unit = "degrees", "radiant intensity", "cd"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "chart", CHARTS[self.angles])
@@ -131,8 +131,18 @@ class Directions(Receiver):
         """Return the solid angles of (rows, columns) cells of ranges x, y, divided by their mean; row 0 is y max."""
         return _areas(self, x, y, shape=shape)
 
+    def cell_sizes(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray:
+        """Return the solid angles (sr) of (rows, columns) cells of ranges x, y; row 0 is y max."""
+        (rows, columns), width, height = shape, math.radians(x[1] - x[0]), math.radians(y[1] - y[0])
+        return self._mean_densities(x, y, shape=shape)[::-1] * (width * height / (rows * columns))
+
     def computed_areas(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray:
-        """Return `areas`, computed anew, a few rows at a time."""
+        """Return `areas`, computed anew."""
+        cells = self._mean_densities(x, y, shape=shape)
+        return cells[::-1] / cells.mean()
+
+    def _mean_densities(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray:
+        """Return the mean solid angle per dx dy of (rows, columns) cells, a few rows at a time; row 0 is y min."""
         rows, columns = shape
         node, weight = np.polynomial.legendre.leggauss(NODES)
         at_x, at_y = (
@@ -143,7 +153,7 @@ class Directions(Receiver):
         for first in range(0, rows, strip):
             density = self._density(at_x[None, None], at_y[first : first + strip, :, None, None])
             cells[first : first + strip] = (density * (weight[:, None, None] * weight / 4)).sum((1, 3))
-        return cells[::-1] / cells.mean()
+        return cells
 
     def _density(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return the solid angle per dx dy at coordinates in rad."""

@@ -1,7 +1,7 @@
 """Emitters: sources of light, each with its irradiance on a plane z = const and the rays that carry this flux.
 
 `irradiance(x, y, z)` is the irradiance (1/mm², for a total flux of 1) on the plane z before the lens, and
-`rays(x, y, z, area)` are the rays through points of that plane, each with the flux of its cell of area `area`.
+`rays_through(x, y, z, area)` are the rays through points of that plane, each with the flux of its cell of area `area`.
 Light travels from the source towards that plane: along +z to a plane above it, along -z to one below (mirrors).
 
 A source with an `extent`, or with several spectral lines, is a sum of simple sources (`element`; see channels.py).
@@ -48,8 +48,8 @@ PROFILE_NAMES = {  # profile names in text
 class Emitter(ABC):
     """A source of light.
 
-    A subclass is a frozen dataclass that defines `irradiance`, `rays` and `window`.  The other methods have defaults;
-    some raise NotImplementedError, which names the method that the subclass must add.
+    A subclass is a frozen dataclass that defines `irradiance`, `rays_through` and `window`.  The other methods have
+    defaults; some raise NotImplementedError, which names the method that the subclass must add.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
@@ -64,11 +64,17 @@ class Emitter(ABC):
     start_key: str = "z"  # scene key of the position where the light starts
     widths: Mapping[str, tuple[str, ...]] = MappingProxyType({})  # scene keys that each profile needs
     unbounded: str | None = None  # name of the profile that needs no width
+    is_given: bool = False  # True: the rays are given (ray_bundle.RayBundle), without an irradiance on planes
 
     @property
     def luminous_flux(self) -> float | None:
         """Luminous flux, lm; None: not stated, so that fluxes are relative."""
         return self.lumens
+
+    @property
+    def remarks(self) -> Iterator[str]:
+        """Sentences, each with its key, on readings that a file of the source does not state plainly."""
+        yield from ()
 
     @property
     def extent(self) -> Outline | None:
@@ -98,7 +104,7 @@ class Emitter(ABC):
         """Return E(x, y) (1/mm²) on the plane z (mm); the total flux is 1."""
 
     @abstractmethod
-    def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
+    def rays_through(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
         """Return rays through (x, y) of the plane z (mm), each with the flux of a cell of `area` (mm²)."""
 
     @abstractmethod
@@ -167,6 +173,15 @@ class Emitter(ABC):
     def is_shift_invariant(self) -> bool:
         """True if a shift along the axis of the lens leaves the light unchanged."""
         return self.parallel and not self.tilted
+
+    def bundle(self, line: int, part: int = 0) -> Emitter | None:
+        """Return the rays of a file at a spectral line, from one of the file's parts; None: no file of rays."""
+        return None
+
+    @property
+    def largest_side(self) -> int:
+        """Number n for which n x n is about the number of given rays in a part."""
+        raise self._missing_method("given rays", "largest_side")
 
     def with_wider_cone(self, by: float) -> Emitter | None:
         """Return the simple source with the tangent of its half angle larger by the fraction `by`; None: no cone."""

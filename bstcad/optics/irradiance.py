@@ -92,6 +92,11 @@ class Screen:
         """Relative areas or solid angles of the pixels (rows, columns), of mean 1; None: all are equal."""
         return self.plane.areas(self.x, self.y, self.shape)
 
+    @property
+    def cell_sizes(self) -> np.ndarray:
+        """Areas (mm²) or solid angles (sr) of the pixels, (rows, columns)."""
+        return self.plane.cell_sizes(self.x, self.y, self.shape)
+
     def pixel(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return (column, row) of (x, y) as real numbers: pixel i extends from i to i + 1."""
         per_x, per_y = self.per_unit
@@ -203,22 +208,35 @@ LEDGER = {  # status of lost rays, by line of the ledger
     "lost through the sides": Status.VIGNETTED,
     "total internal reflection": Status.TOTAL_REFLECTION,
 }
+LEDGER_OF_GIVEN_RAYS = {  # further lines for the rays of a file
+    "starts inside the lens": Status.STARTED_INSIDE,
+    "starts beside or behind the lens": Status.STARTED_BESIDE,
+    "leads away from the lens": Status.LEADS_AWAY,
+}
 
 
-def ledger(rays: Landed, screen: Screen) -> dict[str, float]:
-    """Return the flux on and off the target and by cause of loss; the sum is that of all rays but Status.BLOCKED."""
+def ledger(rays: Landed, screen: Screen, *, given: bool = False) -> dict[str, float]:
+    """Return the flux on and off the target and by cause of loss; the sum is that of all rays but Status.BLOCKED.
+
+    given: count the rays of a file by where they start as well.
+    """
     flux = rays.flux.double()
     on_screen = screen.contains(rays.position[0], rays.position[1])
     lines = {
         "on target": float(total(flux[rays.alive & on_screen])),
         "off target": float(total(flux[(rays.alive & ~on_screen) | (rays.status == int(Status.TURNED_BACK))])),
     }
-    lost = {line: float(total(flux[rays.status == int(reason)])) for line, reason in LEDGER.items()}
+    causes = LEDGER | LEDGER_OF_GIVEN_RAYS if given else LEDGER
+    lost = {line: float(total(flux[rays.status == int(reason)])) for line, reason in causes.items()}
     return lines | lost | {line: float(total(part.double())) for line, part in rays.taken.items()}
+
+
+def leaving(flux: dict[str, float]) -> float:
+    """Return the flux that leaves the last surface, that of a ghost included; flux: the ledger."""
+    return math.fsum(flux.get(f"{ghost}{side} target", 0.0) for ghost in ("", "ghost ") for side in ("on", "off"))
 
 
 def efficiency(flux: dict[str, float]) -> float:
     """Return the flux on the target divided by the flux that leaves the last surface; flux: the ledger."""
-    inside, outside = (flux[f"{side} target"] + flux.get(f"ghost {side} target", 0.0) for side in ("on", "off"))
-    leaving = inside + outside
-    return inside / leaving if leaving > 0 else 0.0
+    whole = leaving(flux)
+    return (flux["on target"] + flux.get("ghost on target", 0.0)) / whole if whole > 0 else 0.0

@@ -29,9 +29,9 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import tubes
-from bstcad.optics.channels import Channel, points_per_line, source_numbers, weighted_sum
+from bstcad.optics.channels import Channel, Draw, points_per_line, source_numbers, weighted_sum
 from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import Leak, Screen, efficiency, leak, rrmsd
+from bstcad.optics.irradiance import LEDGER_OF_GIVEN_RAYS, Leak, Screen, efficiency, leak, leaving, rrmsd
 from bstcad.optics.kernels.reductions import dot, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Landed
@@ -70,8 +70,8 @@ class Effort:
 
 
 FULL = Effort()
+
 GhostTracer = Callable[[Lens, Sequence[Channel], Screen, int, int], GhostImage]  # integers: rays per side, and seed
-Draw = Callable[[int, int], Sequence[Channel]]  # integers: number of points of an extended source, and seed
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,15 @@ class Light:
     ghost: np.ndarray | None = field(default=None, repr=False)  # ghost's part of the picture; None: no ghost is traced
     leak: Leak | None = None  # leak of the rays' mean picture before smoothing; None: the target has no dark pixel
     rrmsd_whole: float | None = None  # RRMSD from `goal.whole`; None: the goal is not restricted
+    # pictures of the independent sets, each (rows, columns) with the target's sum; (): no light, or no longer needed
+    sets: tuple[Tensor, ...] = field(default=(), repr=False)
+    on_screen: float = 0.0  # flux on the screen, ghosts included, as a fraction of the source's
+    peak: float = 0.0  # flux per mm² or sr in the brightest pixel / flux on the screen, without bias
+
+    @property
+    def leaving(self) -> float:
+        """Return the flux that leaves the last surface, ghosts included, as a fraction of the source's."""
+        return leaving(self.flux)
 
     @property
     def efficiency(self) -> float:
@@ -108,7 +117,8 @@ class Light:
     @property
     def used(self) -> float:
         """Return the flux on the target as a fraction of the flux that meets the lens without its underside."""
-        enters = 1 - self.flux["missed the lens"] - self.flux.get(UNDERSIDE, 0.0)
+        beside = (UNDERSIDE, *LEDGER_OF_GIVEN_RAYS)
+        enters = 1 - self.flux["missed the lens"] - math.fsum(self.flux.get(line, 0.0) for line in beside)
         return self.flux["on target"] / enters if enters > 0 else 0.0
 
 
@@ -162,7 +172,7 @@ def _light(setup: _Setup, goal: Goal, channels: Sequence[Channel], rays: _Rays, 
     lens, screen, target, ghost_image = setup.lens, setup.screen, setup.target, setup.ghost
     if not rays.boxes:
         return Light(np.zeros(screen.shape), math.nan, math.inf, rays=rays.count, flux=rays.flux)
-    (value, error), (tent, _) = _value(rays, target), squared_distance(rays.tents, target)
+    (value, error), (tent, _) = _value(rays.boxes, target), _value(rays.tents, target)
     smoothed, error_of_smoothed = _smoothed(rays.boxes, target)
     # two nets, windows and mirrors have no kernel for the whole path, and yet have a witness
     plain = lens.shapes("front") or bool(lens.before or lens.behind)
@@ -170,12 +180,13 @@ def _light(setup: _Setup, goal: Goal, channels: Sequence[Channel], rays: _Rays, 
     paths = ((c.source, c.through(lens), screen.plane) for c in channels)
     simple = lossless and (plain or all(whole_kernel("trace.simulate", *path) for path in paths))
     return Light(
-        smoothed.numpy(), value, error, rays=rays.count, flux=rays.flux, tent=math.sqrt(max(tent, 0.0)),
+        smoothed.numpy(), value, error, rays=rays.count, flux=rays.flux, tent=tent,
         picture_error=error_of_smoothed,
         witness=_witness(setup, channels, rays) if witness and simple else None,
         ghost=None if ghost_image is None else (ghost_image.picture.cpu() * (total(target) / rays.on_screen)).numpy(),
         leak=leak((sum(rays.boxes, torch.zeros_like(target)) / SETS).numpy(), goal.picture),
-        rrmsd_whole=None if goal.whole is None else _value(rays, torch.from_numpy(goal.whole))[0],
+        rrmsd_whole=None if goal.whole is None else _value(rays.boxes, torch.from_numpy(goal.whole))[0],
+        sets=rays.boxes, on_screen=rays.on_screen, peak=_peak(rays.boxes, screen),
     )  # fmt: skip
 
 
@@ -185,7 +196,7 @@ def rrmsds_by_rays(
     """Return `Light.rrmsd` alone for each goal; NaN if no light falls on its screen."""
     setups = _setups(lens, channels, goals, draw)
     pairs = zip(setups, _sample(setups, effort), strict=True)
-    return [_value(rays, setup.target)[0] if rays.boxes else math.nan for setup, rays in pairs]
+    return [_value(rays.boxes, setup.target)[0] if rays.boxes else math.nan for setup, rays in pairs]
 
 
 def rrmsd_by_tubes(lens: Lens, channels: Sequence[Channel], goal: Goal, n: int) -> float:
@@ -249,7 +260,8 @@ class _Setup:
 
 def _setups(lens: Lens, channels: Sequence[Channel], goals: Sequence[Goal], draw: Draw | None) -> list[_Setup]:
     """Return the measurements of one lens and light on the receivers of all goals; draw: as in `measure`."""
-    draw = draw or (lambda count, seed: channels)
+    if not isinstance(draw, Draw):  # a function of a script, or none
+        draw = Draw(draw or (lambda count, seed: channels))
     return [_Setup(lens, draw, goal.receiver, torch.from_numpy(goal.picture)) for goal in goals]
 
 
@@ -269,9 +281,9 @@ def _joined(rays: Sequence[_Rays] | None, more: Sequence[_Rays]) -> list[_Rays]:
     return list(more) if rays is None else [a.joined(b) for a, b in zip(rays, more, strict=True)]
 
 
-def _value(rays: _Rays, target: Tensor) -> tuple[float, float]:
+def _value(pictures: Sequence[Tensor], target: Tensor) -> tuple[float, float]:
     """Return (RRMSD, its standard error); an RRMSD² below its own standard error is replaced by that."""
-    squared, error = squared_distance(rays.boxes, target)
+    squared, error = squared_distance(pictures, target)
     value = math.sqrt(max(squared, error))
     return value, math.sqrt(value**2 + error) - value
 
@@ -300,6 +312,19 @@ def squared_distance(pictures: Sequence[Tensor], other: Tensor) -> tuple[float, 
     jackknife = 4 / m * float((single**2).sum()) / (m - 1)
     least = 2 * pairs / (m * (m - 1))
     return float(mean), math.sqrt(max(jackknife - 4 * pairs / (m * (m - 2)) + least, least))
+
+
+def _peak(pictures: Sequence[Tensor], screen: Screen) -> float:
+    """Return the largest flux per mm² or sr of a pixel, as a fraction of the flux of all pixels.
+
+    One half of the pictures finds the pixel and the other half measures it, so that noise does not make it too large.
+    """
+    sizes = torch.from_numpy(np.ascontiguousarray(screen.cell_sizes))
+    found = []
+    for one, other in ((pictures[::2], pictures[1::2]), (pictures[1::2], pictures[::2])):
+        seek, measured = (sum(half, torch.zeros_like(half[0])) / sizes for half in (one, other))
+        found.append(float(measured.reshape(-1)[int(seek.argmax())] / sum(float(total(part)) for part in other)))
+    return sum(found) / 2
 
 
 def _noise(pictures: Sequence[Tensor], target: Tensor) -> float:
@@ -342,8 +367,9 @@ def _sample(setups: Sequence[_Setup], effort: Effort, max_noise: float = math.in
     RRMSD.  The standard error falls as n^-3 where products of noise dominate (the variance of a pixel of n² stratified
     rays falls as n^-3; measured: n^-2.9), and as n^-3/2 where products of the lens's error and noise dominate.
     """
-    pilot = max(effort.rays // PILOT_DIVISOR, min(effort.rays, 32))
-    began, side, rays = time.perf_counter(), pilot if effort.accuracy else effort.rays, None
+    most = min(effort.rays, setups[0].draw.largest_side or effort.rays)
+    pilot = max(most // PILOT_DIVISOR, min(most, 32))
+    began, side, rays = time.perf_counter(), pilot if effort.accuracy else most, None
     first = side
 
     def finer(rays: _Rays, target: Tensor) -> float:
@@ -364,12 +390,12 @@ def _sample(setups: Sequence[_Setup], effort: Effort, max_noise: float = math.in
         if not all(each.boxes for each in more):
             return more
         rays = _joined(rays, more)
-        if side >= effort.rays:
+        if side >= most:
             return rays
         ratio = max(finer(each, setup.target) for each, setup in zip(rays, setups, strict=True))
         if ratio == 1:
             return rays
-        larger = min(effort.rays, side * ratio)
+        larger = min(most, side * ratio)
         now = time.perf_counter()
         if now - began + (now - start) * (larger / side) ** 2 > effort.seconds:
             return rays
@@ -383,8 +409,9 @@ def _sample_source(setups: Sequence[_Setup], effort: Effort, max_noise: float) -
     rays.  The error of the RRMSD falls as n^-2, or faster where more rays come from more points (measured: n^-2.6).
     Source and picture are smooth, so `max_noise` limits the error of the smoothed picture, not the noise of pixels.
     """
-    pilot = max(effort.rays // PILOT_DIVISOR, min(effort.rays, 32))
-    began, side, rays = time.perf_counter(), pilot if effort.accuracy else effort.rays, None
+    most = min(effort.rays, setups[0].draw.largest_side or effort.rays)
+    pilot = max(most // PILOT_DIVISOR, min(most, 32))
+    began, side, rays = time.perf_counter(), pilot if effort.accuracy else most, None
     number = 0
 
     def times_more(rays: _Rays, target: Tensor) -> float:
@@ -405,12 +432,12 @@ def _sample_source(setups: Sequence[_Setup], effort: Effort, max_noise: float) -
             return more
         rays = _joined(rays, [replace(each, weight=float(side) ** 2) for each in more])
         weight = rays[0].weight
-        if weight >= effort.rays**2:
+        if weight >= most**2:
             return rays
         ratio = max(times_more(each, setup.target) for each, setup in zip(rays, setups, strict=True))
         if ratio == 1:
             return rays
-        finer = math.sqrt(min(weight * ratio, effort.rays**2) - weight)
+        finer = math.sqrt(min(weight * ratio, most**2) - weight)
         now = time.perf_counter()
         if now - began + (now - start) * (finer / side) ** 2 > effort.seconds:
             return rays

@@ -19,7 +19,8 @@ from bstcad.optics.key import Key
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import EVERYWHERE, STRICT, Circle, Outline, Rectangle
 from bstcad.optics.profiles import MeasuredProfile, Profile, pair_of
-from bstcad.optics.rays import Frame, Rays, Vector, point_along, tilt_of
+from bstcad.optics.ray_bundle import MeasuredRays, RayBundle
+from bstcad.optics.rays import Frame, Rays, Vector, clocked, point_along, tilt_of
 from bstcad.optics.wavefront import path_from_sphere
 
 SIZE_KEYS = "diameter", "width", "height"  # scene keys of the size of an emitting disc or rectangle
@@ -67,6 +68,7 @@ class Point(Emitter):
     intensity: Annotated[MeasuredProfile | None, Key("Radiant intensity over directions, in place of a profile.")] = (
         None
     )
+    rays: Annotated[MeasuredRays | None, Key("Rays of a lamp, in place of a profile and a size.")] = None
     rotate: Annotated[
         float | None, Key("Rotation of the profile about its axis, from x towards y.", "degrees", -180.0, 180.0)
     ] = None
@@ -81,25 +83,68 @@ class Point(Emitter):
     unbounded = "lambertian"  # without half_angle a lambertian fills the half space
 
     @property
+    def measured(self) -> MeasuredProfile | None:
+        """Light of a file; None: a profile with a formula."""
+        return self.rays if self.intensity is None else self.intensity
+
+    @property
+    def remarks(self) -> Iterator[str]:
+        """Sentences, each with its key, on readings that a file of the source does not state plainly."""
+        key = "intensity" if self.rays is None else "rays"
+        yield from (f"source.{key}: {remark}" for remark in (() if self.measured is None else self.measured.remarks))
+
+    def emission_centre(self, sense: int = 1) -> Vector:
+        """Return the position of the point, or of the centre of the disc or rectangle (mm); sense: of the light.
+
+        With rays, `position` is that of the origin of their file's coordinates.
+        """
+        if self.rays is None:
+            return self.position
+        place = self.position
+        for part, axis in zip(self.rays.origin, self.file_axes(sense), strict=True):
+            place = point_along(place, part, axis)
+        return place
+
+    def _seen_from(self, z: float) -> tuple[Vector, int]:
+        """Return the centre (mm) for light to the plane z, and the sense of this light."""
+        sense = 1 if self.position[2] <= z else -1
+        return self.emission_centre(sense), sense
+
+    def file_axes(self, sense: int) -> Frame:
+        """Return the axes in space of the coordinates of a file; sense: of the light (see Rays).
+
+        A file describes a real lamp, which is rotated about e_x, not mirrored, to light a plane below it.
+        """
+        e_x, (y_x, y_y, y_z), (n_x, n_y, n_z) = self.axes
+        if sense > 0:
+            return clocked(self.axes, self.rotate or 0.0)
+        return clocked((e_x, (-y_x, -y_y, -y_z), (-n_x, -n_y, -n_z)), -(self.rotate or 0.0))
+
+    @property
     def start_plane(self) -> float:
         """z (mm) of the point, or of the centre of the disc or rectangle."""
-        return self.position[2]
+        return self.emission_centre()[2]
 
     def nearest_z(self, upwards: bool) -> float:
         """Return z (mm) of the point of the source that is nearest to a lens above it (upwards) or below it."""
         reach = 0.0 if self.extent is None else self.extent.reach(*(axis[2] for axis in self.axes[:2]))
-        return self.position[2] + (reach if upwards else -reach)
+        return self.emission_centre(1 if upwards else -1)[2] + (reach if upwards else -reach)
 
     @property
     def luminous_flux(self) -> float | None:
         """Luminous flux as stated, or by the file of the intensity (lm); None: not stated."""
-        return self.lumens or (None if self.intensity is None else self.intensity.lumens)
+        return self.lumens or (None if self.measured is None else self.measured.lumens)
 
     def complaints(self, z: float, optic: str) -> Iterator[str]:
         """Yield faults of the sizes as "key: sentence"; z: plane of the first face (mm), optic: "lens" or "mirror"."""
-        if self.intensity is not None:
+        if self.measured is not None:
+            kind = "an intensity" if self.rays is None else "rays"
             others = {"profile": self.profile != "lambertian", "half_angle": self.half_angle is not None}
-            yield from (f"{key}: the source also has an intensity; remove one of them" for key in others if others[key])
+            if self.rays is not None:
+                others |= {key: getattr(self, key) is not None for key in ("intensity", *SIZE_KEYS, "real_diameter")}
+                if self.rays.lines and self.wavelength != Point.wavelength:
+                    yield "wavelength: the file of the rays states wavelengths of its own; remove this key"
+            yield from (f"{key}: the source also has {kind}; remove one of them" for key in others if others[key])
         given = [name for name in ("width", "height") if getattr(self, name) is not None]
         if given and self.diameter is not None:
             yield f"diameter: the source also has a {given[0]}; give a diameter, or width and height"
@@ -113,7 +158,7 @@ class Point(Emitter):
 
     def reference(self, place: Tensor, z: float, sense: int) -> Tensor:
         """Return the path (mm) from a sphere about the source, with o = (0, 0, z) on it, to points o + place (3, …)."""
-        x, y, start = self.position
+        x, y, start = self.emission_centre(sense)
         return path_from_sphere(place, (x, y, start - z))
 
     def words(self, origin: float) -> str:
@@ -124,13 +169,15 @@ class Point(Emitter):
         sizes = [f"half angle {' × '.join(f'{a:.4g}°' for a in dict.fromkeys(pair_of(angle)))}"] if angle else []
         sizes += [f"rotated by {self.rotate:.4g}°"] if self.rotate else []
         sizes += (f"{key} {size:.4g} {unit}" for key, size, unit in self.sizes())
-        kind = "disc" if self.diameter else "rectangle" if self.width else "point"
-        name = PROFILE_NAMES[self.profile] if self.intensity is None else self.intensity.words
+        kind = "point" if self.extent is None else "disc" if self.extent.is_round else "rectangle"
+        name = PROFILE_NAMES[self.profile] if self.measured is None else self.measured.words
         return ", ".join([f"{kind} at ({position}) mm", name, *sizes])
 
     def sizes(self) -> Iterator[tuple[str, float, str]]:
-        """Yield (key, value, unit) of diameter, width and height, if stated."""
+        """Yield (key, value, unit) of diameter, width and height, if stated; of rays, the larger size of the model."""
         yield from ((key, size, "mm") for key in SIZE_KEYS if (size := getattr(self, key)))
+        if self.rays is not None and self.extent is not None:
+            yield "rays", float(f"{2 * max(self.extent.half_extent):.3g}"), "mm wide"
 
     @property
     def is_rotation_invariant(self) -> bool:
@@ -148,7 +195,7 @@ class Point(Emitter):
         def wider(angle: float) -> float:
             return math.degrees(math.atan((1 + by) * math.tan(math.radians(angle))))
 
-        if self.intensity is not None:
+        if self.measured is not None:
             return None
         if isinstance(self.half_angle_1e2, tuple):
             across, up = map(wider, self.half_angle_1e2)
@@ -165,6 +212,8 @@ class Point(Emitter):
     @property
     def extent(self) -> Outline | None:
         """Emitting disc or rectangle (mm); None: a point."""
+        if self.rays is not None and self.rays.extent is not None:
+            return self.rays.extent
         if self.diameter:
             return Circle(self.diameter / 2)
         return Rectangle(self.width or 0.0, self.height or 0.0) if self.width or self.height else None
@@ -172,19 +221,38 @@ class Point(Emitter):
     @property
     def central(self) -> Point:
         """Point source at the centre, at the main wavelength."""
-        return replace(self, wavelength=self.main_wavelength, diameter=None, width=None, height=None)
+        return replace(self.scaled(0.0), wavelength=self.main_wavelength)
 
     def scaled(self, share: float) -> Point:
         """Return the source with diameter, width and height multiplied by `share`."""
         sizes = self.diameter, self.width, self.height
         diameter, width, height = (share * size if share and size else None for size in sizes)
-        return replace(self, diameter=diameter, width=width, height=height)
+        rays = None if self.rays is None else self.rays.scaled(share)
+        return replace(self, diameter=diameter, width=width, height=height, rays=rays)
 
     def element(self, x: float, y: float) -> Point:
         """Return the point source at (x, y) (mm) of the extent."""
-        e_x, e_y, _ = self.axes
+        e_x, e_y, _ = self.axes if self.rays is None else self.file_axes(1)
         position = point_along(point_along(self.position, x, e_x), y, e_y)
-        return replace(self, position=position, diameter=None, width=None, height=None)
+        return replace(self.scaled(0.0), position=position)
+
+    @property
+    def lines(self) -> tuple[tuple[float, float], ...]:
+        """(nm, fraction of the flux) of each spectral line; those of a file of rays, if it states wavelengths."""
+        return self.rays.lines if self.rays is not None and self.rays.lines else super().lines
+
+    @property
+    def main_wavelength(self) -> float:
+        """Wavelength (nm) of the line with the largest weight."""
+        return self.rays.lines[0][0] if self.rays is not None and self.rays.lines else super().main_wavelength
+
+    def bundle(self, line: int, part: int = 0) -> RayBundle | None:
+        """Return the rays of a spectral line, from one of the parts of the file; None: there is only a model."""
+        order = None if self.rays is None else self.rays.rays_of(line)
+        if order is None or self.rays is None:
+            return None
+        frames = self.file_axes(1), self.file_axes(-1)
+        return RayBundle(order, self.position, frames, wavelength=self.lines[line][0], part=part)
 
     def irradiance(self, x: Tensor, y: Tensor, z: float) -> Tensor:
         """Return E(x, y) (1/mm²) on the plane z (mm); the flux into the half space is 1.
@@ -193,12 +261,13 @@ class Point(Emitter):
         E = I cos θ / d², so E = D² / (π sin² θ_max d⁴), D and d the distances of plane and (x, y, z) from the source.
         uniform: I = 1 / (2π (1 - cos θ_max)), E = I D / d³.  The last two are zero beyond θ_max, the half angle `edge`.
         """
-        distance = abs(z - self.position[2])
+        (start_x, start_y, start_z), _ = self._seen_from(z)
+        distance = abs(z - start_z)
         if self.law is not None:
-            return self._irradiance_of(self.law, x - self.position[0], y - self.position[1], z)
+            return self._irradiance_of(self.law, x - start_x, y - start_y, z)
         if self.tilted:
-            return self._tilted_irradiance(x - self.position[0], y - self.position[1], distance, self.towards(z))
-        r2 = (x - self.position[0]) ** 2 + (y - self.position[1]) ** 2
+            return self._tilted_irradiance(x - start_x, y - start_y, distance, self.towards(z))
+        r2 = (x - start_x) ** 2 + (y - start_y) ** 2
         d2 = r2 + distance**2
         if self.profile == "gaussian":
             w2 = (distance * self._spread) ** 2
@@ -219,8 +288,8 @@ class Point(Emitter):
     @property
     def law(self) -> Profile | None:
         """Irradiance on a plane at distance 1 across the axis; None: a closed form of its own."""
-        if self.intensity is not None:
-            return replace(self.intensity.law, rotate=self.rotate or 0.0)
+        if self.measured is not None:
+            return replace(self.measured.law, rotate=self.rotate or 0.0)
         if self.profile != "gaussian" or not isinstance(self.half_angle_1e2, tuple):
             return None
         across, up = (math.tan(math.radians(angle)) for angle in self.half_angle_1e2)
@@ -241,7 +310,8 @@ class Point(Emitter):
 
         It is E(u, v) D / c³, c = n · p, or E(u, v) D / |p|³ if E is an intensity over stereographic coordinates.
         """
-        distance, sense = abs(z - self.position[2]), 1 if self.position[2] <= z else -1
+        centre, sense = self._seen_from(z)
+        distance = abs(z - centre[2])
         law, (e_x, e_y, _) = self._placed(law, sense)
         n = self.towards(z)
         c = n[0] * x + n[1] * y + n[2] * distance
@@ -262,7 +332,7 @@ class Point(Emitter):
     @property
     def edge(self) -> float:
         """Half angle (rad) at which a uniform or lambertian profile ends; π / 2: the half space."""
-        limit = self.intensity.half_angle if self.intensity is not None else self.half_angle
+        limit = self.half_angle if self.measured is None else self.measured.half_angle
         return HALF_SPACE if limit is None or self.profile == "gaussian" else math.radians(min(limit, 90.0))
 
     @property
@@ -300,7 +370,7 @@ class Point(Emitter):
 
     def beam(self, z: float) -> Beam:
         """Return the parameters of `irradiance` on the plane z (mm) for the kernels."""
-        x, y, from_z = map(float, self.position)
+        x, y, from_z = map(float, self._seen_from(z)[0])
         distance, edge = abs(z - from_z), self.edge
         if (law := self.law) is not None:
             sense = 1 if from_z <= z else -1
@@ -338,11 +408,12 @@ class Point(Emitter):
         The surface lies between the planes at `sags` (mm) above the plane z.  Seen from the source, a surface appears
         larger if it bends towards the source, and may appear shifted if it bends away and the source is off the axis.
         """
-        distance = abs(z - self.position[2])
-        offsets = [abs(p) for p in self.position[:2]]
+        centre, sense = self._seen_from(z)
+        distance = abs(z - centre[2])
+        offsets = [abs(p) for p in centre[:2]]
         half = list(outline.half_extent)
         for sag in sags:
-            away = sag if z > self.position[2] else -sag
+            away = sag if sense > 0 else -sag
             w = distance / max(distance + away, 1e-3 * distance)  # from p, a point at h is seen at p + w (h - p)
             apparent = (w * h + abs(1 - w) * p for h, p in zip(outline.half_extent, offsets, strict=True))
             half = [max(h, s) for h, s in zip(half, apparent, strict=True)]
@@ -367,16 +438,17 @@ class Point(Emitter):
 
     def spot(self, z: float) -> tuple[Outline | None, tuple[float, float]]:
         """Return (disc of the cone, centre in mm) on the plane z; disc None: the light has no edge, or is tilted."""
-        centre = self.position[:2]
+        (x, y, start_z), _ = self._seen_from(z)
+        centre = x, y
         if not self.is_cone or self.tilted:
             return None, centre
-        return Circle(abs(z - self.position[2]) * math.tan(self.edge)), centre
+        return Circle(abs(z - start_z) * math.tan(self.edge)), centre
 
-    def rays(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
+    def rays_through(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
         """Return rays from the point through (x, y) of the plane z (mm), each with the flux of a cell of `area` mm²."""
-        start_x, start_y, start_z = self.position
+        (start_x, start_y, start_z), sense = self._seen_from(z)
         towards = torch.stack([x - start_x, y - start_y, torch.full_like(x, z - start_z)])
         direction = towards / torch.sqrt(towards[0] ** 2 + towards[1] ** 2 + towards[2] ** 2)
         start = torch.tensor((start_x, start_y, 0.0), dtype=x.dtype, device=x.device).view(3, *([1] * x.ndim))
-        flux, sense = self.irradiance(x, y, z) * area, 1 if start_z <= z else -1
+        flux = self.irradiance(x, y, z) * area
         return Rays(start.expand_as(direction), direction, flux, all_alive(x), z=start_z, sense=sense)

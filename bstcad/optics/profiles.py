@@ -191,6 +191,11 @@ class MeasuredProfile(ABC):
         return None
 
     @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on readings that the file does not state plainly."""
+        return ()
+
+    @property
     @abstractmethod
     def words(self) -> str:
         """Name and sizes in words."""

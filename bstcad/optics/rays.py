@@ -27,6 +27,9 @@ class Status(IntEnum):
     TOTAL_REFLECTION = 3  # total internal reflection at a face, or met a refracting face from behind
     TURNED_BACK = 4  # left the last surface away from the receiver, or met a mirror from its rear
     BLOCKED = 5  # missed a window or mirror behind the lens, or met it outside its outline
+    STARTED_INSIDE = 6  # given ray of a file that starts inside the solid
+    STARTED_BESIDE = 7  # given ray of a file that starts beside or behind the first face
+    LEADS_AWAY = 8  # given ray of a file that leads away from the lens at its start
 
 
 TENSORS = ("position", "direction", "flux", "status")  # names of the tensors of a bundle

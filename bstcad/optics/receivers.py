@@ -22,6 +22,9 @@ from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import MIN_AXIAL_COSINE, Frame, Landed, Rays, Status, Vector, axes, clocked
 
+# attributes and methods that a moved receiver has in common with the receiver at rest
+COPIED = ("unit", "light", "photometric_unit", "names", "position_text", "per_radian", "areas", "cell_sizes")
+
 Array = Any  # numpy array, torch tensor or number
 
 
@@ -30,6 +33,7 @@ class Receiver(ABC):
 
     unit: str = "mm"  # unit of x and y
     light: str = "irradiance"  # quantity of a pixel: irradiance (per area) or radiant intensity (per solid angle)
+    photometric_unit: str | None = None  # lx on planes, cd over directions; None: absolute values are not defined
     tilt: tuple[float, float] | None = None  # tilt of a plane about x, then y, degrees; None: not a tilted plane
     names: tuple[str, str] = ("x", "y")  # names of the coordinates
     is_level: bool = False  # True for a plane z = const
@@ -136,6 +140,12 @@ class Receiver(ABC):
         """Return areas or solid angles of (rows, columns) cells of ranges x, y, divided by their mean; None: equal."""
         return None
 
+    def cell_sizes(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray:
+        """Return the areas (mm²), or over directions the solid angles (sr), of (rows, columns) cells of ranges x, y."""
+        mean = (x[1] - x[0]) * (y[1] - y[0]) / (shape[0] * shape[1])
+        areas = self.areas(x, y, shape)
+        return np.full(shape, mean) if areas is None else mean * areas
+
     def to_level_plane(self, x: Array, y: Array, eye: float) -> tuple[Array, Array]:
         """Return (x, y) (mm) of the receiver's points projected from (0, 0, eye) onto the level plane of its centre."""
         p_x, p_y, p_z = self.point(x, y)
@@ -165,7 +175,7 @@ class MovedReceiver(Receiver):
     motion: Motion  # rigid motion
 
     def __post_init__(self) -> None:
-        for name in ("unit", "light", "names", "position_text", "per_radian", "areas"):  # copied from `rest`
+        for name in COPIED:
             object.__setattr__(self, name, getattr(self.rest, name))
 
     @property
@@ -209,6 +219,8 @@ def _rotate(motion: Motion, vector: Array | Sequence[Array]) -> tuple[Array, Arr
 
 class PlaneReceiver(Receiver):
     """Plane n · (p - C) = 0 of points p = C + (x - o_x) e_x + (y - o_y) e_y; its centre C has the coordinates o."""
+
+    photometric_unit = "lx"
 
     @property
     def frame(self) -> Frame:

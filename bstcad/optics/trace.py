@@ -33,6 +33,7 @@ from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import REFLECTED
 from bstcad.optics.outlines import Outline, Rectangle
+from bstcad.optics.ray_bundle import RayBundle
 from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.receivers import Receiver
 from bstcad.optics.surfaces import Plane, Surface
@@ -84,7 +85,7 @@ def whole_kernel(
 
     tables: allow a table of the source's light, which costs as much as some ten thousand rays.
     """
-    fast = ops.whole_kernel(name, lens.interfaces) if plane.has_kernel else None
+    fast = ops.whole_kernel(name, lens.interfaces) if plane.has_kernel and not source.is_given else None
     return fast if fast and beam(source, lens, tables) is not None else None
 
 
@@ -142,7 +143,7 @@ def _useful(
     z = before[0].surface.z
     for _ in range(2):
         x, y = sampling.grid(area, n)
-        rays = across(source.rays(x, y, z, 1.0), before)
+        rays = across(source.rays_through(x, y, z, 1.0), before)
         meets = torch.stack([cross(rays, face).rays.alive for face in faces]).any(0)
         area = _around(area, (x, y), n, meets & (source.irradiance(x, y, z) > 0))
     return area
@@ -165,19 +166,25 @@ def clear_window(source: Emitter, lens: Lens, n: int = 256) -> Rectangle:
     """
     area = window(source, lens)
     x, y = (p.to(lens.like) for p in sampling.grid(area, n))
-    through = is_transmitted(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    through = is_transmitted(source.rays_through(x, y, lens.entrance.z, 1.0), lens)
     through &= source.irradiance(x, y, lens.entrance.z) > 0
     return _around(area, (x, y), n, through)
 
 
 def launch_strips(source: Emitter, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Iterator[Rays]:
-    """Yield those of n x n stratified rays over `area` (default: `window`) that carry flux, a strip at a time."""
+    """Yield those of n x n stratified rays over `area` (default: `window`) that carry flux, a strip at a time.
+
+    The rays of a file are drawn from the file.
+    """
+    if isinstance(source, RayBundle):
+        yield from source.launched(lens, n, seed)
+        return
     area, like = area or window(source, lens), lens.like
     for x, y in sampling.stratified_strips(area, n, seed):
         lit = source.irradiance(x, y, lens.entrance.z) > 0
         whole = bool(lit.all())
         x, y = (p.reshape(-1) if whole else p[lit] for p in (x, y))
-        yield source.rays(x.to(like), y.to(like), lens.entrance.z, area.area / n**2)
+        yield source.rays_through(x.to(like), y.to(like), lens.entrance.z, area.area / n**2)
 
 
 @dataclass(frozen=True)
@@ -223,7 +230,7 @@ def simulate_plain(lights: Lights, screens: Sequence[Screen], n: int) -> tuple[S
             for screen, landed, (box, tent), flux in zip(screens, landings, pictures, ledgers, strict=True):
                 box += weight * irradiance.box(landed, screen)
                 tent += weight * irradiance.tent(landed, screen)
-                lines = irradiance.ledger(landed, screen)
+                lines = irradiance.ledger(landed, screen, given=source.is_given)
                 if lens.behind:
                     lines[BLOCKED] = float(total(landed.flux[landed.status == int(Status.BLOCKED)].double()))
                 for line, value in lines.items():
@@ -242,6 +249,8 @@ def _as_fractions(lights: Lights, box: Tensor, tent: Tensor, flux: dict[str, flo
     flux = {line: value / whole for line, value in flux.items()}
     flux["missed the lens"] += 1.0 - launched / whole
     first = lights[0][2]
+    if any(source.is_given for _, source, _, _ in lights):  # its rays are counted by where they start
+        return Simulation(box / whole, tent / whole, flux, count)
     if first.front.outline is not None and first.passes.sense > 0 and not first.before:  # the underside is lit
         stopped = sum(part * on_underside(source, lens.front.plain(), lens.outline) for part, source, lens, _ in lights)
         flux[UNDERSIDE] = max(min(stopped, flux["missed the lens"]), 0.0)
@@ -257,7 +266,7 @@ def on_underside(source: Emitter, front: Surface, outline: Outline, n: int = UND
     area = Rectangle(2 * half_x, 2 * half_y)
     x, y = sampling.grid(area, n)
     beside = outline.contains(x, y) & ~front.outline.contains(x, y)
-    rays = source.rays(x[beside], y[beside], plane.z, area.area / n**2)
+    rays = source.rays_through(x[beside], y[beside], plane.z, area.area / n**2)
     if not rays.z < plane.z:  # a source in the dome lights no plane behind it
         return 0.0
     met, _, _ = intersect(front.optical, rays, front.outline, Status.MISSED_FRONT)

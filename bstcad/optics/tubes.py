@@ -145,7 +145,7 @@ def _tubes(source: Emitter, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tube
     z, like = lens.entrance.z, lens.like
     area = area_of(x, y).to(like.device)
     x, y = x.to(like), y.to(like)
-    light, lit = source.rays(x, y, z, 1.0), None
+    light, lit = source.rays_through(x, y, z, 1.0), None
     light = replace(light, flux=torch.ones_like(light.flux))
     rays = [light]  # in front of each interface
     interfaces = lens.unbounded().interfaces
@@ -193,7 +193,7 @@ def _over_the_beam(source: Emitter, lens: Lens, n: int) -> _Sheet | None:
         at + (1 - RIM_SHRINK) * torch.cat([p.reshape(-1) for p in side]) for side, at in zip(sides, centre, strict=True)
     )
     rim_x, rim_y = (p.to(lens.like) for p in rim)
-    if not bool(is_transmitted(source.rays(rim_x, rim_y, z, 1.0), lens).all()):
+    if not bool(is_transmitted(source.rays_through(rim_x, rim_y, z, 1.0), lens).all()):
         return None
 
     def rows(band: slice) -> tuple[Tensor, Tensor]:
@@ -255,7 +255,8 @@ def _transmitted_density(source: Emitter, lens: Lens, x: Tensor, y: Tensor) -> T
     if lens.losses is None and (fast := whole_kernel("trace.land", source, lens, receiver)):
         landed = fast(source, lens, receiver, x=x.double(), y=y.double())
         return landed.flux * ((landed.status != int(Status.MISSED_FRONT)) & (landed.status != int(Status.VIGNETTED)))
-    return source.irradiance(x, y, lens.entrance.z) * is_transmitted(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    z = lens.entrance.z
+    return source.irradiance(x, y, z) * is_transmitted(source.rays_through(x, y, z, 1.0), lens)
 
 
 def corners(shape: Outline, sides: Sides, rows: slice = ALL, columns: slice = ALL) -> tuple[Tensor, Tensor]:
@@ -355,10 +356,10 @@ class Path:
     def _arrive_band(self, x: Tensor, y: Tensor, height: Tensor) -> Rays:
         if x.ndim == 2:
             [source] = self.sources
-            rays = source.rays(x, y, self.start, 1.0)
+            rays = source.rays_through(x, y, self.start, 1.0)
         else:
             points = zip(self.sources, x, y, strict=True)
-            rays = stacked([source.rays(p, q, self.start, 1.0) for source, p, q in points])
+            rays = stacked([source.rays_through(p, q, self.start, 1.0) for source, p, q in points])
         rays = functools.reduce(behind, self.before, rays)
         s = rays.sense * (height - rays.above(self.z)) / (rays.sense * rays.direction[2]).clamp(min=MIN_ARRIVAL_COSINE)
         return replace(rays, position=rays.position + s * rays.direction)

@@ -64,7 +64,7 @@ def exit_pupil(source: Emitter, lens: Lens, z: float, n: int = RAYS_PER_SIDE) ->
     rows = max(1, RAYS_PER_BAND // n)
     parts = []
     for band_x, band_y in zip(x.split(rows), y.split(rows), strict=True):
-        rays = source.rays(band_x, band_y, lens.entrance.z, area.area / n**2)
+        rays = source.rays_through(band_x, band_y, lens.entrance.z, area.area / n**2)
         rays, path, rounding = optical_path(source, lens, rays, z)
         parts.append((rays.position[:2], rays.direction, path, rays.flux, rays.alive & (rays.flux > 0), rounding))
     *columns, roundings = zip(*parts, strict=True)

@@ -1,1 +1,1 @@
-"""Photometric files of lamps and luminaires: intensities over directions."""
+"""Photometric files of lamps and luminaires: intensities over directions, and rays."""

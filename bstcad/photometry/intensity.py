@@ -59,7 +59,7 @@ class Intensity:
             around = planes[0] + (around - planes[0]) % TURN
         inside = (along >= self.along[0] - SAME_ANGLE) & (along <= self.along[-1] + SAME_ANGLE)
         inside = inside & (around >= planes[0] - SAME_ANGLE) & (around <= planes[-1] + SAME_ANGLE)
-        (i, a), (j, b) = _cell(planes, around), _cell(self.along, along)
+        (i, a), (j, b) = cell_of(planes, around), cell_of(self.along, along)
         low = (1 - b) * table[i, j] + b * table[i, j + 1]
         high = (1 - b) * table[i + 1, j] + b * table[i + 1, j + 1]
         return np.where(inside, (1 - a) * low + a * high, 0.0)
@@ -174,7 +174,7 @@ def mirrored(planes: np.ndarray, table: np.ndarray, about: float) -> tuple[np.nd
     return angles[new], whole[new]
 
 
-def _cell(angles: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def cell_of(angles: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the number of the interval of each angle, and the place in it from 0 to 1."""
     k = np.clip(np.searchsorted(angles, at, side="right") - 1, 0, len(angles) - 2)
     return k, np.clip((at - angles[k]) / (angles[k + 1] - angles[k]), 0.0, 1.0)

@@ -1,4 +1,8 @@
-"""Reading of intensity files by their suffix: .ies, .ldt, and .csv (C in the first row, γ in the first column)."""
+"""Intensity files by their suffix: .ies, .ldt, and .csv, a table of intensities in cd.
+
+The first row of a table has the angles C and its first column the angles γ (degrees); the first value of the first row
+is not read.  A comma or a semicolon separates values.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,8 @@ import numpy as np
 
 from bstcad.photometry import eulumdat, ies
 from bstcad.photometry.intensity import MAX_INTENSITIES, Intensity, PhotometricError, checked
+
+CORNER = "gamma\\C"  # first value of a table, above γ and before C
 
 
 def of_csv(data: bytes) -> Intensity:
@@ -28,6 +34,13 @@ def of_csv(data: bytes) -> Intensity:
     if body.ndim != 2 or body.shape[0] < 2 or body.shape[1] < 2:
         raise PhotometricError("has fewer than two angles; write C in the first row and γ in the first column")
     return checked("C", around, body[:, 0], body[:, 1:].T)
+
+
+def csv_text(table: Intensity) -> str:
+    """Return a table of intensities (cd) over C and γ (degrees), which `of_csv` reads."""
+    rows = [[CORNER, *(f"{c:.10g}" for c in table.around)]]
+    rows += [[f"{value:.10g}" for value in (g, *each)] for g, each in zip(table.along, table.candela.T, strict=True)]
+    return "".join(",".join(row) + "\n" for row in rows)
 
 
 READERS: Mapping[str, Callable[[bytes], Intensity]] = {".ies": ies.read, ".ldt": eulumdat.read, ".csv": of_csv}

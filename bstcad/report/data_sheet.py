@@ -19,7 +19,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.report import part_views
 from bstcad.report.drawing import GREY, styled
 from bstcad.report.exports import across
-from bstcad.report.goal_figures import GoalFigures
+from bstcad.report.goal_figures import GoalFigures, Photometry
 from bstcad.report.light_figures import View, brightest, srgb_grey
 from bstcad.report.part_views import NOTES, THICK, THIN, Paper, kinds_of_holes, wall_words, wrapped
 from bstcad.report.prescription import PART, Order, prescription
@@ -52,6 +52,7 @@ class DataSheet:
     figures: Sequence[GoalFigures]  # figures of the light on each target
     passed: bool  # True if every check passed
     version: str  # version of the program
+    photometry: Sequence[Photometry] = ()  # absolute figures of each target; empty: the source's flux is not known
 
     @property
     def mount(self) -> Mount | None:
@@ -78,7 +79,7 @@ class DataSheet:
         """Tables by their headings: front, body, back, source and target, and the mount of a part."""
         return tables(
             "data_sheet.txt.j2", lens=self.record, passes=self.lens.passes, order=self.order, shape=self.shape,
-            mount=self.mount, light=self.scene.source, passed=self.passed,
+            mount=self.mount, light=self.scene.source, passed=self.passed, photometry=self.photometry,
             asked=self.scene.limits_light, folded=self.scene.folded,
             pairs=list(zip(self.scene.targets, self.figures, strict=True)), across=across, walls=wall_words,
             apertures={face: _aperture(patch, self.lens.outline) for face, patch in self.apertures.items()},

@@ -25,15 +25,17 @@ from bstcad.optics.bspline import is_net
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Surface, sag
-from bstcad.photometry import eulumdat, ies
-from bstcad.photometry.intensity import Luminaire
+from bstcad.photometry import eulumdat, ies, intensity_files, tm25
+from bstcad.photometry.intensity import Intensity, Luminaire
 from bstcad.report.grid_sag import MAX_POINTS, MIN_POINTS, GridLight, GridSag, axes, table_note
 from bstcad.report.units import environment, paragraphs
 from bstcad.runs import files
 from bstcad.scene.mount import Mount
 
 SIDECAR = ".txt"  # suffix of a text file that states how far interpolation of a table moves the light
-PHOTOMETRIC = ("ies", "ldt")  # kinds of intensity files
+INTENSITIES = ("ies", "ldt", "csv")  # kinds of intensity files
+RAYS = "tm25"  # kind of files of rays
+RAY_COUNT = 1_000_000  # number of rays of a file
 SHEET = "datasheet"  # kind of export that `export` omits: the caller draws it from the report in the design's folder
 
 OUTLINE, RIM, FLANGE, SCREWS, HOLES = "OUTLINE", "RIM", "FLANGE", "SCREW_HOLES", "HOLES"  # layers of edges
@@ -89,11 +91,17 @@ def export(
             raise ValueError(f"'{kind}' cannot be exported; give one of {', '.join(files.EXPORTS)}")
     if points is not None and not MIN_POINTS <= points <= MAX_POINTS:
         raise ValueError(f"points = {points} is not possible; give a number from {MIN_POINTS} to {MAX_POINTS}")
-    lens, paths, notes = lens.plain(), [], []
+    lens, paths, notes, intensity = lens.plain(), [], [], None
     for kind in dict.fromkeys(kinds):
-        if kind in PHOTOMETRIC and far is None:
+        if kind in (*INTENSITIES, RAYS) and far is None:
             raise ValueError(f"'{kind}' needs the light of a scene; export it from the folder of a design")
-        for name, data in _files(kind, lens, points, label=label, mount=mount, light=light, far=far):
+        if kind == RAYS and far is not None:
+            files.put(folder / "rays.tm25ray", tm25.write(far.rays(lens, RAY_COUNT), _luminaire(lens, label)))
+            paths.append(folder / "rays.tm25ray")
+            continue
+        if kind in INTENSITIES and far is not None and intensity is None:  # traced once for all files
+            intensity = Stated(far.table(lens), far.lumens)
+        for name, data in _files(kind, lens, points, label=label, mount=mount, light=light, intensity=intensity):
             files.put(folder / name, data.encode("utf-8") if isinstance(data, str) else data)
             paths.append(folder / name)
             if name.endswith(SIDECAR):
@@ -109,7 +117,7 @@ def _files(
     label: Label,
     mount: Mount | None,
     light: GridLight | None,
-    far: FarField | None,
+    intensity: Stated | None,
 ) -> Iterator[tuple[str, str | bytes]]:
     count = min(max(lens.back_net.shape), MAX_POINTS) if points is None else points
     match kind:
@@ -136,24 +144,38 @@ def _files(
             yield "outline.svg", svg(lens.outline, mount, label)
         case "preview":
             yield from preview_files(lens, label)
-        case "ies" | "ldt" if far is not None:
-            yield f"intensity.{kind}", photometric_file(kind, lens, far, label)
+        case "ies" | "ldt" | "csv" if intensity is not None:
+            yield f"intensity.{kind}", photometric_file(kind, lens, intensity, label)
 
 
 # --- photometric files ---------------------------------------------------------------------------------------------
 
 
-def photometric_file(kind: str, lens: Lens, far: FarField, label: Label) -> bytes:
-    """Return the intensity of the light behind the lens as an IES or EULUMDAT file.
+def _luminaire(lens: Lens, label: Label) -> Luminaire:
+    width, height = (2 * half for half in lens.outline.half_extent)
+    return Luminaire(label.name, size=(width, height, 0.0), is_round=isinstance(lens.outline, Circle))
+
+
+@dataclass(frozen=True)
+class Stated:
+    """Intensity of the light behind a lens, and the flux of its source."""
+
+    table: Intensity
+    lumens: float | None  # luminous flux of the source, lm; None: not known, the table is for NOMINAL_LUMENS
+
+
+def photometric_file(kind: str, lens: Lens, light: Stated, label: Label) -> bytes:
+    """Return the intensity of the light behind the lens as an IES or EULUMDAT file, or as a table over C and γ (CSV).
 
     If the flux of the source is known, the intensities are absolute; otherwise they are for a lamp of 1000 lm.
     """
-    width, height = (2 * half for half in lens.outline.half_extent)
-    luminaire = Luminaire(label.name, size=(width, height, 0.0), is_round=isinstance(lens.outline, Circle))
-    table, lamp = far.table(lens), NOMINAL_LUMENS if far.lumens is None else None
+    if kind == "csv":
+        return intensity_files.csv_text(light.table).encode()
+    luminaire = _luminaire(lens, label)
+    table, lamp = light.table, NOMINAL_LUMENS if light.lumens is None else None
     if kind == "ies":
         return ies.write(table, luminaire, lamp_lumens=lamp)
-    return eulumdat.write(table, luminaire, lamp_lumens=far.lumens or lamp)
+    return eulumdat.write(table, luminaire, lamp_lumens=light.lumens or lamp)
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from bstcad.optics.measure import Light, SpectralLine
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Surface
 from bstcad.optics.wavefront_error import WavefrontError
-from bstcad.report import data_sheet, light_figures, rendering
+from bstcad.report import data_sheet, light_figures, photometric_figures, rendering
 from bstcad.report.data_sheet import DataSheet
 from bstcad.report.drawing import BLUE, GLASS, GREY, VERMILION, footnote, new_figure, png, round_up, steps, styled
 from bstcad.report.light_figures import View, plain_ticks
@@ -78,11 +78,13 @@ class Pictures:
         self._jobs.append(self._vtk.submit(lambda: {"lens": rendering.lens_picture(mesh)}))
 
     def lens(self, lens: Lens) -> None:
-        """Start the job `draw_lens`, and a job `draw_transport` for each target."""
+        """Start the job `draw_lens`, a job `draw_transport` for each target, and the far field if it has a meaning."""
         source, screens = self._scene.source.central, [target.screen for target in self._scene.targets]
         self.begin(draw_lens, source, lens, screens)
         for k, screen in enumerate(screens):
             self.begin(draw_transport, source, lens, screen, number=k)
+        if photometric_figures.has_far_field(self._scene):
+            self.begin(photometric_figures.draw_far_field, photometric_figures.far_field_of(self._scene), lens)
 
     def sheet(self, sheet: DataSheet) -> None:
         """Start the job that draws the data sheet."""
@@ -140,7 +142,7 @@ def draw_transport(source: Emitter, lens: Lens, screen: Screen, view: View) -> P
 
 def draw_light(target: np.ndarray, light: Light, lines: Sequence[SpectralLine], view: View) -> Pngs:
     """Return the figures of the irradiance and, if there are any, of the ghost and of the spectral lines."""
-    found = light.picture
+    found, view = light.picture, view.with_flux(target, light.on_screen)
     pictures = {
         "irradiance": light_figures.irradiance_triptych(target, found, view),
         "cross_section": light_figures.cross_section(target, found, view),

@@ -1,4 +1,4 @@
-"""Figures of each goal in report.json: the light on each target, flat tops, and the wavefront."""
+"""Figures of each goal in report.json: the light on each target, absolute too, flat tops, and the wavefront."""
 
 from __future__ import annotations
 
@@ -6,15 +6,20 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+import numpy as np
+import torch
 from pydantic import Field
 
 from bstcad.analysis.top_hat import FLAT_LEVEL, FlatTop
 from bstcad.optics.goal import Goal, suffix_of, words_of
+from bstcad.optics.irradiance import Screen
 from bstcad.optics.measure import RESOLVED, Light
 from bstcad.optics.wavefront_error import WavefrontError
+from bstcad.scene.effects import reflection_of
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import drawing
 from bstcad.verify.checks import Proof
+from bstcad.verify.light_limits import PER_LX
 
 Fraction = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]  # number from 0 to 1, with the rounding error of a sum
 Size = Annotated[float, Field(ge=0, le=1e12)]  # number from 0 to 1e12
@@ -97,6 +102,52 @@ def figures_of(goals: Sequence[Goal], lights: Sequence[Light]) -> tuple[GoalFigu
         )
         for goal, light in zip(goals, lights, strict=True)
     )
+
+
+@dataclass(frozen=True)
+class Photometry:
+    """Absolute figures of the light on a target, if the luminous flux of the source is known."""
+
+    key: str  # key of the target: target, target[0], …
+    source_lumens: Size  # luminous flux of the source (lm)
+    lumens: Size  # luminous flux on the target (lm)
+    unit: str | None  # unit of mean and peak: lx on planes, cd over directions; None: a receiver of a script
+    mean: Size | None  # mean illuminance or intensity over the whole target
+    peak: Size | None  # illuminance or intensity of the brightest pixel
+    output_ratio: Fraction  # light output ratio: flux that leaves the last surface / flux of the source
+    reflection: bool  # True if losses by reflection at the faces are simulated
+    # mean luminance of the back (cd/m²), its outline projected, in the direction of the peak; None: not a target over
+    # directions
+    luminance: Size | None = None
+
+
+def photometry(scene: Scene, proof: Proof) -> Iterator[Photometry]:
+    """Yield the absolute figures of the light on each target; none if the flux of the source is not known."""
+    lumens = scene.source.luminous_flux
+    for key, target, light in zip(scene.target_keys, scene.targets, proof.lights, strict=True) if lumens else ():
+        screen, on_target = target.screen, lumens * light.on_screen
+        unit = screen.plane.photometric_unit
+        mean = peak = luminance = None
+        if unit is not None and light.picture.any():
+            sizes = screen.cell_sizes
+            scale = on_target / light.picture.sum() * (PER_LX if unit == "lx" else 1.0)
+            values = scale * light.picture / sizes
+            row, column = (int(each) for each in np.unravel_index(values.argmax(), values.shape))
+            mean = float(scale * light.picture.sum() / sizes.sum())
+            peak = on_target * light.peak * (PER_LX if unit == "lx" else 1.0)
+            luminance = _luminance(proof, screen, peak, at=(row, column)) if unit == "cd" else None
+        yield Photometry(
+            key, lumens, on_target, unit, mean=mean, peak=peak, output_ratio=light.leaving, luminance=luminance,
+            reflection=reflection_of(scene.effects) is not None,
+        )  # fmt: skip
+
+
+def _luminance(proof: Proof, screen: Screen, peak: float, at: tuple[int, int]) -> float | None:
+    """Return I / (A cos θ) (cd/m²): I = peak (cd) in the direction of the pixel `at`, θ from +z, A the back's area."""
+    (row, column), (per_x, per_y) = at, screen.per_unit
+    x, y = screen.x[0] + (column + 0.5) / per_x, screen.y[1] - (row + 0.5) / per_y
+    cosine = float(screen.plane.normal(torch.tensor([x, y], dtype=torch.float64))[2])
+    return peak / (proof.lens.apertures[1].area * cosine) * PER_LX if cosine > 0 else None
 
 
 def flat_tops(scene: Scene, proof: Proof) -> Iterator[FlatTop]:

@@ -8,7 +8,7 @@ coordinates" has row 0 at y max and column 0 at x min.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +33,7 @@ from bstcad.report.drawing import (
 from bstcad.report.units import number, quantity, tilt_words
 from bstcad.scene.picture import to_srgb
 from bstcad.scene.target import numbered
+from bstcad.verify.light_limits import PER_LX
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -88,13 +89,25 @@ class View:
     folded: bool = False  # True if the light reaches the target along -z
     receiver: Receiver = LevelPlane(0.0)  # receiver on which x and y are measured
     number: int = 0  # index of the target, used in the names of its figures
+    lumens: float | None = None  # luminous flux of the source (lm); None: not known
+    absolute_mean: str = ""  # mean of the lit pixels with its unit, lx or cd; empty: not known
 
     @classmethod
     def of(cls, scene: Scene, number: int = 0) -> View:
         """Return the view of the target `number` of the scene."""
         target = scene.targets[number]
         side: dict[str, Any] = {"optic": scene.optic, "folded": scene.folded}
+        side["lumens"] = scene.source.luminous_flux
         return cls(target.x, target.y, target.seen_from, receiver=target.screen.plane, number=number, **side)
+
+    def with_flux(self, target: np.ndarray, on_target: float) -> View:
+        """Return the view with the mean light of the lit pixels; on_target: flux there / flux of the source."""
+        unit = self.receiver.photometric_unit
+        if self.lumens is None or unit is None:
+            return self
+        sizes = self.receiver.cell_sizes(self.x, self.y, target.shape)
+        mean = lit_mean(self.irradiance(target)) / target.sum() * self.lumens * on_target / sizes.mean()
+        return replace(self, absolute_mean=f"{number(mean * (PER_LX if unit == 'lx' else 1.0))} {unit}")
 
     @property
     def labels(self) -> tuple[str, str]:
@@ -104,7 +117,8 @@ class View:
     @property
     def mean_lit(self) -> str:
         """Label of a scale relative to the mean of the lit pixels."""
-        return f"{self.receiver.light} / mean of lit pixels"
+        absolute = f"\n({self.absolute_mean})" if self.absolute_mean else ""
+        return f"{self.receiver.light} / mean of lit pixels{absolute}"
 
     @property
     def words(self) -> str:

@@ -33,7 +33,17 @@ from bstcad.optics.goal import Goal, worst
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.reach import unreached
 from bstcad.optics.receivers import LevelPlane
-from bstcad.report.goal_figures import Fraction, GoalFigures, Rrmsd, Size, WavefrontFigures, figures_of, flat_tops
+from bstcad.report.goal_figures import (
+    Fraction,
+    GoalFigures,
+    Photometry,
+    Rrmsd,
+    Size,
+    WavefrontFigures,
+    figures_of,
+    flat_tops,
+    photometry,
+)
 from bstcad.report.light_figures import rrmsd
 from bstcad.report.prescription import Order, prescription
 from bstcad.report.units import DIGITS, Remark, Rows, number, paragraphs, percent, tables
@@ -41,6 +51,7 @@ from bstcad.report.units import remarks as written
 from bstcad.runs import files
 from bstcad.scene.scene import Scene
 from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Nominal, Proof
+from bstcad.verify.light_limits import LightValue
 from bstcad.verify.verdict import NO_LIMIT, Check, verdict
 
 if TYPE_CHECKING:
@@ -225,6 +236,9 @@ class Contents:
     order: Order | None = None  # data with which a machine shop makes the part
     flat_tops: tuple[FlatTop, ...] = ()  # figures of the targets with a flat profile
     wavefront: WavefrontFigures | None = None  # wavefront error; None: no requested wave, or no light on its plane
+    photometry: tuple[Photometry, ...] = ()  # absolute figures of each target; empty: the source's flux is not known
+    # values of the light that the table [accept] limits: test points, uniformity, cut-off, glare
+    values: Annotated[tuple[LightValue, ...], Field(max_length=1000), FailFast()] = ()
 
     @property
     def worst(self) -> GoalFigures:
@@ -324,6 +338,8 @@ def contents_of(
         estimates=estimates,
         flat_tops=tuple(flat_tops(scene, proof)),
         wavefront=proof.wavefront and WavefrontFigures.of(proof.wavefront),
+        photometry=tuple(photometry(scene, proof)),
+        values=proof.values,
     )
     return _with_remarks(contents, *remarks(contents, scene, goals, [each.picture for each in proof.lights]))
 

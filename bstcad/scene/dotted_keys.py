@@ -37,6 +37,8 @@ def override(data: dict[str, Any], key: str, value: Any, shown: str) -> None:
         table = _inner(table, steps[k:], shown)
     if number is not None:
         _set_table(table, name, number, value, shown=shown)
+        if tables and not table[name]:  # the last table of a list within a table
+            del table[name]
     elif value is None:
         table.pop(name, None)
     else:

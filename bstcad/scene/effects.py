@@ -1,4 +1,7 @@
-"""Effects of a scene: [[effects]] tables, none by default; an absent effect costs no time."""
+"""Effects of a scene: [[effects]] tables; an absent effect costs no time.
+
+None is simulated by default, but with the luminous flux of the source known, the reflection at the faces of a lens.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ from bstcad.scene.blank import INDICES, LensBlank
 from bstcad.scene.schema import Record
 
 if TYPE_CHECKING:
+    from bstcad.optics.emitters import Emitter
     from bstcad.optics.losses import Losses
     from bstcad.optics.measure import GhostTracer
 
@@ -122,6 +126,16 @@ def complaints(effects: Effects, lens: LensBlank) -> Iterator[str]:
             yield f"{key}.metal: only a mirror (lens.back.reflect, lens.front.reflect) has a metal; remove this key"
         if effect.kind == "absorption" and effect.coefficient is None and lens.material is None:
             yield f"{key}.coefficient: missing, and so is lens.material; add it in 1/mm, or set lens.material"
+
+
+def default(source: Emitter, lens: LensBlank) -> Effects:
+    """Return the effects of a scene that states none: `fresnel` for a lens if the flux of the source is known.
+
+    Absolute photometry needs the losses at the faces.  The reflectance of a mirror depends on its metal, which only the
+    scene can state.
+    """
+    known = source.luminous_flux is not None and not lens.passes.reflects
+    return (Fresnel(kind="fresnel"),) if known else ()
 
 
 def _name(effect: Effect) -> str:

@@ -1,28 +1,35 @@
-"""Lamps of a scene: points and small sources whose radiant intensity may come from a photometric file."""
+"""Lamps of a scene: points and small sources whose radiant intensity, or whose rays, may come from a file."""
 
 from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
 from bstcad.optics import point
 from bstcad.optics.key import Key
-from bstcad.optics.outlines import STRICT
+from bstcad.optics.outlines import STRICT, Outline
 from bstcad.optics.profiles import MeasuredProfile, Net, Profile
-from bstcad.photometry import intensity_files
-from bstcad.photometry.intensity import Intensity, PhotometricError
+from bstcad.optics.ray_bundle import MeasuredRays, RayOrder
+from bstcad.optics.rays import Vector
+from bstcad.photometry import intensity_files, ray_files, tm25
+from bstcad.photometry.intensity import Intensity, Luminaire, PhotometricError
+from bstcad.photometry.ray_model import RayModel, model_of, rays_of_lines
+from bstcad.photometry.ray_set import RaySet
 from bstcad.runs import files
 from bstcad.scene.picture import safe_name
 from bstcad.scene.schema import FileContent, OneOrTwoWidths, from_file
 
-PREFIXES = ("lamp-", "wanted-")  # beginnings of the names of copies: of a lamp, of a target
+PREFIXES = ("lamp-", "wanted-", "rays-")  # beginnings of the names of copies: of a lamp, of a target, of rays
 MAX_FILE_SIZE = 100_000_000  # largest intensity file (bytes)
+MAX_RAYS_SIZE = 400_000_000  # largest ray file (bytes) that is copied whole; of a larger one, random rays are copied
+COPIED_RAYS = 5_000_000  # number of random rays that are copied of a larger file
+MIN_RAYS = 1000  # smallest number of rays of a file; fewer cannot judge a lens
 NET_SIDES = 257, 513, 1025  # control points per side, for tables of wider and narrower spacing
 POINTS_PER_SPACING = 4.0  # control points per spacing of the table's angles, if NET_SIDES allow it
 HALF_SPACE = 90.0  # degrees
@@ -47,7 +54,7 @@ class IntensityFile(FileContent, MeasuredProfile):
     @property
     def shown(self) -> str:
         """Name of the file for messages, without the prefix of its copy."""
-        return next((self.name.removeprefix(each) for each in PREFIXES if self.name.startswith(each)), self.name)
+        return shown(self.name)
 
     @functools.cached_property
     def law(self) -> Profile:
@@ -81,6 +88,145 @@ class IntensityFile(FileContent, MeasuredProfile):
         return f"intensity of {self.shown}, {self.lumens:.5g} lm"
 
 
+@dataclass(frozen=True)
+class RayFile(FileContent, MeasuredRays):
+    """The rays of a file and their model: the content of the file, and a safe name for its copy."""
+
+    name: str
+    data: bytes = field(repr=False)
+    notes: tuple[str, ...] = ()  # sentences on the copying of a part of a larger file
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the content alone: what follows from it is several times as large."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
+
+    @functools.cached_property
+    def rays(self) -> RaySet:
+        """Positions (mm), directions and powers of the rays."""
+        try:
+            return ray_files.read(self.name, self.data)
+        except PhotometricError as fault:
+            raise ValueError(f"{self.shown!r} {fault}") from None
+
+    @functools.cached_property
+    def model(self) -> RayModel:
+        """Even disc or rectangle of points for which a lens is tailored."""
+        rays = self.rays
+        try:
+            return model_of(rays)
+        except ValueError as fault:
+            raise ValueError(f"{self.shown!r} {fault}") from None
+
+    @property
+    def shown(self) -> str:
+        """Name of the file for messages, without the prefix of its copy."""
+        return shown(self.name)
+
+    @property
+    def law(self) -> Profile:
+        """Radiant intensity of the model."""
+        return self.model.law
+
+    @property
+    def extent(self) -> Outline | None:
+        """Emitting disc or rectangle (mm) of the model."""
+        return self.model.extent
+
+    @property
+    def origin(self) -> Vector:
+        """Centre of the emitting area in the coordinates of the file (mm)."""
+        return self.model.origin
+
+    @property
+    def lines(self) -> tuple[tuple[float, float], ...]:
+        """(nm, fraction of the flux) of each spectral line."""
+        return self.model.lines
+
+    @property
+    def lumens(self) -> float | None:
+        """Luminous flux of the file (lm); None: it states a radiant flux."""
+        return self.model.lumens
+
+    @property
+    def half_angle(self) -> float:
+        """Largest angle from the axis (degrees) with light."""
+        return self.model.half_angle
+
+    @property
+    def words(self) -> str:
+        """Name, number of rays, flux and model of the file."""
+        rays = self.rays
+        return f"{len(rays.power)} rays of {self.shown}, {rays.flux:.5g} {rays.unit}, tailored as {self.model.words}"
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on readings that the file does not state plainly."""
+        return (*self.notes, *self.rays.remarks)
+
+    def scaled(self, share: float) -> MeasuredRays:
+        """Return the model with its extent multiplied by `share`; the whole extent has the rays as well."""
+        return self if share == 1 else self.model.scaled(share)
+
+    def rays_of(self, line: int) -> RayOrder:
+        """Return the rays of a spectral line in random order."""
+        return self._orders[line]
+
+    @functools.cached_property
+    def _orders(self) -> tuple[RayOrder, ...]:
+        return tuple(RayOrder.of(self.rays, chosen) for chosen in rays_of_lines(self.rays))
+
+
+def shown(name: str) -> str:
+    """Return the name of a file without the prefix of its copy."""
+    return next((name.removeprefix(each) for each in PREFIXES if name.startswith(each)), name)
+
+
+def read_rays(path: Path) -> RayFile:
+    """Read a file of rays; ValueError, without the key, if it is missing or damaged."""
+    try:
+        state = path.stat()
+        return _rays_of(path, state.st_size, state.st_mtime_ns)
+    except PhotometricError as fault:
+        raise ValueError(f"{path.name!r} {fault}") from None
+    except OSError as error:
+        raise ValueError(f"{str(path)!r} cannot be read ({error}); give a path relative to the scene file") from None
+
+
+@functools.lru_cache(maxsize=1)  # a page reads the scene at each change, and a file may take seconds
+def _rays_of(path: Path, size: int, changed: int) -> RayFile:
+    """Return the rays of a file of this size (bytes), last changed at this time (ns)."""
+    name = _copied(path, "rays-")
+    if path.is_file() and size > MAX_RAYS_SIZE:
+        found = _part_of(path, f"{Path(name).stem}.tm25ray")
+    else:
+        try:
+            found = RayFile(name, files.contents(path, MAX_RAYS_SIZE))
+        except ValueError as error:
+            remedy = "give a path relative to the scene file"
+            raise ValueError(f"{str(path)!r} cannot be read ({error}); {remedy}") from None
+    if (count := len(found.rays)) < MIN_RAYS:
+        raise PhotometricError(f"has {count} rays, and a lens is judged by at least {MIN_RAYS}; give a larger file")
+    _ = found.model
+    return found
+
+
+def _part_of(path: Path, name: str) -> RayFile:
+    """Return random rays of a file that is too large for a copy, as a TM-25 file of this name."""
+    rays = ray_files.read(path.name, path)
+    if rays.unit == "lm" and isinstance(rays.wavelength, np.ndarray):
+        both = "wavelengths beside luminous flux, which the smaller copy cannot have"
+        raise PhotometricError(f"has more than {MAX_RAYS_SIZE / 1e6:.0f} MB and {both}; write a file with fewer rays")
+    some = rays.drawn(COPIED_RAYS)
+    note = f"The file has {len(rays)} rays; {len(some)} random ones are copied and stand for them."
+    return RayFile(name, tm25.write(some, Luminaire(rays.name)), notes=(note, *rays.remarks))
+
+
+def _copied(path: Path, prefix: str) -> str:
+    """Return the name of the copy of a file, with this prefix, so that no other file of a scene has it."""
+    stem = safe_name(path.stem)[:60]
+    return (stem if stem.startswith(prefix) else f"{prefix}{stem}") + path.suffix.lower()
+
+
 def read_intensity(path: Path, prefix: str) -> IntensityFile:
     """Read an intensity file; ValueError, without the key, if it is missing, too large or damaged.
 
@@ -90,15 +236,14 @@ def read_intensity(path: Path, prefix: str) -> IntensityFile:
         data = files.contents(path, MAX_FILE_SIZE)
     except ValueError as error:
         raise ValueError(f"{str(path)!r} cannot be read ({error}); give a path relative to the scene file") from None
-    stem = safe_name(path.stem)[:60]
-    found = IntensityFile((stem if stem.startswith(prefix) else f"{prefix}{stem}") + path.suffix.lower(), data)
+    found = IntensityFile(_copied(path, prefix), data)
     _ = found.table
     return found
 
 
 @dataclass(frozen=True)
 class Point(point.Point):
-    """A point, disc or rectangle of a scene, whose intensity may come from a file."""
+    """A point, disc or rectangle of a scene, whose intensity may come from a file, or a file of rays."""
 
     half_angle_1e2: Annotated[
         OneOrTwoWidths | None,
@@ -113,6 +258,10 @@ class Point(point.Point):
         ]
         | None,
         Key("Intensity over directions from a file (.ies, .ldt, .csv), in place of a profile.", example="led.ies"),
+    ] = None
+    rays: Annotated[
+        Annotated[RayFile, *from_file(RayFile, read_rays, "rays = 'led.tm25ray'")] | None,
+        Key("Rays of a lamp from a file (.tm25ray, .dat, .sdf, .ray); they judge the lens.", example="led.tm25ray"),
     ] = None
 
     __pydantic_config__ = STRICT

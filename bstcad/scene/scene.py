@@ -21,7 +21,7 @@ import tomli_w
 import torch
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_serializer, model_validator
 
-from bstcad.optics.channels import Channel, channels_of, drawn_channels, merge_wavelengths
+from bstcad.optics.channels import Channel, Draw, channels_of, drawn_channels, given_channels, merge_wavelengths
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
 from bstcad.optics.key import Key
@@ -32,6 +32,7 @@ from bstcad.optics.sides import Sides, as_pair
 from bstcad.optics.wavefront import MAX_RAY_ANGLE, PlaneWave, Wave, ZernikeWave
 from bstcad.runs import files
 from bstcad.scene import effects, elements, lighting, mount, picture, quality, scene_file
+from bstcad.scene.accept import Accept
 from bstcad.scene.beam import Collimated, of_beam
 from bstcad.scene.blank import LensBlank, as_front, net_extent
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
@@ -46,33 +47,13 @@ from bstcad.scene.schema import FILE, FileContent, Record, contents, of_model
 from bstcad.scene.target import FAR_Z, AngularTarget, Target, Targets, coplanar_complaints
 
 if TYPE_CHECKING:
-    from bstcad.optics.measure import Draw, GhostTracer
+    from bstcad.optics.measure import GhostTracer
 
 MESH_TOLERANCE = 1e-3  # mm; default maximum distance of mesh facets from a lens up to 100 mm wide
 IMAGE_KEY = re.compile(r"target(\[\d+\])?\.image|source\.profile\.image")  # dotted keys of images
 SEARCH_RANGE = 0.999  # fraction of the possible range of a front's sag at the rim that tailoring searches
 FLOAT32_ROUNDING = 2.0**-24  # largest relative rounding error of a coordinate in float32
 FINEST_MESH = 4 * FLOAT32_ROUNDING  # smallest tolerance of a mesh, as a fraction of the largest coordinate
-
-
-class Accept(Record):
-    """Limits of the checks in the report; with None the check only states its value."""
-
-    rrmsd: Annotated[float | None, Key("Maximum RRMSD of light on a target.", "", 1e-6, 10.0, of_light=True)] = None
-    form: Annotated[float, Key("Maximum deviation of lens.step from the tailored faces.", "mm", 1e-12, 1.0)] = 1e-6
-    efficiency: Annotated[
-        float | None, Key("Minimum flux on target / flux behind the lens.", "", 0.0, 1.0, example=0.9, of_light=True)
-    ] = None
-    light_on_target: Annotated[
-        float | None, Key("Minimum flux on the target / flux that meets the lens.", "", 0.0, 1.0, of_light=True)
-    ] = None
-    leak: Annotated[
-        float | None, Key("Maximum flux on dark pixels / flux on the target.", "", 0.0, 1.0, of_light=True)
-    ] = None
-    decentre: Annotated[float | None, Key("Maximum decentre of a measured part.", "mm", 1e-6, 1e3)] = None
-    wavefront: Annotated[
-        float | None, Key("Maximum RMS wavefront error, in waves.", "", 1e-9, 1e6, example=0.1, of_light=True)
-    ] = None
 
 
 class Output(Record):
@@ -98,7 +79,9 @@ class Scene(Record):
     behind: Annotated[Elements, Key("Windows and mirrors that light meets behind the lens: [[behind]] tables.")] = ()
     wavefront: Annotated[Annotated[Wave, Field(discriminator="kind")] | None, Key("Wavefront behind the lens.")] = None
     tailoring: Annotated[Tailoring, Key("Effort and settings of tailoring.")] = Tailoring()
-    effects: Annotated[Effects, Key("Effects simulated besides refraction: [[effects]] tables.")] = ()
+    effects: Annotated[
+        Effects, Key("Effects simulated besides refraction: [[effects]] tables; fresnel if the flux is stated.")
+    ] = ()
     accept: Annotated[Accept, Key("The limits of the checks in the report.")] = Accept()
     tolerance: Annotated[tuple[Tolerance, ...], Key("Tolerances of part, mount and source: [[tolerance]].")] = ()
     output: Annotated[Output, Key("Accuracy of the meshes, and files for the shop.")] = Output()
@@ -107,6 +90,8 @@ class Scene(Record):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
+        if not self.states_effects:
+            object.__setattr__(self, "effects", effects.default(self.source, self.lens))  # not a stated key
         self.refuse()
         return self
 
@@ -145,6 +130,7 @@ class Scene(Record):
                     several = "several targets, or a wavefront, need targets on planes"
                     yield f"{key}: {several}; make it a plane, or keep one target without a wavefront"
         yield from coplanar_complaints(self.targets)
+        yield from self.accept.complaints(self.targets, self.source)
         if self.wavefront is not None and self.light_path.is_folded:
             yield "wavefront: cannot be set with a mirror in [[behind]], which reverses the wave; remove one of them"
         yield from _wavefront_complaints(self.wavefront, source, lens, accept=self.accept)
@@ -173,7 +159,7 @@ class Scene(Record):
             doubts += lighting.doubts(self.source, self.rim, key)
         elif not self.light_path.is_folded:
             doubts += self._of_targets(lambda target: target.grazed(self.lens))
-        return (*doubts, *self.picture_remarks())
+        return (*doubts, *self.source.remarks, *self.picture_remarks())
 
     def picture_remarks(self) -> tuple[str, ...]:
         """Return sentences on changes of the pictures that the scene does not state."""
@@ -202,8 +188,9 @@ class Scene(Record):
         """Return one scene per target, with only this target and no wavefront; for one target, the scene itself."""
         if len(self.targets) == 1:
             return (self,)
-        without_wave = {"wavefront": None, "accept": self.accept.model_copy(update={"wavefront": None})}
-        return tuple(self.model_copy(update={"targets": (each,), **without_wave}) for each in self.targets)
+        alone = {"wavefront": None, "point": (), "uniformity": None, "cut_off": None}  # which name a target or the wave
+        without = {"wavefront": None, "accept": self.accept.model_copy(update=alone)}
+        return tuple(self.model_copy(update={"targets": (each,), **without}) for each in self.targets)
 
     @model_serializer(mode="wrap")
     def _written(self, handler: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
@@ -211,9 +198,15 @@ class Scene(Record):
         found = {("target" if name == "targets" else name): value for name, value in handler(self).items()}
         if len(found.get("target", ())) == 1:
             found["target"] = found["target"][0]
-        return {name: value for name, value in found.items() if value or name not in ("before", "behind")}
+        omitted = {"before", "behind"} | (set() if self.states_effects else {"effects"})  # `effects` may be a default
+        return {name: value for name, value in found.items() if value and name != "effects" or name not in omitted}
 
     # ---- the lens and its light ----
+
+    @property
+    def states_effects(self) -> bool:
+        """True if the scene states its effects, perhaps as an empty list, instead of the default."""
+        return "effects" in self.model_fields_set
 
     @property
     def optic(self) -> str:
@@ -314,9 +307,13 @@ class Scene(Record):
     @property
     def draw(self) -> Draw | None:
         """Function of (points, seed) that samples the channels of an extended source; None for other sources."""
+        if (bundles := given_channels(self.source, self.lens.index_at)) is not None:
+            return Draw(lambda points, seed: self._with_losses(bundles(seed)), bundles.largest_side)
         if self.source.extent is None:
             return None
-        return lambda points, seed: self._with_losses(drawn_channels(self.source, self.lens.index_at, points, seed))
+        return Draw(
+            lambda points, seed: self._with_losses(drawn_channels(self.source, self.lens.index_at, points, seed))
+        )
 
     def _with_losses(self, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:
         lines = [nm for nm, _ in self.source.lines]
@@ -339,8 +336,7 @@ class Scene(Record):
     @property
     def limits_light(self) -> bool:
         """True if [accept] or tailoring.accuracy limits the light."""
-        marked = (name for name, field in Accept.model_fields.items() if any(key.of_light for key in field.metadata))
-        return any(limit is not None for limit in (*(getattr(self.accept, n) for n in marked), self.tailoring.accuracy))
+        return self.accept.limits_light or self.tailoring.accuracy is not None
 
     @property
     def mesh_tolerance(self) -> float:
@@ -369,6 +365,8 @@ class Scene(Record):
         own: dict[str, Any] = {"source": self.source} if self.source.kind == Emitter.kind else {}
         placeholder = Collimated(self.lens.outline, self.source.wavelength, z=self.source.start_plane)
         data = _from_python(self.model_copy(update={"source": placeholder}) if own else self, "", given)
+        if not self.states_effects:
+            del data["effects"]
         outline = changes.get("lens.outline", self.lens.outline)
         for key, value in changes.items():
             if key == "lens.front":

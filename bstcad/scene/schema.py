@@ -61,7 +61,9 @@ class FileContent:
     @property
     def digest(self) -> str:
         """SHA-256 of `data` and the other fields, in hexadecimal digits."""
-        return hashlib.sha256(repr(self).encode() + self.data).hexdigest()
+        found = hashlib.sha256(repr(self).encode())
+        found.update(self.data)
+        return found.hexdigest()
 
 
 def contents(value: Any, key: str = "") -> Iterator[tuple[str, FileContent]]:

@@ -126,7 +126,10 @@ class Target(Record):
                 yield f"target.outline: is larger than the target along {axis}; make it smaller, or widen target.{axis}"
 
     def _profile_complaints(self) -> Iterator[str]:
-        """Yield complaints about a profile larger than the target, or narrower than two pixels."""
+        """Yield complaints about a profile larger than the target, or narrower than two pixels, or about its edge."""
+        edge, narrow = getattr(self.profile, "edge", 0.0), 2 * min(getattr(self.profile, "half_extent", (0.0, 0.0)))
+        if edge > narrow - edge:
+            yield f"target.profile.edge: {edge:g} is wider than the rectangle, {narrow - edge:g}; make it narrower"
         pixels = (side / n for side, n in zip(self.size, self.columns_rows, strict=True))
         for axis, half, size, pixel in zip("xy", self._half_profile, self.size, pixels, strict=True):
             if 2 * half > size:

@@ -104,9 +104,18 @@ def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ..
     reference = Reference.of(lens, _central_channel(scene), scene.target.screen, picture=picture, control_points=points)
     entries = [*_glass_effects(scene, reference), *_mirror_effects(scene, reference)]
     entries += _source_size(scene, reference)
-    entries.append(_entry("diffraction", reference.diffraction(), "at the whole aperture"))
+    entries.append(_diffraction(scene, reference))
     entries.append(_entry("stray light", None, "which depends on the finish of the faces"))
     return tuple(sorted(entries, key=lambda entry: -(entry.rrmsd_change or 0.0)))
+
+
+def _diffraction(scene: Scene, reference: Reference) -> LeftOut:
+    """Return diffraction at the aperture; over directions with its blur λ / D in degrees."""
+    change, screen, words = reference.diffraction(), scene.target.screen, "at the whole aperture"
+    if change is not None and screen.plane.unit == "degrees":
+        blur = change.blur / math.sqrt(math.prod(screen.per_unit))
+        words = f"{words}, λ/D = {blur:.2g} degrees"
+    return _entry("diffraction", change, words)
 
 
 def _glass_effects(scene: Scene, reference: Reference) -> Iterator[LeftOut]:

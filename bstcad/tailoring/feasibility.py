@@ -133,7 +133,7 @@ def _largest_deflection(task: Task, lens: Lens, light: LightBehind) -> float:
     lit = lit_corners(light.picture)
     x, y = (torch.from_numpy(q[lit]) for q in slopes.face_points)
     way = torch.from_numpy(b[:, lit]) - torch.stack([x, y, lens.front.sag_and_slope(x, y)[0]])
-    coming = source.rays(x, y, lens.entrance.z, 1.0).direction
+    coming = source.rays_through(x, y, lens.entrance.z, 1.0).direction
     cosine = (way * coming).sum(0) / torch.sqrt((way * way).sum(0))
     return math.degrees(math.acos(max(-1.0, min(1.0, float(cosine.min())))))
 

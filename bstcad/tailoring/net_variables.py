@@ -89,7 +89,7 @@ def along_light(source: Emitter, lens: Lens, goals: Sequence[Goal]) -> tuple[csr
     front, back = lens.nets
     q_x, q_y = torch.meshgrid(*control_point_axes(front), indexing="ij")
     q, device = torch.stack([q_x, q_y]).numpy(), lens.like.device
-    coming = source.rays(q_x.to(device), q_y.to(device), lens.entrance.z, 1.0)
+    coming = source.rays_through(q_x.to(device), q_y.to(device), lens.entrance.z, 1.0)
     interfaces, number = lens.unbounded().interfaces, lens.number_of("front")
     within = behind(across(coming, interfaces[:number]), interfaces[number])
     out = behind(within, interfaces[number + 1])

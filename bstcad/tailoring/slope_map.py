@@ -94,7 +94,7 @@ def face_grid(source: Emitter, lens: Lens, window: Rectangle, cells: Sides) -> F
     x, y = (t.to(lens.like.device) for t in sampling.grid(window, cells))
     number = lens.freeform[-1]
     q_x, q_y, at_face = rays_to(source, lens, x=x, y=y, number=number)
-    coming = across(source.rays(q_x, q_y, lens.entrance.z, 1.0), lens.interfaces[:number])
+    coming = across(source.rays_through(q_x, q_y, lens.entrance.z, 1.0), lens.interfaces[:number])
     steps = tuple(side / n for side, n in zip((window.width, window.height), as_pair(cells), strict=True))
     xx, xy = torch.gradient(q_x, spacing=steps)
     yx, yy = torch.gradient(q_y, spacing=steps)
@@ -321,7 +321,7 @@ def map_to_target(source: Emitter, lens: Lens, goal: Goal, n: int, solver: Solve
     side = max(area.width, area.height)
     x, y = (t.to(lens.like.device) for t in sampling.grid(Rectangle(side, side), n * SUBCELLS))
     flux = source.irradiance(x, y, lens.entrance.z)
-    flux = flux * is_transmitted(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    flux = flux * is_transmitted(source.rays_through(x, y, lens.entrance.z, 1.0), lens)
     density = light_density(flux.cpu().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3)), side)
     if not screen.plane.is_level:
         target, frame = resample_picture(picture, screen.plane.to_level_plane(*pixel_corners(screen), lens.front.z), n)

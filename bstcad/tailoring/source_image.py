@@ -29,11 +29,11 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from bstcad.optics.channels import Channel
+from bstcad.optics.channels import Channel, Draw
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen, tent
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Draw, side_factor, simulated
+from bstcad.optics.measure import side_factor, simulated
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import point_pairs

@@ -203,7 +203,7 @@ def aimed_rays(
     mapping = slope_map.map_to_target(source, lens, goal, n, solver=Solver(iterations))
     area = clear_window(source, lens)
     x, y = (t.to(lens.like) for t in sampling.grid(area, side))
-    rays = source.rays(x, y, lens.entrance.z, area.area / side**2)
+    rays = source.rays_through(x, y, lens.entrance.z, area.area / side**2)
     return rays, slope_map.aim_points(mapping, lens, goal.receiver, x=x, y=y), mapping
 
 

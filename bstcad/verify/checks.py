@@ -29,12 +29,15 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.passes import Face
 from bstcad.optics.wavefront_error import WavefrontError, wavefront_error
 from bstcad.runs.processes import Overdue, Submit, end, result, return_freed, run_here
+from bstcad.scene.accept import Accept
 from bstcad.scene.blank import LensBlank
+from bstcad.scene.errors import SceneError
 from bstcad.scene.mount import Part, as_cut
-from bstcad.scene.scene import Accept, Scene
+from bstcad.scene.scene import Scene
 from bstcad.step_text import part21
 from bstcad.step_text.part21 import StepText
 from bstcad.verify import jobs, text_checks
+from bstcad.verify.light_limits import LightValue, light_values
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
@@ -116,6 +119,7 @@ class Proof:
     lines: Lines = ()  # pictures of the lines of a spectrum on the worst target
     at_bounds: dict[str, AtBound] | None = None  # bounds that the lens reaches, by key; None: no bound is reached
     wavefront: WavefrontError | None = None  # error of the wavefront; None: not requested, or no light reaches it
+    values: tuple[LightValue, ...] = ()  # values of the light that the scene limits, such as test points
 
     @property
     def worst(self) -> int:
@@ -162,6 +166,8 @@ def verify(
     made_lens, of_aperture, why = (lens, [], "") if read_part is None else _mounted_lens(read_part, lens, nominal, path)
     on_lens(made_lens)
     lights, lines = zip(*_measure_targets(made_lens, nominal, effort, on_light), strict=True)
+    values = light_values(nominal.scene, nominal.goals, lights, lens=made_lens, channels=nominal.channels)
+    lights = tuple(replace(light, sets=()) for light in lights)  # frees their memory
     wavefront, of_wavefront = _wavefront_checks(made_lens, nominal)
     cut = as_cut(lens, mount)
     shape = describe(cut, effort.places) | {"volume": whole.volume} | _ripple_rrmsd(made_lens, nominal)
@@ -181,10 +187,11 @@ def verify(
         *_mesh_checks(mesh, lens, whole.volume, nominal),
         *map(_target_check, nominal.goals, nominal.stored or [goal.picture for goal in nominal.goals]),
         *(c for goal, light in lit_goals for c in _light_checks(light, accept, optic, of=goal.suffix, why=why)),
+        *(check for value in values for check in value.checks()),
         *of_wavefront,
         *of_stability,
     )
-    proof = Proof(checks, made_lens, lights, shape, stability=stability, wavefront=wavefront)
+    proof = Proof(checks, made_lens, lights, shape, stability=stability, wavefront=wavefront, values=values)
     goal = nominal.goals[proof.worst]
     blurred = blur(nominal.channels, made_lens, goal.receiver, goal.picture)
     return replace(proof, blur=blurred, lines=lines[proof.worst], at_bounds=at_bounds or None)
@@ -218,10 +225,14 @@ def _measure_targets(lens: Lens, nominal: Nominal, effort: Effort, on_light: OnL
     lights = nominal.lights(lens, nominal.goals, effort)
     for number, (goal, light) in enumerate(zip(nominal.goals, lights, strict=True)):
         if not light.rrmsd >= 0:
+            if nominal.scene.draw is not None and nominal.scene.draw.largest_side is not None:
+                few = f"so few of the rays fall on {goal.words} that an eighth of them may give no picture"
+                raise SceneError(f"source.rays: {few}; give a file with more rays, or widen lens or target")
             name = "lens.step" if nominal.scene.mount is None else "part.step"
             raise ValueError(f"{name}: none of its light falls on {goal.words}; write it again, or check scene.toml")
         found.append((light, spectral_lines(lens, nominal.channels, goal, n=max(LINE_TUBES, tubes_of(lens)))))
-        on_light(*found[-1], number)
+        light, lines = found[-1]
+        on_light(replace(light, sets=()), lines, number)  # pictures are drawn in another process
     return found
 
 

@@ -18,10 +18,11 @@ PAGES = ROOT / "docs" / "reference"
 RECORDS = {  # JSON file: (module, names of its records), with the record of the file first
     "report.json": [
         ("report/record.py", ["Contents", "StageRecord", "CurvePoint", "PrecisionTest", "LineFigures", "LeftOut"]),
-        ("report/goal_figures.py", ["GoalFigures", "WavefrontFigures"]),
+        ("report/goal_figures.py", ["GoalFigures", "WavefrontFigures", "Photometry"]),
         ("analysis/top_hat.py", ["FlatTop"]),
         ("analysis/cost.py", ["ConvergenceEnd"]),
         ("verify/verdict.py", ["Check"]),
+        ("verify/light_limits.py", ["LightValue"]),
         ("analysis/light.py", ["Blur", "FinestDetail"]),
         ("judges/comparison.py", ["Judge"]),
         ("report/prescription.py", ["Order"]),

@@ -5,17 +5,25 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import photompy
 import pytest
 
 import bstcad
-from bstcad.analysis.far_field import FarField
+from bstcad.analysis.far_field import SEED, FarField, default_grid, grid_of
 from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
+from bstcad.optics.directions import Directions
+from bstcad.optics.irradiance import Screen, leaving
+from bstcad.optics.losses import FresnelLoss, Losses
+from bstcad.optics.measure import GHOST_DIVISOR, simulated
 from bstcad.optics.outlines import Circle
 from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane
-from bstcad.photometry import eulumdat, ies
+from bstcad.optics.trace import ghost_light
+from bstcad.photometry import intensity_files, ray_files
+from bstcad.photometry.intensity import Intensity
 from tests.lenses import lens_of, net
+from tests.photometry.other_readers import assert_is_an_l, read_by_others
 
 PLATE = lens_of(net(lambda x, y: 0 * x, 22.0, 17, half=11.0), Plane(20.0), Circle(10.0), 1.5)
 
@@ -40,21 +48,61 @@ def test_a_tilted_beam_is_where_its_direction_is():
     assert table.along[j] == pytest.approx(math.degrees(math.acos(n_z)), abs=0.6)
 
 
-def test_a_design_exports_what_others_read(tmp_path, prepared_design):
-    """Both files have one flux, absolute with source.lumens and for 1000 lm without."""
-    design = prepared_design
-    [one, other] = design.export("ies", "ldt")
-    tables = ies.read(one.read_bytes()), eulumdat.read(other.read_bytes())
-    assert tables[0].lumens == pytest.approx(tables[1].lumens, rel=1e-4)
-    assert {table.rated_lumens for table in tables} == {1000.0}
+def test_the_flux_of_the_table_is_that_of_the_ledger_with_the_ghost():
+    """Losses at faces are taken, the light reflected twice is contained; the sum is exact for the same rays."""
+    channel = Channel(Point((0.0, 0.0, 0.0)), 1.5, losses=Losses(FresnelLoss(587.6)))
+    screen = Screen(0.0, *2 * ((-90.0, 90.0),), pixels=720, surface=Directions("C"))
+    [light] = simulated(PLATE, (channel,), [screen], 256, seed=SEED)
+    ghost = ghost_light(PLATE, (channel,), screen, 256 // GHOST_DIVISOR, SEED)
+    assert float(ghost.picture.sum()) > 1e-3 * leaving(light.flux)
+    bare, whole = (
+        FarField((channel,), lumens=100.0, ghost=each).table(PLATE, rays=256).lumens for each in (None, ghost_light)
+    )
+    assert bare == pytest.approx(100 * leaving(light.flux), rel=1e-6)
+    assert whole == pytest.approx(100 * leaving({**light.flux, **ghost.flux}), rel=1e-6)
 
 
-@pytest.fixture
-def prepared_design(tmp_path):
+def test_the_grid_of_a_file_is_completed_to_90_degrees():
+    def grid(around, along, kind="C"):
+        return grid_of(Intensity(kind, np.array(around, float), np.array(along, float), np.ones((1, 1))))
+
+    around, along = grid([0, 30, 90, 240], [0, 10, 30, 40])
+    assert list(around) == [0, 30, 90, 240] and list(along) == [0, 10, 30, 40, 50, 60, 70, 80, 90]
+    assert list(grid([0], [30, 50, 180])[1]) == [0, 10, 30, 50, 180]
+    assert len(grid([0], [0, 90])[0]) == 72
+    for own, default in zip(grid([-90, 90], [-90, 90], "B"), default_grid(), strict=True):
+        assert np.array_equal(own, default)
+
+
+def test_a_design_exports_what_others_read(design):
+    """All files have one flux, that of the ledger for 1000 lm; an L is upright for two packages of others."""
+    [one, other, table, rays] = design.export("ies", "ldt", "csv", "tm25")
+    tables = [intensity_files.read(path.name, path.read_bytes()) for path in (one, other, table)]
+    lumens = 1000 * leaving(design.report.flux)
+    for found in tables:
+        assert found.lumens == pytest.approx(lumens, rel=1e-3)
+        assert found.candela == pytest.approx(tables[2].candela, abs=1e-3 * tables[2].candela.max())
+    assert [found.rated_lumens for found in tables] == [1000.0, 1000.0, None]
+    for found in read_by_others(other).values():
+        assert_is_an_l(found)
+    light = ray_files.read(rays.name, rays)
+    assert (light.unit, light.flux) == ("W", pytest.approx(leaving(design.report.flux), rel=5e-3))
+    # the integral of another package, of the file that states C = 360°
+    assert photompy.IESFile.read(one).photometry.total_optical_power() == pytest.approx(lumens, rel=2e-3)
+
+
+def test_the_figures_of_a_target_over_directions_are_drawn(design):
+    names = {path.stem for path in (design.folder / "figures").iterdir()}
+    assert {"polar", "isocandela"} <= names and not {"cone", "isolux"} & names  # the flux is not known
+
+
+@pytest.fixture(scope="module")
+def design(tmp_path_factory):
     scene = bstcad.load("templates/disk.toml").changed({
-        "lens.back.control_points": 33, "target.pixels": 32, "tailoring.quality": "draft", "tailoring.rays": 96,
-        "tailoring.stage2_iterations": 2,
+        "lens.back.control_points": 49, "tailoring.quality": "draft", "tailoring.rays": 96,
+        "tailoring.stage2_iterations": 3, "effects": [{"kind": "fresnel"}],
+        "target": {"kind": "intensity", "x": [-24.0, 24.0], "y": [-24.0, 24.0], "pixels": 48, "text": "L"},
     })  # fmt: skip
-    design = bstcad.design(scene, progress=False)
-    design.write(tmp_path / "design", progress=False)
-    return design
+    made = bstcad.design(scene, progress=False)
+    made.write(tmp_path_factory.mktemp("far") / "design", progress=False)
+    return made

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -46,6 +47,8 @@ def test_a_preview_is_near_the_finished_draft(name, lit):
     assert shown["Smallest radius, steepest slope"].startswith("known after") and not any(
         "tool" in name for name in shown
     )
+    known = dict(figures(replace(found, scene=scene.changed({"source.lumens": 100.0}))))
+    assert known["Luminous flux on the target"].endswith("of 100 lm") and "Luminous flux on the target" not in shown
     shape, finished = found.shape, describe(made.lens, 65)
     for key in ("thickness_min", "thickness_max", "sag_pv"):
         assert abs(shape[key] - finished[key]) < spread * shape["sag_pv"]

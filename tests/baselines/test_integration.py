@@ -47,9 +47,9 @@ class Known:
         line = torch.linspace(-5.0, 5.0, n, dtype=torch.float64)
         x, y = torch.meshgrid(line, line, indexing="ij")
         if self.front is None:
-            return self.source.rays(x, y, self.face.z, 1.0)
+            return self.source.rays_through(x, y, self.face.z, 1.0)
         lens = Lens(self.front, net(z=self.face.z), WIDE, self.law.n_in)
-        return to_first_net(self.source.rays(x, y, self.front.z, 1.0), lens)
+        return to_first_net(self.source.rays_through(x, y, self.front.z, 1.0), lens)
 
     def aims(self, coming):
         """Return the points (2, n, n) (mm) to which the face sends the rays, and where the rays meet the face."""

@@ -86,7 +86,7 @@ def test_the_beam_shaper_is_the_quadrature_s(made):
     flux = torch.exp(-2 * (r / shaper.radius_1e2) ** 2)  # places of equal area
     share = flux / flux.sum()
     for target in scene.targets:
-        rays = source.rays(x, y, lens.entrance.z, 1.0)
+        rays = source.rays_through(x, y, lens.entrance.z, 1.0)
         ours, path, _ = optical_path(source, lens, rays, target.z)
         assert bool(ours.alive.all())
         lands = torch.from_numpy(shaper.lands_at(r.numpy()))

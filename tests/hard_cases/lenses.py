@@ -35,7 +35,7 @@ def engines(source, lens: Lens, x, y, z: float) -> Iterator[tuple[str, Landed]]:
     """(name, landed) by every way to trace."""
     for engine in ("plain", "mixed", "fused"):
         with tracing(engine) as through_back:
-            yield engine, through_back(trace.to_first_net(source.rays(x, y, lens.front.z, 1.0), lens), lens, z)
+            yield engine, through_back(trace.to_first_net(source.rays_through(x, y, lens.front.z, 1.0), lens), lens, z)
     if x.dtype == torch.float64:
         yield "forward", forward.land(source, lens, LevelPlane(z), x, y)
 

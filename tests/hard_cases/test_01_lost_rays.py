@@ -49,7 +49,7 @@ Z = 200.0
 def good(dtype) -> Rays:
     """143 rays: an odd number, so that one more leaves each of two threads what it had."""
     x, y = (p.reshape(-1)[:143] for p in stratified(Rectangle(12.0, 12.0), 12, 0, dtype))
-    return Point().rays(x, y, 15.0, 1.0)
+    return Point().rays_through(x, y, 15.0, 1.0)
 
 
 def with_ray(rays: Rays, other: Rays, place: int) -> Rays:
@@ -154,7 +154,7 @@ def test_the_surface_is_not_evaluated_for_20_164_rays_because_of_one(way, dtype,
     """Places at which sag and slopes are asked for, which no busy machine changes: at most a hundredth more."""
     lens = lens_of(wavy(dtype))
     x, y = (p.reshape(-1) for p in stratified(Rectangle(13.0, 13.0), 142, 0, dtype))
-    rays = trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens)
+    rays = trace.to_first_net(Point().rays_through(x, y, 15.0, 1.0), lens)
     direction, asked, evaluate = rays.direction.clone(), [], BSplineSurface.relative_sag_and_slope
     direction[:, 7000] = torch.nn.functional.normalize(torch.tensor(way, dtype=torch.float64), dim=0)
 

@@ -93,7 +93,7 @@ def test_the_forward_kernel_chooses_it_too():
     """A near source before a plane front: rays in the glass up to 38° off the axis, waves steeper than that allows."""
     source, lens = Point((1.0, 0.5, 12.0)), Lens(Plane(15.0), waves(2.5, 12.0), SQUARE, N)
     x, y = uniform((2, 3000), 5, -9.9, 9.9)
-    rays = source.rays(x, y, 15.0, 1.0)
+    rays = source.rays_through(x, y, 15.0, 1.0)
     in_glass = trace.to_first_net(rays, lens)
     plain = from_first_net_plain(in_glass, lens, LevelPlane(200.0))
     found = forward.land(source, lens, LevelPlane(200.0), x, y)

@@ -145,7 +145,7 @@ def test_the_forward_kernel_at_knots_and_corners():
     source = Collimated(Rectangle(3 * half, 3 * half))
     found = forward.land(source, lens, LevelPlane(120.0), x, y)
     with tracing("plain") as through_back:
-        plain = through_back(to_first_net(source.rays(x, y, 8.0, 1.0), lens), lens, 120.0)
+        plain = through_back(to_first_net(source.rays_through(x, y, 8.0, 1.0), lens), lens, 120.0)
     lit = plain.flux > 0
     assert torch.equal(found.status[lit], plain.status[lit]) and int(plain.alive.sum()) > 300
     both = plain.alive & lit

@@ -78,7 +78,7 @@ def test_no_curvature_is_the_plane_to_the_bit(source, dtype):
                       for front in fronts)  # fmt: skip
     assert all(torch.equal(a, b) for other in others for a, b in zip(other, plane, strict=True))
     tiny = trace.trace(
-        source.rays(x, y, 15.0, 1.0), lens_of(wavy(dtype), Sphere(15.0, 1e-300)), LevelPlane(300.0)
+        source.rays_through(x, y, 15.0, 1.0), lens_of(wavy(dtype), Sphere(15.0, 1e-300)), LevelPlane(300.0)
     ).position
     assert torch.equal(tiny, plane[2])
 

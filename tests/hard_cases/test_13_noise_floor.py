@@ -25,7 +25,7 @@ from bstcad.optics.measure import Effort, Light, measure
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Plane
-from bstcad.scene.scene import Accept
+from bstcad.scene.accept import Accept
 from bstcad.verify import checks
 from tests.tracing import simulated, simulated_plain
 
@@ -57,7 +57,7 @@ def truth() -> torch.Tensor:
 def by_random(form, n: int, seed: int, dtype) -> torch.Tensor:
     """n² independent rays."""
     x, y = sampling.random(APERTURE, n * n, seed, dtype)
-    rays = SOURCE.rays(x, y, 5.0, APERTURE.area / n**2)
+    rays = SOURCE.rays_through(x, y, 5.0, APERTURE.area / n**2)
     return irradiance.box(trace.trace(rays, plate(dtype), LevelPlane(SCREEN.z)), SCREEN)
 
 

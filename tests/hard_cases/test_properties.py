@@ -102,7 +102,7 @@ def test_a_hit_lies_on_its_face_and_ahead(source, depth, curvature, ripple, seed
     """Hits at both faces: F = 0 to rounding, the path is forwards, along the ray, inside the outline."""
     x, y = uniform((2, 200), seed, -11.0, 11.0)
     lens = lens_with(depth, curvature, ripple=ripple)
-    rays = source.rays(x, y, 15.0, 1.0)
+    rays = source.rays_through(x, y, 15.0, 1.0)
     for surface, eta in ((lens.front, (1.0, N)), (lens.back, (N, 1.0))):
         at, z_x, z_y = intersect(surface, rays, lens.outline, Status.VIGNETTED)
         there = at.alive
@@ -124,9 +124,9 @@ def test_a_mirrored_scene_lands_mirrored(depth, curvature, seed, axis):
     mirrored = replace(lens, back=replace(lens.back, heights=lens.back.heights.flip(k).contiguous()))
     points = uniform((2, 100), seed, -8.0, 8.0)
     place = [0.5, -0.75, 1.0]
-    landed = trace.trace(Point(tuple(place)).rays(*points, 15.0, 1.0), lens, LevelPlane(500.0))
+    landed = trace.trace(Point(tuple(place)).rays_through(*points, 15.0, 1.0), lens, LevelPlane(500.0))
     place[k], points[k] = -place[k], -points[k]
-    other = trace.trace(Point(tuple(place)).rays(*points, 15.0, 1.0), mirrored, LevelPlane(500.0))
+    other = trace.trace(Point(tuple(place)).rays_through(*points, 15.0, 1.0), mirrored, LevelPlane(500.0))
     assert torch.equal(landed.status, other.status)
     back = other.position.clone()
     back[k] = -back[k]

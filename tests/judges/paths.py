@@ -28,7 +28,7 @@ def paths_apart(lens, source, z, n=128):
 
     lens, source = lens.plain(), source.central
     area = clear_window(source, lens)
-    rays = source.rays(*sampling.grid(area, n), lens.entrance.z, area.area / n**2)
+    rays = source.rays_through(*sampling.grid(area, n), lens.entrance.z, area.area / n**2)
     ours, path, _ = optical_path(source, lens, rays, z)
     in_a_row = replace(rays, position=rays.position.reshape(3, -1), direction=rays.direction.reshape(3, -1))
     theirs = judge.through(lens, judge.surfaces(lens), in_a_row)

@@ -68,7 +68,7 @@ SCENES = {
 def test_the_kernels_collect_directions_as_the_plain_form_does(name, kind):
     source, lens = SCENES[name]
     x, y = (p.reshape(-1) for p in stratified(Rectangle(18.0, 18.0), 60, 0))
-    coming = to_first_net(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    coming = to_first_net(source.rays_through(x, y, lens.entrance.z, 1.0), lens)
     plain = from_first_net_plain(coming, lens, Directions(kind))
     for found in (land(source, lens, Directions(kind), x, y), from_first_net(coming, lens, Directions(kind))):
         alive = plain.alive & (plain.flux > 0)
@@ -82,7 +82,7 @@ def test_the_gradient_of_directions_is_the_plain_one(name, kind):
     """Gradient in the heights of the net, for seeds of any sign."""
     source, lens = SCENES[name]
     x, y = sampling.grid(Rectangle(15.0, 15.0), 40)
-    coming = to_first_net(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    coming = to_first_net(source.rays_through(x, y, lens.entrance.z, 1.0), lens)
     seeds = torch.randn((2, 1600), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     gradients = []
     for trace in (from_first_net_plain, from_first_net):

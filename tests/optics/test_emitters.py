@@ -89,7 +89,7 @@ SOURCES = [
 @pytest.mark.parametrize("source", SOURCES, ids=str)
 def test_rays_pass_the_points_they_were_asked_for(source, dtype):
     x, y = stratified(Rectangle(20.0, 8.0), 8, 0, dtype)
-    rays = source.rays(x, y, Z, 0.3)
+    rays = source.rays_through(x, y, Z, 0.3)
     eps = torch.finfo(dtype).eps
     assert rays.position.shape == rays.direction.shape == (3, 8, 8) and rays.position.dtype == dtype
     torch.testing.assert_close(rays.direction.norm(dim=0), torch.ones_like(x), rtol=0, atol=4 * eps)
@@ -117,7 +117,7 @@ def test_no_ray_from_outside_the_window_enters_the_lens(source, front, outline):
     lens = lens_of(net(z=40.0, half=12.0), front, outline)
     area = window(source, lens)
     x, y = stratified(Rectangle(3 * area.width, 3 * area.height), 120, 0)
-    entered = to_first_net(source.rays(x, y, Z, 1.0), lens).alive
+    entered = to_first_net(source.rays_through(x, y, Z, 1.0), lens).alive
     inside = (x.abs() <= area.width / 2) & (y.abs() <= area.height / 2)
     assert int((entered & inside).sum()) > 10
     assert not (entered & ~inside).any()
@@ -173,13 +173,13 @@ def test_a_tilted_beam_has_all_its_flux_on_any_plane_and_is_shifted_along_its_wa
 
 def test_a_tilted_beam_says_that_it_is_not_axial():
     x, y = sampling.grid(Rectangle(2.0, 2.0), 4)
-    rays = Collimated(DISC, tilt=(10.0, 30.0)).rays(x, y, Z, 1.0)
+    rays = Collimated(DISC, tilt=(10.0, 30.0)).rays_through(x, y, Z, 1.0)
     assert not rays.axial and rays.z < 0
     assert rays.direction[:, 0, 0].tolist() == pytest.approx(axes((10.0, 30.0))[2], rel=1e-15)
-    below = Collimated(DISC, tilt=(10.0, 30.0), z=40.0).rays(x, y, Z, 1.0)
+    below = Collimated(DISC, tilt=(10.0, 30.0), z=40.0).rays_through(x, y, Z, 1.0)
     torch.testing.assert_close(below.direction, -rays.direction)
     assert below.sense == -1
-    moved = Collimated(DISC, centre=(1.0, 0.0)).rays(x, y, Z, 1.0)
+    moved = Collimated(DISC, centre=(1.0, 0.0)).rays_through(x, y, Z, 1.0)
     assert moved.axial and torch.equal(moved.position[0], x)
 
 

@@ -77,7 +77,7 @@ def test_a_tilted_beam_passes_a_plate_as_snell_says(tilt, z):
     sin = math.hypot(n_x, n_y)
     inside = math.tan(math.asin(sin / 1.5)) / sin  # per component of the direction
     way = 4.0 * inside + (60.0 - 6.0) / n_z
-    for landed in (trace(source.rays(x, y, 2.0, 1.0), lens, screen), land(source, lens, screen, x, y)):
+    for landed in (trace(source.rays_through(x, y, 2.0, 1.0), lens, screen), land(source, lens, screen, x, y)):
         assert landed.alive.all()
         torch.testing.assert_close(landed.position[0], x + way * n_x, rtol=0, atol=1e-12 * 60.0 / n_z)
         torch.testing.assert_close(landed.position[1], y + way * n_y, rtol=0, atol=1e-12 * 60.0 / n_z)

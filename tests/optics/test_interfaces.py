@@ -56,7 +56,7 @@ def net(z, size, seed=1):
 
 def rays_of(source, lens, n=40, size=16.0):
     x, y = stratified(Rectangle(size, size), n, 0)
-    return source.rays(x, y, lens.entrance.z, 1.0)
+    return source.rays_through(x, y, lens.entrance.z, 1.0)
 
 
 def test_a_window_before_a_lens_and_a_fold_mirror_behind_it_are_data():
@@ -141,7 +141,7 @@ def test_the_metal_of_a_mangin_mirror_is_met_from_the_glass():
     """The face reflects |(m - n) / (m + n)|² at normal incidence, and light crosses a bare front before and after."""
     metal, flat = 1.2 + 6.0j, [net(z, 0.0) for z in (0.0, 6.0)]
     lens = Lens(*flat, SQUARE, N, own_passes=MANGIN, losses=Losses(FresnelLoss(587.6, metal=metal)))
-    rays = Collimated(Rectangle(4.0, 4.0)).rays(*stratified(Rectangle(4.0, 4.0), 4, 0), 0.0, 1.0)
+    rays = Collimated(Rectangle(4.0, 4.0)).rays_through(*stratified(Rectangle(4.0, 4.0), 4, 0), 0.0, 1.0)
     left = trace(rays, lens, LevelPlane(-20.0)).flux / rays.flux
     wanted = (1 - ((N - 1) / (N + 1)) ** 2) ** 2 * abs((metal - N) / (metal + N)) ** 2
     torch.testing.assert_close(left, torch.full_like(left, wanted), rtol=1e-12, atol=0)

@@ -59,7 +59,7 @@ def test_a_paraboloid_gathers_parallel_light_in_its_focus():
     c = 1 / 80.0
     x = torch.linspace(-8.5, 8.5, 35, dtype=torch.float64)
     x, y = (p.reshape(-1) for p in torch.meshgrid(x, x, indexing="ij"))
-    rays = Collimated(Circle(20.0), z=200.0).rays(x, y, Z, 1.0)
+    rays = Collimated(Circle(20.0), z=200.0).rays_through(x, y, Z, 1.0)
     for land in (from_first_net, from_first_net_plain):
         found = land(rays, mirror(paraboloid(c)), LevelPlane(Z + 1 / (2 * c)))
         assert found.alive.all() and float(found.position.abs().max()) < 1e-9
@@ -73,7 +73,7 @@ def test_an_ellipsoid_takes_light_from_one_focus_to_the_other(conic_constant):
     x = torch.linspace(-9, 9, 13, dtype=torch.float64)
     x, y = (p.reshape(-1) for p in torch.meshgrid(x, x, indexing="ij"))
     face = Interface(Conic(Z, 1 / radius, conic_constant), EVERYWHERE, Reflect(), Status.MISSED_FRONT)
-    hit = cross(Point((0.0, 0.0, near)).rays(x, y, Z, 1.0), face)
+    hit = cross(Point((0.0, 0.0, near)).rays_through(x, y, Z, 1.0), face)
     landed = LevelPlane(far).to(hit.rays)
     assert landed.alive.all() and float(landed.position[:2].abs().max()) < 1e-9
 
@@ -128,7 +128,7 @@ def test_the_rays_to_points_of_the_mirror_meet_them(light):
     x = torch.linspace(-6, 6, 21, dtype=torch.float64)
     x, y = torch.meshgrid(x, x, indexing="ij")
     p, q, coming = rays_to(source, lens, x, y)
-    hit = cross(source.rays(p, q, Z, 1.0), lens.interfaces[0]).rays
+    hit = cross(source.rays_through(p, q, Z, 1.0), lens.interfaces[0]).rays
     torch.testing.assert_close(hit.position[:2], torch.stack([x, y]), rtol=0, atol=1e-6)
     assert coming.sense == -1 and bool((coming.direction[2] < 0).all())
 

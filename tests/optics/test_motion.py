@@ -79,7 +79,7 @@ def test_rays_of_a_moved_source_are_moved_rays(source, motion):
     if isinstance(source, Collimated):
         shift = after.shift(z)
         x, y = x + shift[0], y + shift[1]
-    rays = after.rays(x, y, z, 1.0)
+    rays = after.rays_through(x, y, z, 1.0)
     back = motion.inverse
     height = rays.position[2] + rays.z
     start = np.stack([p.numpy().ravel() for p in (*rays.position[:2], height)])

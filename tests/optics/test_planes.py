@@ -45,7 +45,7 @@ def coming_through(light):
     source, reflects = LIGHTS[light]
     lens = optic(0.5, reflects)
     x = torch.linspace(-11.0, 11.0, 41, dtype=torch.float64)
-    return to_first_net(source.rays(*torch.meshgrid(x, x, indexing="ij"), lens.entrance.z, 1.0), lens), lens
+    return to_first_net(source.rays_through(*torch.meshgrid(x, x, indexing="ij"), lens.entrance.z, 1.0), lens), lens
 
 
 @pytest.mark.parametrize("tilt", [(30.0, 0.0), (0.0, 30.0), TILT, (-80.0, 75.0)])

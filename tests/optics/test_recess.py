@@ -50,13 +50,13 @@ def test_inside_it_is_its_optical_part_and_beyond_a_plane_through_the_rim(face):
 def test_a_ray_crosses_the_dome_inside_its_outline_alone():
     """Rays from the centre go on undeflected; a micron outside the rim they are lost."""
     r = torch.tensor([0.0, 5.0, EDGE - 1e-6, EDGE + 1e-6, 20.0], dtype=torch.float64)
-    rays = Point().rays(r * RADIUS / PLANE, 0 * r, RADIUS, 1.0)  # through r of the underside's plane
+    rays = Point().rays_through(r * RADIUS / PLANE, 0 * r, RADIUS, 1.0)  # through r of the underside's plane
     behind = to_first_net(rays, lens())
     assert behind.alive.tolist() == [True, True, True, False, False]
     assert set(behind.status[3:].tolist()) == {int(Status.MISSED_FRONT)}
     torch.testing.assert_close(behind.direction[:, :3], rays.direction[:, :3], rtol=0, atol=1e-12)
     assert bool((behind.position[:2, :3].norm(dim=0) <= EDGE).all())
-    beam = to_first_net(Collimated(Circle(RIM), z=-5.0).rays(r, 0 * r, RADIUS, 1.0), lens())
+    beam = to_first_net(Collimated(Circle(RIM), z=-5.0).rays_through(r, 0 * r, RADIUS, 1.0), lens())
     assert beam.alive.tolist() == [True, True, True, False, False]  # also where the way needs no search
 
 
@@ -93,7 +93,7 @@ def test_the_kernel_traces_a_dome_as_the_plain_form_does(monkeypatch):
     torch.testing.assert_close(fast.box, plain.box, rtol=0, atol=1e-13)
     assert fast.flux == pytest.approx(plain.flux, abs=1e-12)
     x = torch.linspace(-15, 15, 40, dtype=torch.float64)
-    rays = source.rays(*torch.meshgrid(x, x, indexing="ij"), RADIUS, 1.0)
+    rays = source.rays_through(*torch.meshgrid(x, x, indexing="ij"), RADIUS, 1.0)
     first = trace(rays, wide, LevelPlane(500.0))
     monkeypatch.setattr(ops, "ENABLED", False)
     second = trace(rays, wide, LevelPlane(500.0))

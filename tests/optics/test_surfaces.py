@@ -28,7 +28,7 @@ def places(n=400, reach=8.0, dtype=torch.float64):
 def behind(front, source=BEAM):
     """Rays in the glass behind a front at z = 15."""
     x, y = places(reach=6.0)
-    rays = to_first_net(source.rays(x, y, front.z, 1.0), lens_of(net(z=60.0), front, index=N))
+    rays = to_first_net(source.rays_through(x, y, front.z, 1.0), lens_of(net(z=60.0), front, index=N))
     assert rays.alive.all()
     return rays
 
@@ -70,7 +70,7 @@ def test_points_fulfil_the_equation(constant, curvature):
 def test_rays_meet_it_where_it_is(constant, curvature):
     surface = Conic(15.0, curvature, constant)
     x, y = places(reach=6.0)
-    at, *_ = intersect(surface, Point((2.0, -1.0, 3.0)).rays(x, y, 15.0, 1.0), SQUARE, Status.MISSED_FRONT)
+    at, *_ = intersect(surface, Point((2.0, -1.0, 3.0)).rays_through(x, y, 15.0, 1.0), SQUARE, Status.MISSED_FRONT)
     assert at.alive.all()
     found = torch.from_numpy(sag(surface, *at.position[:2].numpy()))
     torch.testing.assert_close(at.above(0.0), found, rtol=0, atol=1e-12)
@@ -87,7 +87,7 @@ def test_the_other_sheet_of_a_hyperboloid_is_not_met():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_conic_of_constant_zero_is_the_sphere_to_the_bit(dtype):
     x, y = places(dtype=dtype)
-    rays = Point().rays(x, y, 15.0, 1.0)
+    rays = Point().rays_through(x, y, 15.0, 1.0)
     for c in (0.02, -0.05):
         conic, sphere = Conic(15.0, c), Sphere(15.0, c)
         assert all(map(torch.equal, conic.sag_and_slope(x, y), sphere.sag_and_slope(x, y)))

@@ -21,7 +21,7 @@ from tests.tracing import from_first_net_plain, stratified
 
 def from_point(n=40, half=9.0, z=15.0, source=None, dtype=torch.float64):
     x, y = stratified(Rectangle(2 * half, 2 * half), n, 0, dtype)
-    return (source or Point()).rays(x, y, z, 1.0)
+    return (source or Point()).rays_through(x, y, z, 1.0)
 
 
 def heading(rays, surface, outline=SQUARE):
@@ -95,7 +95,7 @@ def test_a_ray_that_turns_back_does_not_land(form):
 
 def test_axial_closed_form_is_the_newton_answer():
     x, y = stratified(Rectangle(22.0, 22.0), 30, 0)
-    axial = Collimated(Circle(12.0)).rays(x, y, 8.0, 1.0)
+    axial = Collimated(Circle(12.0)).rays_through(x, y, 8.0, 1.0)
     searched = replace(axial, axial=False)
     for front in (Plane(8.0), Sphere(8.0, -0.03)):
         lens = Lens(front, wavy(), SQUARE, N)
@@ -137,7 +137,7 @@ def test_paraxial_rays_follow_the_transfer_matrix(curvature, z):
     thickness, power = 6.0, (N - 1) * curvature
     lens = Lens(Sphere(14.0, curvature), net(), SQUARE, N)
     h = torch.tensor([1e-3, 2e-3], dtype=torch.float64)
-    rays = Collimated(Circle(5.0)).rays(h, -h, 0.0, 1.0)
+    rays = Collimated(Circle(5.0)).rays_through(h, -h, 0.0, 1.0)
     expected = h * (1 - power * thickness / N) - h * power * (z - 20.0)
     landed = trace.trace(rays, lens, LevelPlane(z))
     atol = 10 * float(h.max()) ** 3 * curvature**2 * z * abs(curvature) + 1e-15 * z  # third-order aberration
@@ -151,7 +151,7 @@ def test_a_prism_deviates_by_its_closed_form():
     """Flat front, back tilted by α: sin(α + δ) = n sin α for rays along the axis, δ towards the thicker side."""
     slope = 0.3
     x, y = sampling.grid(SQUARE, 5)
-    rays = Collimated(Circle(30.0)).rays(x, y, 0.0, 1.0)
+    rays = Collimated(Circle(30.0)).rays_through(x, y, 0.0, 1.0)
     landed = trace.trace(rays, Lens(Plane(8.0), tilted(slope), SQUARE, N), LevelPlane(1000.0))
     tilt = math.atan(slope)
     turn = math.asin(N * math.sin(tilt)) - tilt
@@ -172,7 +172,7 @@ def test_gradient_in_curvature_net_and_start_is_finite_differences(kind, curvatu
 
     def landing(heights, curvature, x, y):
         lens = Lens(Sphere(15.0, curvature), replace(start, heights=heights), SQUARE, N)
-        return trace.trace(source.rays(x, y, 15.0, 1.0), lens, LevelPlane(60.0)).position
+        return trace.trace(source.rays_through(x, y, 15.0, 1.0), lens, LevelPlane(60.0)).position
 
     x, y = (a.reshape(-1).requires_grad_() for a in stratified(Rectangle(12.0, 12.0), 2, 0))
     c = torch.tensor(curvature, dtype=torch.float64, requires_grad=True)

@@ -152,7 +152,7 @@ def test_rays_meet_the_back_where_they_are_sent(name):
     lens = lens_behind(front, outline)
     x, y = tubes.corners(Rectangle(14.0, 12.0), 300)
     p, q, at_back = tubes.rays_to(source, lens, x, y)
-    entered = to_first_net(source.rays(p, q, lens.front.z, 1.0), lens.unbounded())
+    entered = to_first_net(source.rays_through(p, q, lens.front.z, 1.0), lens.unbounded())
     hit, _, _ = intersect(lens.back, entered, EVERYWHERE, 2)
     assert bool(at_back.alive.all())
     torch.testing.assert_close(hit.position, at_back.position, rtol=0, atol=3e-7)

@@ -196,3 +196,11 @@ def test_damaged_files_are_refused_in_a_clause_or_are_files(suffix):
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert refused >= 50 and most < 100e6
+
+
+def test_a_table_of_commas_returns_as_it_was_written():
+    given = table("none")
+    found = intensity_files.of_csv(intensity_files.csv_text(given).encode())
+    for part in ("around", "along", "candela"):
+        assert getattr(found, part) == pytest.approx(getattr(given, part), rel=1e-9)
+    assert intensity_files.csv_text(found) == intensity_files.csv_text(given)

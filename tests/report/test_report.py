@@ -23,6 +23,7 @@ from bstcad.verify.verdict import Check
 
 PICTURES = (
     "irradiance", "cross_section", "ghost", "lines", "lens", "side_view", "surface", "transport", "convergence",
+    "isolux", "polar", "isocandela", "cone",
 )  # fmt: skip
 PNG = b"\x89PNG not a real picture"
 REPORT = {

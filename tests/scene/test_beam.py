@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import random
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from PIL import Image
 
 import bstcad
 from bstcad.optics.outlines import EVERYWHERE
-from bstcad.scene.beam import background, lit, moments
+from bstcad.scene.beam import MeasuredBeam, background, lit, moments, read_beam
 from bstcad.scene.errors import SceneError
 
 SIDE, WIDTH = 400, 12.0  # pixels, mm
@@ -124,3 +126,32 @@ def test_wrong_tables_are_refused(content, sentence, tmp_path):
 def test_wrong_profiles_are_refused(changes, sentence):
     with pytest.raises(SceneError, match=f"^{sentence}"):
         bstcad.load("templates/thu.toml").changed(changes)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".csv"])
+def test_damaged_beams_are_refused_in_a_sentence_or_are_beams(suffix, tmp_path):
+    """Files cut short, with bytes changed, or with lines lost; memory does not follow what a damaged header claims."""
+    light, path, chance = camera()[::8, ::8].clip(0), tmp_path / f"beam{suffix}", random.Random(3)
+    if suffix == ".csv":
+        np.savetxt(path, light, delimiter=",", fmt="%.1f")
+    else:
+        Image.fromarray(light.astype(np.uint16)).save(path)
+    whole, refused = path.read_bytes(), 0
+    tracemalloc.start()
+    for _ in range(80):
+        bad = bytearray(whole[: chance.randrange(len(whole))] if chance.random() < 0.5 else whole)
+        for _ in range(chance.randrange(1, 20)):
+            if bad:
+                bad[chance.randrange(min(len(bad), 200 if chance.random() < 0.7 else len(bad)))] = chance.randrange(256)
+        path.write_bytes(bad)
+        try:
+            found = MeasuredBeam(image=read_beam(path), width=WIDTH).law
+        except SceneError as fault:
+            refused += 1
+            words = str(fault)
+            assert words.startswith("source.profile") and words.isprintable() and len(words) < 400
+        else:
+            assert np.isfinite(found.net.values.numpy()).all() and found.net.flux > 0
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert refused >= 50 and most < 100e6

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import pickle
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +12,13 @@ import pytest
 import torch
 
 import bstcad
+from bstcad.app.preview import PreviewSize, preview
 from bstcad.optics import sampling
 from bstcad.optics.outlines import Rectangle
-from bstcad.photometry import eulumdat, ies
+from bstcad.photometry import eulumdat, ies, tm25
 from bstcad.photometry.intensity import Luminaire, checked
+from bstcad.photometry.ray_set import RaySet
+from bstcad.scene import lamp
 from bstcad.scene.errors import SceneError
 
 
@@ -112,3 +117,97 @@ def test_a_target_of_directions_is_changed_and_written(scene, tmp_path):
             scene.changed({"target": wanted | {"intensity": file, key: value}})
     with pytest.raises(SceneError, match=r"^target\.x: a corner of the target is more than 180 degrees"):
         scene.changed({"target": wanted | {"text": "L", "x": [-150.0, 150.0], "y": [-150.0, 150.0]}})
+
+
+def rays_of(n=3000, up=True):
+    """Rays of a disc of 2 mm into a cone about the axis."""
+    chance = np.random.default_rng(3)
+    radius, turn = np.sqrt(chance.random(n)), 2 * np.pi * chance.random(n)
+    start = np.stack([radius * np.cos(turn), radius * np.sin(turn), 0 * turn], 1)
+    direction = np.hstack([0.3 * chance.standard_normal((n, 2)), np.full((n, 1), 1.0 if up else -1.0)])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    power = np.full(n, 50.0 / n, np.float32)
+    return RaySet(start.astype(np.float32), direction.astype(np.float32), power, "lm")
+
+
+@pytest.fixture
+def ray_scene(tmp_path):
+    (tmp_path / "led.tm25ray").write_bytes(tm25.write(rays_of(), Luminaire()))
+    source = {"kind": "point", "rays": str(tmp_path / "led.tm25ray"), "position": [0.0, 0.0, -20.0]}
+    return bstcad.load("templates/disk.toml").changed({"source": source, "target.uniform": True})
+
+
+def test_rays_give_size_flux_and_light_and_are_copied(ray_scene, tmp_path):
+    source = ray_scene.source
+    assert source.luminous_flux == pytest.approx(50.0, rel=1e-6)
+    assert source.extent.is_round and source.extent.radius == pytest.approx(1.0, rel=0.05)
+    assert source.emission_centre() == pytest.approx(
+        (0.0, 0.0, -20.0), abs=0.1
+    ) and "3000 rays of led.tm25ray" in source.words(0)
+    again = bstcad.load(saved(ray_scene, tmp_path / "copy"))
+    assert again == ray_scene and again.draw.largest_side == ray_scene.draw.largest_side
+    [one], [other] = (scene.draw(8, 5) for scene in (ray_scene, again))
+    assert np.array_equal(one.source.order.order, other.source.order.order) and one.source.part == other.source.part
+    assert ray_scene.changed({"source.lumens": 70.0}).source.luminous_flux == 70.0
+    assert not any("rays" in doubt for doubt in ray_scene.warnings())
+    (tmp_path / "other.tm25ray").write_bytes(tm25.write(rays_of(), Luminaire())[:12] + struct.pack("<f", 80.0)
+                                             + tm25.write(rays_of(), Luminaire())[16:])  # fmt: skip
+    scaled = ray_scene.changed({"source.rays": str(tmp_path / "other.tm25ray")})
+    assert scaled.source.luminous_flux == pytest.approx(80.0, rel=1e-6)
+    assert any(doubt.startswith("source.rays: The powers of the rays sum to 50 lm") for doubt in scaled.warnings())
+
+
+def test_a_default_of_the_effects_is_not_stated_by_a_saved_scene(ray_scene, tmp_path):
+    """Fresnel losses follow the flux, before and after saving, unless the scene states its effects."""
+    again = bstcad.load(saved(ray_scene, tmp_path / "copy"))
+    for scene in (ray_scene, again):
+        assert [effect.kind for effect in scene.effects] == ["fresnel"] and "effects" not in scene.toml()
+        assert scene.changed({"source": {"kind": "point"}}).effects == ()
+    stated = ray_scene.changed({"effects": []})
+    assert "effects = []" in stated.toml() and stated.effects == ()
+
+
+def test_a_lamp_whose_rays_start_at_a_point_has_a_preview(ray_scene, tmp_path):
+    rays = replace(rays_of(20_000), position=np.zeros((20_000, 3), np.float32))
+    (tmp_path / "point.tm25ray").write_bytes(tm25.write(rays, Luminaire()))
+    scene = ray_scene.changed({"source.rays": str(tmp_path / "point.tm25ray")})
+    assert scene.source.extent is None and scene.draw is not None
+    seen = preview(scene, PreviewSize(pixels=24, net=17, tubes=36, rounds=1, evaluations=2, blurred=1))
+    assert all(np.isfinite(picture).all() for pictures in seen.pictures for picture in pictures)
+
+
+def test_a_lamp_beside_the_lens_is_measured_and_not_refused():
+    beside = {"source.profile": "uniform", "source.half_angle": 5.0, "source.position": [50.0, 0.0, 0.0]}
+    bstcad.load("templates/disk.toml").changed(beside)
+
+
+def test_of_a_ray_file_too_large_for_a_copy_random_rays_are_copied(tmp_path, monkeypatch):
+    path = tmp_path / "big.tm25ray"
+    path.write_bytes(tm25.write(rays_of(), Luminaire()))
+    monkeypatch.setattr("bstcad.scene.lamp.MAX_RAYS_SIZE", 1000)
+    monkeypatch.setattr("bstcad.scene.lamp.COPIED_RAYS", 1500)
+    found = lamp.read_rays(path)
+    assert len(found.rays) == 1500 and found.lumens == pytest.approx(50.0, rel=1e-3) and len(found.data) < 90_000
+    assert found.name == "rays-big.tm25ray" and "1500 random ones" in found.remarks[0]
+    again = pickle.loads(pickle.dumps(found))
+    assert again == found and len(pickle.dumps(found)) < 1.1 * len(found.data)
+    assert np.array_equal(again.rays.power, found.rays.power)
+
+
+def test_wrong_rays_are_refused(ray_scene, tmp_path):
+    (tmp_path / "short.tm25ray").write_bytes(tm25.write(rays_of(), Luminaire())[:-1000])
+    (tmp_path / "down.tm25ray").write_bytes(tm25.write(rays_of(up=False), Luminaire()))
+    (tmp_path / "few.tm25ray").write_bytes(tm25.write(rays_of(20), Luminaire()))
+    (tmp_path / "blue.tm25ray").write_bytes(tm25.write(replace(rays_of(), wavelength=450.0), Luminaire()))
+    with pytest.raises(SceneError, match=r"^source\.wavelength: the file of the rays states"):
+        ray_scene.changed({"source.rays": str(tmp_path / "blue.tm25ray"), "source.wavelength": 650.0})
+    faults = {
+        "short": "states 3000 rays .* not complete", "down": "has no ray along", "no": "cannot be",
+        "few": "has 20 rays, .* at least 1000",
+    }  # fmt: skip
+    for name, fault in faults.items():
+        with pytest.raises(SceneError, match=rf"^source\.rays: '.*{name}.tm25ray' {fault}"):
+            ray_scene.changed({"source.rays": str(tmp_path / f"{name}.tm25ray")})
+    for key, value in (("real_diameter", 2.0), ("diameter", 1.0), ("half_angle", 20.0)):
+        with pytest.raises(SceneError, match=rf"^source\.{key}: the source also has rays"):
+            ray_scene.changed({f"source.{key}": value})

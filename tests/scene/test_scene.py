@@ -16,6 +16,7 @@ from bstcad.optics.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.surfaces import Plane, Recess, Sphere
 from bstcad.optics.trace import ghost_light
 from bstcad.report.record import simulated
+from bstcad.scene.accept import Accept
 from bstcad.scene.beam import Collimated
 from bstcad.scene.blank import Back, LensBlank, PlaneFront, SphereFront
 from bstcad.scene.errors import SceneError, line_of, toml_positions
@@ -23,7 +24,7 @@ from bstcad.scene.lamp import Point
 from bstcad.scene.mount import LENS_COLOUR, MIRROR_COLOUR, Box, Part, Round
 from bstcad.scene.picture import Picture
 from bstcad.scene.quality import PRESETS, VERIFICATION_POINTS, Tailoring, coarse_to_fine
-from bstcad.scene.scene import Accept, Scene, load
+from bstcad.scene.scene import Scene, load
 from bstcad.scene.target import Target
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
@@ -45,8 +46,8 @@ def photo(tmp_path):
 def through_its_file(scene, folder):
     """The scene as it loads from its own file, beside its picture."""
     folder.mkdir(exist_ok=True)
-    if scene.target.image is not None:
-        (folder / scene.target.image.name).write_bytes(scene.target.image.data)
+    for name, file in scene.files.items():
+        (folder / name).write_bytes(file.copy)
     (folder / "scene.toml").write_text(scene.toml(), encoding="utf-8")
     return load(folder / "scene.toml")
 

@@ -34,7 +34,7 @@ def lens_of(m=97, back=65):
 
 
 def traced(source, lens, q):
-    rays = source.rays(q[0], q[1], lens.entrance.z, 1.0)
+    rays = source.rays_through(q[0], q[1], lens.entrance.z, 1.0)
     for interface in lens.unbounded().interfaces:
         rays = behind(rays, interface)
     return [screen.plane.land(rays).position for screen in SCREENS]
@@ -84,8 +84,8 @@ def test_where_rays_cross_in_the_glass_the_back_gets_no_ripple():
     m = 97
     front = surface(0.0, lambda x, y: 0.004 * (x * x + y * y) + 0.25 * torch.cos(x / 0.8) * torch.cos(y / 0.8), m)
     lens = Lens(front, lens_of().back, Rectangle(22.0, 22.0), 1.5, shaped=(0, 1))
-    within = behind(BEAM.rays(*torch.meshgrid(*[torch.linspace(-6, 6, 97).double()] * 2, indexing="ij"), 0.0, 1.0),
-                    lens.unbounded().interfaces[0])  # fmt: skip
+    places = torch.meshgrid(*[torch.linspace(-6, 6, 97).double()] * 2, indexing="ij")
+    within = behind(BEAM.rays_through(*places, 0.0, 1.0), lens.unbounded().interfaces[0])
     there = within.position[:2] + (12.0 - within.above(0.0)) * within.direction[:2] / within.direction[2]
     assert bool((torch.linalg.det(jacobian(there, 0.125)) < 0).any())  # they do cross
     along, _ = along_light(BEAM, lens, GOALS)

@@ -38,7 +38,7 @@ def test_wanted_slopes_are_snells_law_inverted(source, front, plane):
     """Slopes measured on a traced lens are the ones wanted for where its rays land."""
     lens = Lens(front, surface(17, 1.0, 0.4), SQUARE, 1.488)
     x, y = sampling.grid(Rectangle(11.0, 11.0), 15)
-    rays = source.rays(x, y, front.z, 1.0)
+    rays = source.rays_through(x, y, front.z, 1.0)
     landed = trace(rays, lens, plane)
     at_face, z_x, z_y = intersect(lens.back, to_first_net(rays, lens), SQUARE, Status.VIGNETTED)
     assert landed.alive.all()
@@ -53,7 +53,7 @@ def test_an_aim_that_no_face_can_reach_turns_the_ray_as_far_as_one_can(index, re
     """Never reflected, never steeper than it may be, towards the aim, and as far as it goes where that is the limit."""
     x, y = torch.meshgrid(*[torch.linspace(-3.0, 3.0, 7, dtype=torch.float64)] * 2, indexing="ij")
     lens = Lens(Plane(8.0), net(m=5), SQUARE, index)
-    in_glass = to_first_net(Collimated(Circle(8.0)).rays(x, y, 8.0, 1.0), lens)
+    in_glass = to_first_net(Collimated(Circle(8.0)).rays_through(x, y, 8.0, 1.0), lens)
     at_face, _, _ = intersect(lens.back, in_glass, SQUARE, Status.VIGNETTED)
     aim = torch.stack([torch.full_like(x, reach), torch.full_like(x, -0.2 * reach)])
     z_x, z_y = wanted_slopes(at_face, aim, LevelPlane(500.0), Refract(index, 1.0))
@@ -91,7 +91,7 @@ def test_tailor_to_aim_lands_where_a_surface_can():
     """A stretched grid, near the axis: the map is a gradient but for the finite throw, so a surface follows it."""
     source, lens = Collimated(Circle(8.0)), Lens(Plane(8.0), net(m=33), SQUARE, 1.488)
     x, y = sampling.grid(Rectangle(16.0, 16.0), 66)
-    rays, screen = source.rays(x, y, 8.0, 1.0), LevelPlane(1000.0)
+    rays, screen = source.rays_through(x, y, 8.0, 1.0), LevelPlane(1000.0)
     aim = torch.stack([4 * x, 3 * y])
     lens = tailor_to_aim(lens, rays, aim, screen, 4)
     miss = float(mean_square_miss(trace(rays, lens, screen), aim).sqrt())

@@ -101,7 +101,7 @@ def traced(setup: Setup, amounts: dict[str, torch.Tensor]) -> torch.Tensor:
     lens, screen, source = setup.lens, setup.screen, setup.channels[0].source
     flux = tubes.launch_tubes(source, lens, TUBES).flux
     corners = tubes._sheet(source, lens, TUBES).rows(tubes.ALL)
-    rays = moved(source.rays(*corners, lens.entrance.z, 1.0), setup.pivot("source"), amounts, "source")
+    rays = moved(source.rays_through(*corners, lens.entrance.z, 1.0), setup.pivot("source"), amounts, "source")
     rays = moved(rays, setup.pivot("lens"), amounts, "lens", back=True)
     lens = made(setup, amounts)
     for interface in lens.interfaces:

@@ -21,7 +21,7 @@ from bstcad.cad import step_reading
 from bstcad.folder import read_nominal
 from bstcad.optics import measure
 from bstcad.optics.measure import Effort, Light
-from bstcad.scene.scene import Accept
+from bstcad.scene.accept import Accept
 from bstcad.verify import checks, step_checks
 from bstcad.verify.checks import Check
 from bstcad.verify.verdict import verdict

@@ -116,7 +116,7 @@ def independent(source, lens, around, screen, count=1 << 17):
     window = Rectangle(7.0, 6.4)  # no rim is wider
     points = SobolEngine(2, scramble=True, seed=5).draw(count, dtype=torch.float64) - 0.5
     x, y = points[:, 0] * window.width, points[:, 1] * window.height
-    rays = source.rays(x, y, lens.front.z, window.area / count)
+    rays = source.rays_through(x, y, lens.front.z, window.area / count)
     flux = rays.flux.numpy().copy()
     for interface, polygon in zip(lens.unbounded().interfaces, around, strict=True):
         rays = cross(rays, interface).rays

@@ -39,7 +39,7 @@ def test_landings_and_their_gradient(scene, dtype):
     source, front, outline, fates = SCENES[scene]
     lens = Lens(front, deep(dtype=dtype), outline, 1.6)
     x, y = stratified(Rectangle(23.0, 23.0), 90, 0, dtype)
-    in_glass = trace.to_first_net(source.rays(x, y, 15.0, 1.0), lens)
+    in_glass = trace.to_first_net(source.rays_through(x, y, 15.0, 1.0), lens)
     z, weight = LevelPlane(400.0), uniform((2, *x.shape), 1)
     results = []
     for form, kind in ((trace.from_first_net, dtype), (from_first_net_plain, torch.float64)):
@@ -67,8 +67,8 @@ def test_a_grid_of_rays_is_traced_as_its_rays_are(scene):
     source, front, outline, fates = SCENES[scene]
     lens, z = Lens(front, deep(), outline, 1.6), LevelPlane(400.0)
     x, y = torch.meshgrid(*(torch.linspace(-11.5, 11.5, n, dtype=torch.float64) for n in (70, 300)), indexing="ij")
-    grid = trace.to_first_net(source.rays(x, y, 15.0, 1.0), lens)
-    listed = trace.to_first_net(source.rays(x.reshape(-1), y.reshape(-1), 15.0, 1.0), lens)
+    grid = trace.to_first_net(source.rays_through(x, y, 15.0, 1.0), lens)
+    listed = trace.to_first_net(source.rays_through(x.reshape(-1), y.reshape(-1), 15.0, 1.0), lens)
     one, other = trace.from_first_net(grid, lens, z), trace.from_first_net(listed, lens, z)
     assert torch.equal(one.status.reshape(-1), other.status) and set(other.status.unique().tolist()) == fates
     error = (one.position.reshape(2, -1) - other.position).abs() / (1 + other.position.abs())
@@ -81,7 +81,7 @@ def test_a_beam_meets_a_front_that_reaches_beyond_where_it_begins():
     lens = Lens(front, deep(), Rectangle(20.0, 20.0), 1.6, shaped=(0, 1))
     beam = Collimated(Rectangle(17.0, 17.0))
     x, y = stratified(Rectangle(17.0, 17.0), 60, 0)
-    rays, interface = beam.rays(x, y, 15.0, 1.0), lens.interfaces[0]
+    rays, interface = beam.rays_through(x, y, 15.0, 1.0), lens.interfaces[0]
     assert float(front.sag_and_slope(x, y)[0].min()) < rays.z - 5.0
     fused, plain = trace.behind(rays, interface), trace.across(rays, (interface,))
     assert fused.alive.all() and torch.equal(fused.status, plain.status)
@@ -114,7 +114,7 @@ def test_the_gradient_in_the_rays_is_that_of_the_plain_form(name, plane):
     """Positions and directions before the face, landings and flux behind it; lost rays have none."""
     lens, source = NETS[name]
     x, y = stratified(Rectangle(23.0, 23.0), 60, 0)
-    coming = trace.to_first_net(source.rays(x, y, lens.entrance.z, 1.0), lens)
+    coming = trace.to_first_net(source.rays_through(x, y, lens.entrance.z, 1.0), lens)
     weight, gradients, landings = uniform((2, *x.shape), 1), [], []
     for form in (trace.from_first_net_to_each, from_first_net_to_each_plain):
         leaves = [t.detach().clone().requires_grad_() for t in (lens.back.heights, coming.position, coming.direction)]
@@ -141,7 +141,7 @@ def test_the_gradient_in_the_rays_is_finite_differences():
     """The kernel's adjoint against the kernel's values."""
     lens = lens_of(deep(m=7, depth=1.0))
     x, y = stratified(Rectangle(12.0, 12.0), 5, 0)
-    coming = trace.to_first_net(Point().rays(x, y, 15.0, 1.0), lens)
+    coming = trace.to_first_net(Point().rays_through(x, y, 15.0, 1.0), lens)
 
     def landing(position, direction):
         return trace.from_first_net(
@@ -158,7 +158,7 @@ def test_a_ray_of_no_number_is_lost_alone(form, source, name):
     """An index made from it must not be out of range: on a GPU that would end the whole process."""
     lens = Lens(Plane(15.0), deep(), Rectangle(20.0, 20.0), 1.5)
     x, y = sampling.grid(Rectangle(10.0, 10.0), 4)
-    in_glass = trace.to_first_net(source.rays(x, y, 15.0, 1.0), lens)
+    in_glass = trace.to_first_net(source.rays_through(x, y, 15.0, 1.0), lens)
     wrong = getattr(in_glass, name).clone()
     wrong[:, 2, 1] = torch.nan
     landed = form(replace(in_glass, **{name: wrong}), lens, LevelPlane(400.0))

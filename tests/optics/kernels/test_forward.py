@@ -105,7 +105,7 @@ def test_each_ray_ends_as_in_the_plain_form(name, plane):
     """Against `to_first_net` and `from_first_net_plain`: not another fused kernel; all fates occur."""
     source, lens, fates = SCENES[name]
     x, y = (p.reshape(-1) for p in stratified(Rectangle(23.0, 23.0), 150, 0))  # not a multiple of a block
-    rays = source.rays(x, y, lens.entrance.z, 1.0)
+    rays = source.rays_through(x, y, lens.entrance.z, 1.0)
     plain = from_first_net_plain(trace.to_first_net(rays, lens), lens, plane)
     found = land(source, lens, plane, x, y)
     rtol = 1e-13 if source.tilted else 1e-14  # exp(-80) of a number whose last digits differ
@@ -167,8 +167,8 @@ class Unknown(Emitter):
     def irradiance(self, x, y, z):
         return self.other.irradiance(x, y, z)
 
-    def rays(self, x, y, z, area):
-        return self.other.rays(x, y, z, area)
+    def rays_through(self, x, y, z, area):
+        return self.other.rays_through(x, y, z, area)
 
     def window(self, outline, z, sags):
         return self.other.window(outline, z, sags)

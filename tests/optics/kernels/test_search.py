@@ -46,7 +46,7 @@ def test_rays_meet_the_points_to_the_tolerance():
     source, lens = Point((1.0, -2.0, 10.0)), deep(Sphere(15.0, 0.05), depth=2.0)
     x, y = tubes.corners(Circle(8.0), 57)
     p, q, rays = tubes.rays_to(source, lens, x, y)
-    coming = to_first_net(source.rays(p, q, lens.front.z, 1.0), lens.unbounded())
+    coming = to_first_net(source.rays_through(p, q, lens.front.z, 1.0), lens.unbounded())
     far = (lens.back.z + rays.position[2] - coming.above(0.0)) / coming.direction[2]
     met = coming.position[:2] + far * coming.direction[:2]
     assert bool(rays.alive.all())
