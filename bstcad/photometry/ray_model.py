@@ -247,7 +247,8 @@ def line_numbers(rays: RaySet) -> tuple[tuple[float, ...], np.ndarray]:
     counts = np.bincount(number)
     if len(counts) > MAX_LINES or counts.min() < RAYS_PER_LINE:
         least = max(RAYS_PER_LINE, math.ceil(count / MAX_LINES))
-        number = ((np.cumsum(counts) - counts) // least)[number]  # by the rays of shorter wavelengths
+        shorter = np.cumsum(counts) - counts  # number of rays of shorter wavelengths
+        number = (shorter // least)[number]
         counts = np.bincount(number)
         kept = [int(line) for line in np.flatnonzero(counts >= RAYS_PER_LINE)] or [0]
         nearest = np.array([min((abs(one - line), one) for one in kept)[1] for line in range(len(counts))])
