@@ -189,7 +189,8 @@ def read_rays(path: Path) -> RayFile:
     except PhotometricError as fault:
         raise ValueError(f"{path.name!r} {fault}") from None
     except OSError as error:
-        raise ValueError(f"{str(path)!r} cannot be read ({error}); give a path relative to the scene file") from None
+        why = f"cannot be read ({error.strerror})"
+        raise ValueError(f"{str(path)!r} {why}; give a path relative to the scene file") from None
 
 
 @functools.lru_cache(maxsize=1)  # a page reads the scene at each change, and a file may take seconds
