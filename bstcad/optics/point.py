@@ -16,10 +16,11 @@ from bstcad.optics.emitters import PROFILE_NAMES, Emitter, LumensKey, OneOrTwo, 
 from bstcad.optics.kernels.records import Beam
 from bstcad.optics.kernels.reductions import elementary
 from bstcad.optics.key import Key
+from bstcad.optics.measured_rays import MeasuredRays
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import EVERYWHERE, STRICT, Circle, Outline, Rectangle
 from bstcad.optics.profiles import MeasuredProfile, Profile, pair_of
-from bstcad.optics.ray_bundle import MeasuredRays, RayBundle
+from bstcad.optics.ray_bundle import RayBundle
 from bstcad.optics.rays import Frame, Rays, Vector, clocked, point_along, tilt_of
 from bstcad.optics.wavefront import path_from_sphere
 
@@ -101,7 +102,7 @@ class Point(Emitter):
         if self.rays is None:
             return self.position
         place = self.position
-        for part, axis in zip(self.rays.origin, self.file_axes(sense), strict=True):
+        for part, axis in zip(self.rays.facts.origin, self.file_axes(sense), strict=True):
             place = point_along(place, part, axis)
         return place
 
@@ -142,7 +143,7 @@ class Point(Emitter):
             others = {"profile": self.profile != "lambertian", "half_angle": self.half_angle is not None}
             if self.rays is not None:
                 others |= {key: getattr(self, key) is not None for key in ("intensity", *SIZE_KEYS, "real_diameter")}
-                if self.rays.lines and self.wavelength != Point.wavelength:
+                if self.rays.facts.lines and self.wavelength != Point.wavelength:
                     yield "wavelength: the file of the rays states wavelengths of its own; remove this key"
             yield from (f"{key}: the source also has {kind}; remove one of them" for key in others if others[key])
         given = [name for name in ("width", "height") if getattr(self, name) is not None]
@@ -212,8 +213,8 @@ class Point(Emitter):
     @property
     def extent(self) -> Outline | None:
         """Emitting disc or rectangle (mm); None: a point."""
-        if self.rays is not None and self.rays.extent is not None:
-            return self.rays.extent
+        if self.rays is not None and self.rays.facts.extent is not None:
+            return self.rays.facts.extent
         if self.diameter:
             return Circle(self.diameter / 2)
         return Rectangle(self.width or 0.0, self.height or 0.0) if self.width or self.height else None
@@ -239,12 +240,12 @@ class Point(Emitter):
     @property
     def lines(self) -> tuple[tuple[float, float], ...]:
         """(nm, fraction of the flux) of each spectral line; those of a file of rays, if it states wavelengths."""
-        return self.rays.lines if self.rays is not None and self.rays.lines else super().lines
+        return self.rays.facts.lines if self.rays is not None and self.rays.facts.lines else super().lines
 
     @property
     def main_wavelength(self) -> float:
         """Wavelength (nm) of the line with the largest weight."""
-        return self.rays.lines[0][0] if self.rays is not None and self.rays.lines else super().main_wavelength
+        return self.lines[0][0] if self.rays is not None and self.rays.facts.lines else super().main_wavelength
 
     def bundle(self, line: int, part: int = 0) -> RayBundle | None:
         """Return the rays of a spectral line, from one of the parts of the file; None: there is only a model."""

@@ -1,17 +1,13 @@
-"""Light of a file of rays: the rays, which a lens is judged by, and a model of them, for which it is tailored.
+"""Emitter whose rays are those of a file, by which a lens is judged.
 
-A bundle is an emitter whose rays are given, so that it has no irradiance on a plane in closed form.  Random numbers
-divide the rays among PARTS disjoint parts.  A part stands for the whole source: each set of rays of a measurement
-draws from its own part, so that the noise of the file itself is independent from set to set and biases no figure.
+Its rays are given, so that it has no irradiance on a plane in closed form.
 """
 
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -19,82 +15,11 @@ from torch import Tensor
 
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.lens import Lens
+from bstcad.optics.measured_rays import PARTS, RayOrder
 from bstcad.optics.outlines import Outline, Rectangle
-from bstcad.optics.profiles import MeasuredProfile
 from bstcad.optics.rays import Frame, Rays, Status, Vector
-from bstcad.optics.sampling import POINTS_PER_STRIP, hash_seed, jitter
+from bstcad.optics.sampling import POINTS_PER_STRIP
 from bstcad.optics.surfaces import Surface
-
-PARTS = 8  # number of disjoint parts, one for each set of rays of a measurement (measure.SETS)
-ORDER_SEED = 25  # seed of the random order of the rays
-
-
-class GivenRays(Protocol):
-    """Rays of a file, in its own coordinates; the light goes along +z."""
-
-    @property
-    def position(self) -> np.ndarray:
-        """Positions (n, 3), mm."""
-
-    @property
-    def direction(self) -> np.ndarray:
-        """Unit vectors (n, 3)."""
-
-    @property
-    def power(self) -> np.ndarray:
-        """Powers (n,), in any unit."""
-
-
-class MeasuredRays(MeasuredProfile):
-    """A file of rays, with a model: an even disc or rectangle of points, each with the radiant intensity `law`."""
-
-    @property
-    @abstractmethod
-    def extent(self) -> Outline | None:
-        """Emitting disc or rectangle (mm); None: a point."""
-
-    @property
-    @abstractmethod
-    def origin(self) -> Vector:
-        """Centre of the emitting area in the coordinates of the file (mm)."""
-
-    @property
-    @abstractmethod
-    def lines(self) -> tuple[tuple[float, float], ...]:
-        """(nm, fraction of the flux) of each spectral line, the main line first; (): the file states no wavelength."""
-
-    @abstractmethod
-    def scaled(self, share: float) -> MeasuredRays:
-        """Return the model with its extent multiplied by `share`."""
-
-    def rays_of(self, line: int) -> RayOrder | None:
-        """Return the rays of a spectral line in random order; None: a model alone."""
-        return None
-
-
-@dataclass(frozen=True, eq=False)
-class RayOrder:
-    """Rays of a file in random order, so that each run of neighbours is a random sample of them."""
-
-    rays: GivenRays
-    order: np.ndarray  # (n,) numbers of the rays
-
-    @classmethod
-    def of(cls, rays: GivenRays, chosen: np.ndarray | None = None) -> RayOrder:
-        """Return rays in random order; chosen: numbers of those rays that count (default: all)."""
-        numbers = np.arange(len(rays.power)) if chosen is None else chosen
-        chance, _ = jitter(hash_seed(ORDER_SEED), numbers)
-        key = (chance * 2.0**32).astype(np.uint64) << np.uint64(32) | numbers.astype(np.uint64)
-        return cls(rays, (np.sort(key) & np.uint64(0xFFFFFFFF)).astype(np.uint32))  # faster than np.argsort
-
-    def sample(self, part: int, count: int, seed: int) -> np.ndarray:
-        """Return the numbers of `count` random rays of one of the PARTS parts; all of its rays if it has no more."""
-        own = self.order[part % PARTS :: PARTS]
-        if count >= len(own):
-            return own
-        (start,), _ = jitter(hash_seed(seed), np.zeros(1, np.int64))
-        first = int(start * len(own))
-        return np.concatenate([own[first : first + count], own[: max(first + count - len(own), 0)]])
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,9 +18,9 @@ from functools import partial
 
 import numpy as np
 
+from bstcad.optics.measured_rays import MeasuredRays, RayFacts
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.profiles import Net, Profile
-from bstcad.optics.ray_bundle import MeasuredRays
 from bstcad.optics.rays import Vector
 from bstcad.optics.sampling import hash_seed, jitter
 from bstcad.photometry.ray_set import RaySet
@@ -43,57 +43,29 @@ EDGE = 1.0 / SIDE  # margin of the half angle, in tan(θ / 2)
 class RayModel(MeasuredRays):
     """Model of a set of rays, with the wavelengths of the rays as lines."""
 
-    whole_law: Profile
-    area: Outline | None
-    middle: Vector
-    flux: float | None  # luminous flux of the file, lm
-    spectrum: tuple[tuple[float, float], ...]
-    largest_angle: float  # degrees
+    record: RayFacts
 
     @property
-    def law(self) -> Profile:
-        """Radiant intensity over stereographic coordinates."""
-        return self.whole_law
-
-    @property
-    def extent(self) -> Outline | None:
-        """Emitting disc or rectangle (mm); None: a point."""
-        return self.area
-
-    @property
-    def origin(self) -> Vector:
-        """Centre of the emitting area in the coordinates of the file (mm)."""
-        return self.middle
-
-    @property
-    def lines(self) -> tuple[tuple[float, float], ...]:
-        """(nm, fraction of the flux) of each spectral line."""
-        return self.spectrum
-
-    @property
-    def lumens(self) -> float | None:
-        """Luminous flux of the file (lm)."""
-        return self.flux
-
-    @property
-    def half_angle(self) -> float:
-        """Largest angle from the axis (degrees) with light."""
-        return self.largest_angle
+    def facts(self) -> RayFacts:
+        """Facts of the model."""
+        return self.record
 
     @property
     def words(self) -> str:
         """Size of the model in words."""
-        if self.area is None:
+        extent = self.facts.extent
+        if extent is None:
             return "a point"
-        a, b = self.area.half_extent
-        return f"a disc of {2 * a:.4g} mm" if self.area.is_round else f"a rectangle of {2 * a:.4g} × {2 * b:.4g} mm"
+        a, b = extent.half_extent
+        return f"a disc of {2 * a:.4g} mm" if extent.is_round else f"a rectangle of {2 * a:.4g} × {2 * b:.4g} mm"
 
     def scaled(self, share: float) -> RayModel:
         """Return the model with its extent multiplied by `share`; a scaled model has one wavelength, its channel's."""
         if share not in self._scaled:  # models are compared by identity
-            area = None if self.area is None or not share else self.area.scaled(share)
-            changed = (area, self.spectrum if share else ()) != (self.area, self.spectrum)
-            self._scaled[share] = replace(self, area=area, spectrum=self.spectrum if share else ()) if changed else self
+            extent, lines = self.facts.extent, self.facts.lines
+            smaller = None if extent is None or not share else extent.scaled(share), lines if share else ()
+            facts = replace(self.facts, extent=smaller[0], lines=smaller[1])
+            self._scaled[share] = RayModel(facts) if smaller != (extent, lines) else self
         return self._scaled[share]
 
     @functools.cached_property
@@ -116,7 +88,7 @@ def model_of(rays: RaySet) -> RayModel:
     area, middle = _emitting_area(position[ahead], direction[ahead], power[ahead])
     law, angle = _intensity(direction[ahead], power[ahead], float(power.sum()))
     lumens = rays.flux if rays.unit == "lm" else rays.stated_lumens
-    return RayModel(law, area, middle=middle, flux=lumens, spectrum=lines_of(rays), largest_angle=angle)
+    return RayModel(RayFacts(law, area, middle, lines=lines_of(rays), lumens=lumens, half_angle=angle))
 
 
 def _emitting_area(position: np.ndarray, direction: np.ndarray, power: np.ndarray) -> tuple[Outline | None, Vector]:

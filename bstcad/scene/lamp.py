@@ -13,10 +13,9 @@ import numpy as np
 
 from bstcad.optics import point
 from bstcad.optics.key import Key
-from bstcad.optics.outlines import STRICT, Outline
+from bstcad.optics.measured_rays import MeasuredRays, RayFacts, RayOrder
+from bstcad.optics.outlines import STRICT
 from bstcad.optics.profiles import MeasuredProfile, Net, Profile
-from bstcad.optics.ray_bundle import MeasuredRays, RayOrder
-from bstcad.optics.rays import Vector
 from bstcad.photometry import intensity_files, ray_files, tm25
 from bstcad.photometry.intensity import Intensity, Luminaire, PhotometricError
 from bstcad.photometry.ray_model import RayModel, model_of, rays_of_lines
@@ -118,39 +117,14 @@ class RayFile(FileContent, MeasuredRays):
             raise ValueError(f"{self.shown!r} {fault}") from None
 
     @property
+    def facts(self) -> RayFacts:
+        """Facts of the model."""
+        return self.model.facts
+
+    @property
     def shown(self) -> str:
         """Name of the file for messages, without the prefix of its copy."""
         return shown(self.name)
-
-    @property
-    def law(self) -> Profile:
-        """Radiant intensity of the model."""
-        return self.model.law
-
-    @property
-    def extent(self) -> Outline | None:
-        """Emitting disc or rectangle (mm) of the model."""
-        return self.model.extent
-
-    @property
-    def origin(self) -> Vector:
-        """Centre of the emitting area in the coordinates of the file (mm)."""
-        return self.model.origin
-
-    @property
-    def lines(self) -> tuple[tuple[float, float], ...]:
-        """(nm, fraction of the flux) of each spectral line."""
-        return self.model.lines
-
-    @property
-    def lumens(self) -> float | None:
-        """Luminous flux of the file (lm); None: it states a radiant flux."""
-        return self.model.lumens
-
-    @property
-    def half_angle(self) -> float:
-        """Largest angle from the axis (degrees) with light."""
-        return self.model.half_angle
 
     @property
     def words(self) -> str:

@@ -10,9 +10,10 @@ from bstcad.optics.channels import Channel, Draw, drawn_channels, given_channels
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure
+from bstcad.optics.measured_rays import PARTS, MeasuredRays, RayOrder
 from bstcad.optics.outlines import Circle
 from bstcad.optics.point import Point
-from bstcad.optics.ray_bundle import PARTS, MeasuredRays, RayBundle, RayOrder, fates
+from bstcad.optics.ray_bundle import RayBundle, fates
 from bstcad.optics.rays import Status
 from bstcad.optics.surfaces import Plane
 from bstcad.optics.trace import launch_strips, simulate
@@ -31,12 +32,7 @@ class Given(MeasuredRays):
         self.rays, self.model = rays, model or model_of(rays)
         self.order = RayOrder.of(rays)
 
-    law = property(lambda self: self.model.law)
-    extent = property(lambda self: self.model.extent)
-    origin = property(lambda self: self.model.origin)
-    lines = property(lambda self: self.model.lines)
-    lumens = property(lambda self: self.model.lumens)
-    half_angle = property(lambda self: self.model.half_angle)
+    facts = property(lambda self: self.model.facts)
     words = "rays of a test"
 
     def scaled(self, share):
@@ -116,7 +112,7 @@ def test_rays_and_their_model_light_a_tilted_plane_alike(sense):
     start = np.tile([0.4, -0.7, 0.3], (n, 1)) - direction * chance.random((n, 1))
     lamp = Given(ray_set(start, direction))
     point = Point((1.0, 2.0, 0.0), 550.0, rays=lamp, tilt=(8.0, -5.0), rotate=35.0)
-    assert np.allclose(lamp.origin, (0.4, -0.7, 0.3), atol=1e-4) and lamp.extent is None
+    assert np.allclose(lamp.facts.origin, (0.4, -0.7, 0.3), atol=1e-4) and lamp.facts.extent is None
     z = 20.0 * sense
     lens = Lens(Plane(z), Plane(z + 3.0), Circle(100.0), 1.5)
     if sense < 0:

@@ -43,14 +43,14 @@ def test_the_emitting_area_is_found_though_rays_start_elsewhere_on_their_lines(s
     direction = lambertian(chance)
     start = np.hstack([place, np.zeros((N, 1))]) + [0.3, -0.2, 0.5]
     model = model_of(rays(start + 20.0 * direction, direction))
-    assert model.origin == pytest.approx((0.3, -0.2, 0.5), abs=0.01)
+    assert model.facts.origin == pytest.approx((0.3, -0.2, 0.5), abs=0.01)
     if shape == "disc":
-        assert isinstance(model.extent, Circle) and model.extent.radius == pytest.approx(0.8, rel=0.01)
+        assert isinstance(model.facts.extent, Circle) and model.facts.extent.radius == pytest.approx(0.8, rel=0.01)
     elif shape == "rectangle":
-        assert isinstance(model.extent, Rectangle)
-        assert (model.extent.width, model.extent.height) == pytest.approx((1.0, 0.4), rel=0.02)
+        assert isinstance(model.facts.extent, Rectangle)
+        assert (model.facts.extent.width, model.facts.extent.height) == pytest.approx((1.0, 0.4), rel=0.02)
     else:
-        assert model.extent is None or max(model.extent.half_extent) < 1e-4  # float32 at 20 mm
+        assert model.facts.extent is None or max(model.facts.extent.half_extent) < 1e-4  # float32 at 20 mm
 
 
 def test_a_lambertian_intensity_is_taken_round_and_is_the_cosine_within_a_per_cent():
