@@ -29,6 +29,7 @@ WIDTHS = {  # keys that a profile needs, by (kind of the source, profile)
     ("point", "gaussian"): ("half_angle_1e2",),
     ("point", "uniform"): ("half_angle",),
 }
+PAIRS = ("radius_1e2", "half_angle_1e2", "divergence")  # keys of a source that may have two values, which rotate turns
 ORDER, DARK_CENTRE = 10.0, 0.25  # order of a super-Gaussian, and radius of a dark centre / lens width, when chosen
 PICTURE_KEYS = ("rotate", "fit", "seen_from", "sample")  # keys whose choices are not tried: each try reads a photo
 
@@ -103,7 +104,8 @@ def _profile_widths(data: Mapping[str, Any], profile: Any) -> dict[str, Any]:
     wanted = WIDTHS.get((kind, profile), ()) if isinstance(profile, str) else ()
     known = {name for (of, _), names in WIDTHS.items() if of == kind for name in names}
     changes: dict[str, Any] = {f"source.{name}": None for name in sorted(known - {*wanted}) if name in source}
-    if "rotate" in source and not isinstance(source.get("radius_1e2", source.get("half_angle_1e2")), list):
+    pairs = (name for name in PAIRS if isinstance(source.get(name), list) and f"source.{name}" not in changes)
+    if "rotate" in source and not any(pairs):
         changes["source.rotate"] = None
     for name in wanted:
         if name not in source and (made := _width(data, source, name)) is not None:

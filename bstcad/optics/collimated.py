@@ -18,7 +18,7 @@ from bstcad.optics.key import Key
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle
 from bstcad.optics.profiles import GAUSSIAN, MeasuredProfile, Profile, pair_of
-from bstcad.optics.rays import Rays, tilt_of
+from bstcad.optics.rays import Rays, clocked, tilt_of
 
 WIDTHS_BEFORE_LENS = 4.0  # distance of aperture and lens for a rotated beam without z, in diagonals of the aperture
 ProfileName = Literal["uniform", "gaussian", "super_gaussian", "annular"]
@@ -31,12 +31,14 @@ class Collimated(Emitter):
 
     uniform: constant.  gaussian: ∝ exp(-2 r² / radius_1e2²), or with two radii (w_x, w_y) ∝ exp(-2 q), q = x² / w_x² +
     y² / w_y².  super_gaussian: ∝ exp(-2 q^(order / 2)).  annular: constant outside inner_radius.  `rotate` turns the
-    profile about the centre, from x towards y.  A record with a `law` (profiles.Profile) is a measured irradiance.
+    profile and the divergence about the axis, from x towards y.  A record with a `law` (profiles.Profile) is a measured
+    irradiance.
 
     With a tilt the rays go along n = (n_x, n_y, n_z) (rays.axes).  On another plane the light is shifted by
     (n_x, n_y) / n_z times the distance, and its irradiance on planes z = const is unchanged.  With a divergence the
     rays have all directions of a cone about the axis, at equal radiance: the flux through the plane is uniform in
-    (d_x, d_y), whose range for a half angle α is an ellipse about cos α (n_x, n_y).
+    (d_x, d_y), whose range for a half angle α is an ellipse about cos α (n_x, n_y).  Two divergences are full angles of
+    an elliptical cone along e_x and e_y, with sines sin α_x and sin α_y and the mean cosine (cos α_x + cos α_y) / 2.
     """
 
     aperture: Annotated[Outline, Key("Beam outline about source.centre.", example={"shape": "circle", "radius": 12.0})]
@@ -52,7 +54,9 @@ class Collimated(Emitter):
         tuple[float, float] | None, Key("Centre of aperture and profile.", "mm", -1e8, 1e8, example=[2.0, 0.0])
     ] = None
     tilt: TiltKey = None
-    divergence: Annotated[float | None, Key("Full angle of the cone of rays, simulated.", "degrees", 0.0, 179.0)] = None
+    divergence: Annotated[
+        OneOrTwo | None, Key("Full angle of the cone of rays, simulated; two: along x, along y.", "degrees", 0.0, 179.0)
+    ] = None
     real_divergence: Annotated[
         float | None, Key("Full divergence angle of the real lamp, for estimates only.", "degrees", 0.0, 179.0)
     ] = None
@@ -63,7 +67,7 @@ class Collimated(Emitter):
         float | None, Key("Radius of the dark centre of an annular profile.", "mm", 1e-3, 1e6, example=3.0)
     ] = None
     rotate: Annotated[
-        float | None, Key("Rotation of the profile about its centre, from x towards y.", "degrees", -180.0, 180.0)
+        float | None, Key("Rotation of profile and divergence, from x towards y.", "degrees", -180.0, 180.0)
     ] = None
     lumens: LumensKey = None
     kind: Annotated[Literal["collimated"], Key("Parallel light.")] = "collimated"
@@ -86,13 +90,14 @@ class Collimated(Emitter):
         elif self.law is not None and not self.law.flux(self.aperture) > 0:
             yield "profile: the beam has no light inside source.aperture; move it, or widen the aperture"
         lean = math.degrees(math.acos(max(-1.0, min(1.0, self.axes[2][2]))))
-        if not lean + (self.divergence or 0.0) / 2 < MAX_INCLINATION:
-            key, light = ("divergence", "a part of the light") if self.divergence else ("tilt", "the light")
+        if not lean + max(self.half_angles) < MAX_INCLINATION:
+            key, light = ("divergence", "a part of the light") if self.extent else ("tilt", "the light")
             yield f"{key}: {light} is inclined to the axis by {MAX_INCLINATION:g} degrees or more; reduce the {key}"
 
     def words(self, origin: float) -> str:
         """Return profile, divergence and aperture for a data sheet."""
-        spread = f"divergence {self.divergence:.4g}°, " if self.divergence else ""
+        angles = " × ".join(f"{2 * half:.4g}°" for half in dict.fromkeys(self.half_angles))
+        spread = f"divergence {angles}, " if self.extent else ""
         return f"parallel light, {self.profile_words}, {spread}{self.aperture.words.replace(' x ', ' × ')}"
 
     @property
@@ -105,15 +110,15 @@ class Collimated(Emitter):
             name += f" {' × '.join(f'{w:.4g}' for w in self.radius_1e2)} mm"
         return name + (f", rotated by {self.rotate:.4g}°" if self.rotate else "")
 
-    def sizes(self) -> Iterator[tuple[str, float, str]]:
+    def sizes(self) -> Iterator[tuple[str, OneOrTwo, str]]:
         """Yield the divergence, if there is one."""
-        if self.divergence:
+        if self.divergence and self.extent:
             yield "divergence", self.divergence, "degrees"
 
     @property
     def is_rotation_invariant(self) -> bool:
-        """True if aperture and profile are round; the cone of directions always is."""
-        return self.aperture.is_round and (self.law is None or self.law.is_round)
+        """True if aperture, profile and cone of directions are round."""
+        return self.aperture.is_round and not self.can_rotate
 
     def moved(self, motion: Motion, entrance: float) -> Collimated:
         """Return the simple beam after a motion; entrance: z of the plane through the first vertex (mm).
@@ -133,9 +138,18 @@ class Collimated(Emitter):
         return replace(self, z=z, centre=centre, tilt=tilt_of(normal))
 
     @property
+    def half_angles(self) -> tuple[float, float]:
+        """Half angles (degrees) of the cone along x and y of the beam, which `rotate` turns; 0: parallel."""
+        along_x, along_y = pair_of(self.divergence or 0.0)
+        return along_x / 2, along_y / 2
+
+    @property
     def extent(self) -> Circle | None:
-        """Disc that the cone fills in the direction cosines along e_x and e_y; None: all rays are parallel."""
-        return Circle(math.sin(math.radians(self.divergence / 2))) if self.divergence else None
+        """Disc of the direction cosines along e_x and e_y; None: all rays are parallel.
+
+        Its radius is the sine of the larger half angle.  `element` compresses the disc to the ellipse of two angles.
+        """
+        return Circle(math.sin(math.radians(max(self.half_angles)))) if any(self.half_angles) else None
 
     @property
     def central(self) -> Collimated:
@@ -144,20 +158,33 @@ class Collimated(Emitter):
 
     def scaled(self, share: float) -> Collimated:
         """Return the beam with its divergence multiplied by `share`."""
-        return replace(self, divergence=share * self.divergence if share and self.divergence else None)
+        if not (share and self.divergence):
+            return replace(self, divergence=None)
+        along_x, along_y = (share * angle for angle in pair_of(self.divergence))
+        return replace(self, divergence=(along_x, along_y) if isinstance(self.divergence, tuple) else along_x)
 
     def element(self, u: float, v: float) -> Collimated:
-        """Return the beam at (u, v) of the extent: d_x and d_y from cos α n + u e_x + v e_y, and d_z from |d| = 1."""
-        e_x, e_y, n = self.axes
-        cos = math.cos(math.radians((self.divergence or 0.0) / 2))
+        """Return the beam at (u, v) of the extent: d_x and d_y from cos α n + u e_x + v e_y, and d_z from |d| = 1.
+
+        For two half angles, u and v are multiplied by sin α_x and sin α_y over the larger of them, e_x and e_y are
+        turned by `rotate`, and cos α is the mean of both cosines.
+        """
+        frame, angles = self.axes, [math.radians(half) for half in self.half_angles]
+        if angles[0] != angles[1]:
+            largest = math.sin(max(angles))
+            u, v = (part * math.sin(angle) / largest for part, angle in zip((u, v), angles, strict=True))
+            frame = clocked(frame, self.rotate or 0.0)
+        e_x, e_y, n = frame
+        cos = (math.cos(angles[0]) + math.cos(angles[1])) / 2
         d_x, d_y = (cos * n[i] + u * e_x[i] + v * e_y[i] for i in (0, 1))
         direction = d_x, d_y, math.sqrt(max(1 - d_x * d_x - d_y * d_y, 0.0))
         return replace(self, divergence=None, tilt=tilt_of(direction))
 
     @property
     def can_rotate(self) -> bool:
-        """True if the profile is not round."""
-        return self.law is not None and not self.law.is_round
+        """True if the profile or the cone of directions is not round."""
+        is_round = self.law is None or self.law.is_round  # reads a measured profile
+        return not is_round or self.half_angles[0] != self.half_angles[1]
 
     @property
     def law(self) -> Profile | None:

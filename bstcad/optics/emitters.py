@@ -155,8 +155,8 @@ class Emitter(ABC):
         """Return kind, position, profile and sizes for a data sheet; origin: z (mm) from which the sheet measures."""
         return "a custom source"
 
-    def sizes(self) -> Iterator[tuple[str, float, str]]:
-        """Yield (key, size, unit) for each key that defines the extent."""
+    def sizes(self) -> Iterator[tuple[str, OneOrTwo, str]]:
+        """Yield (key, size, unit) for each key that defines the extent; size: a number, or two along x and y."""
         yield from ()
 
     @property

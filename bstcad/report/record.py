@@ -383,7 +383,9 @@ def simulated(scene: Scene) -> Rows:
 
 def extent(source: Emitter) -> Iterator[tuple[str, str]]:
     """Yield the keys that give a source a size, each with the size in words."""
-    yield from ((key, f"{size:g} {unit}") for key, size, unit in source.sizes())
+    for key, size, unit in source.sizes():
+        values = f"[{size[0]:g}, {size[1]:g}]" if isinstance(size, tuple) else f"{size:g}"
+        yield key, f"{values} {unit}"
 
 
 # --- remarks ----------------------------------------------------------------------------------------------------------

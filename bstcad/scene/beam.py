@@ -242,5 +242,9 @@ class Collimated(collimated.Collimated):
         OneOrTwoWidths | None,
         Key("Radius at which the profile is 1/e² of its peak; two: along x, along y.", "mm", 1e-3, 1e6, example=8.0),
     ] = None
+    divergence: Annotated[
+        OneOrTwoWidths | None,
+        Key("Full angle of the cone of rays, simulated; two: along x, along y.", "degrees", 0.0, 179.0, example=0.53),
+    ] = None
 
     __pydantic_config__ = STRICT

@@ -23,6 +23,7 @@ from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
+from bstcad.optics.profiles import pair_of
 from bstcad.optics.sides import as_pair
 from bstcad.report.record import DesignCourse, LeftOut
 from bstcad.scene.effects import Absorption, Effect, Fresnel, Ghost, find_effect, losses, reflection_of
@@ -177,8 +178,8 @@ def band(scene: Scene) -> tuple[float, float]:
     """Return the band (low, high), nm, assumed for one wavelength: VISIBLE_BAND for sunlight, else LINE_WIDTH wide."""
     source = scene.source
     if isinstance(source, Collimated):
-        divergence = source.divergence or source.real_divergence or 0.0
-        if SUN_ANGLES[0] <= divergence <= SUN_ANGLES[1]:
+        divergences = pair_of(source.divergence or source.real_divergence or 0.0)
+        if all(SUN_ANGLES[0] <= divergence <= SUN_ANGLES[1] for divergence in divergences):
             return VISIBLE_BAND
     return source.main_wavelength - LINE_WIDTH / 2, source.main_wavelength + LINE_WIDTH / 2
 

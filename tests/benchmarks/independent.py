@@ -133,7 +133,7 @@ class Light(NamedTuple):
     aperture: np.ndarray  # (2,) half extents (mm); of a circle both its radius
     round_extent: bool
     extent: np.ndarray  # (2,) half extents of the source: mm of a point source, direction cosines of a parallel beam
-    cone: float  # cosine of the half divergence
+    cone: float  # cosine of the half divergence; the mean of two
 
 
 class Around(NamedTuple):
@@ -316,8 +316,8 @@ def light_of(source, sense, vertex):
         z = source.get("z")
         place = np.array([*(source.get("centre") or (0.0, 0.0)), vertex if z is None else z])
         if source.get("divergence"):
-            half = math.radians(source["divergence"] / 2)
-            extent, cone = np.full(2, math.sin(half)), math.cos(half)
+            half = np.radians(np.broadcast_to(source["divergence"], 2) / 2)
+            extent, cone = np.sin(half), np.cos(half).mean()
     else:
         place = np.array(source["position"], float)
         if profile == 1:
@@ -333,8 +333,12 @@ def light_of(source, sense, vertex):
             extent = np.full(2, source["diameter"] / 2)
         elif source.get("width") or source.get("height"):
             extent, round_extent = np.array([source.get("width") or 0.0, source.get("height") or 0.0]) / 2, False
+    axes = turned(source.get("tilt"))
+    if parallel:
+        turn = math.radians(source.get("rotate") or 0.0)
+        axes[:2] = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]]) @ axes[:2]
     return Light(
-        parallel, place, turned(source.get("tilt")), sense, profile, width, peak, round_aperture, aperture,
+        parallel, place, axes, sense, profile, width, peak, round_aperture, aperture,
         round_extent, extent, cone,
     )  # fmt: skip
 

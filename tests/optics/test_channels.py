@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bstcad.optics.channels import Channel, channels_of, merge_wavelengths, source_numbers
+from bstcad.optics.channels import Channel, channels_of, drawn_channels, merge_wavelengths, source_numbers
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.outlines import Circle
 from bstcad.optics.point import Point
@@ -83,6 +83,31 @@ def test_directions_of_a_cone_carry_the_flux_of_one_radiance(tilt):
     flux = w[:, None] * d[..., 2]
     wanted = (flux[..., None] * d).sum((0, 1)) / flux.sum()
     np.testing.assert_allclose(found.mean(0), wanted, atol=2e-4)
+
+
+@pytest.mark.parametrize("turn", [None, 35.0])
+def test_directions_of_two_divergences_fill_an_ellipse_evenly(turn):
+    """Second moments of an even ellipse, sin² α / 4 along its axes and 0 between them; a quarter of it, a quarter."""
+    source = replace(SUN, divergence=(6.0, 2.0), rotate=turn)
+    wide = np.sin(np.radians([3.0, 1.0]))
+    cos, sin = np.cos(np.radians(turn or 0.0)), np.sin(np.radians(turn or 0.0))
+    own = np.array([[cos, sin], [-sin, cos]])  # rows: axes of the ellipse
+    for channels in (channels_of(source, index, 512), drawn_channels(source, index, 512, 3)):
+        found = np.array([c.source.axes[2][:2] for c in channels]) @ own.T / wide
+        assert (np.hypot(*found.T) <= 1 + 1e-6).all()
+        np.testing.assert_allclose(found.T @ found / len(found), np.eye(2) / 4, atol=4e-3)
+        assert np.mean(np.hypot(*found.T) < 0.5) == pytest.approx(0.25, abs=0.01)
+    assert source.half_angles == (3.0, 1.0) and not source.is_rotation_invariant and source.can_rotate
+
+
+@pytest.mark.parametrize("tilt", [None, (10.0, 60.0)], ids=str)
+def test_two_equal_divergences_are_one_to_the_last_bit(tilt):
+    one = replace(SUN, divergence=3.0, tilt=tilt, profile="gaussian", radius_1e2=(4.0, 2.0), rotate=20.0)
+    pair = replace(one, divergence=(3.0, 3.0))
+    assert channels_of(one, index, 64) == channels_of(pair, index, 64)
+    assert drawn_channels(one, index, 64, 5) == drawn_channels(pair, index, 64, 5)
+    assert channels_of(one.scaled(0.4), index, 64) == channels_of(pair.scaled(0.4), index, 64)
+    assert replace(one, divergence=(0.0, 0.0)).extent is None
 
 
 def test_each_line_has_its_share_of_points_in_pairs():

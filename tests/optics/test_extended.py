@@ -107,6 +107,17 @@ def test_the_suns_image_through_a_plate_is_as_wide_as_its_angle_times_the_throw(
         assert 2 * math.sqrt(one - other) == pytest.approx(wide, rel=2e-3)  # a disc of radius R has R² / 4
 
 
+def test_the_image_of_two_divergences_has_both_widths():
+    """The sun's image, stretched: along each axis the radius is that axis's sin α (L + t / n)."""
+    lens, source = plate(), Collimated(Circle(1.0), divergence=(4.0, 1.0))
+    half = 1.2 * (1.0 + math.sin(math.radians(2.0)) * 305)
+    screen = Screen(306.0, (-half, half), (-half, half), (200, 200))
+    alone = moments([Channel(source.central, 1.5)], lens, screen)
+    found = moments(channels_of(source, lambda nm: 1.5, 64), lens, screen)
+    wide = [math.sin(math.radians(a)) * (300.0 + 4.0 / 1.5) for a in (2.0, 0.5)]
+    assert [2 * math.sqrt(a - b) for a, b in zip(found, alone, strict=True)] == pytest.approx(wide, rel=2e-3)
+
+
 @pytest.mark.parametrize("tilt", [None, (0.0, 40.0)], ids=str)
 def test_a_disc_behind_a_pinhole_makes_its_own_image(tilt):
     """A camera obscura: the disc's image upside down, as large as the distances say.

@@ -66,6 +66,7 @@ def test_a_template_is_the_same_scene_once_resolved_and_changed_in_nothing(templ
 KEPT = [
     (THU, {"source.wavelength": RGB}, "source.wavelength", ((486.1, 1.0), (587.6, 2.0), (656.3, 1.0))),
     (THU, {"source.divergence": "0.53"}, "source.divergence", 0.53),
+    (THU, {"source.divergence": "[0.5, 0.2]", "source.rotate": "30"}, "source.divergence", (0.5, 0.2)),
     (THU, {"source.tilt": "[3.0, -2.0]", "source.z": "-50"}, "source.tilt", (3.0, -2.0)),
     (THU, {"source.centre": "[1.0, 0.5]"}, "source.centre", (1.0, 0.5)),
     (DISK, {"source.width": "1", "source.height": "0"}, "source.height", 0.0),

@@ -35,6 +35,7 @@ SOURCES = {
     "line": replace(CHIP, height=None),
     "tilted": replace(CHIP, tilt=(0.0, 8.0)),
     "sun": Collimated(Circle(8.0), divergence=2.5),
+    "two divergences": Collimated(Circle(8.0), divergence=(2.5, 1.0), rotate=30.0),
 }
 
 

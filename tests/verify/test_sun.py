@@ -3,6 +3,7 @@
 import json
 import math
 
+import numpy as np
 import pytest
 
 from bstcad import cli
@@ -16,17 +17,21 @@ SMALL = {
 SUN = math.radians(0.53) / 2  # angular radius of the sun (rad)
 
 
-@pytest.fixture(scope="module")
-def plate(tmp_path_factory):
+def plate_of(settings, folder):
     """A plate of 40 x 30 mm that throws letters on a wall 200 mm behind it: its folder."""
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
         verify_with(patch, quick_effort())
-        patch.chdir(tmp_path_factory.mktemp("sun"))
+        patch.chdir(folder)
         assert cli.run(["new", "plate", "--light", "sun", "--size", "40x30", "--distance", "200"]) == 0
-        settings = [part for key, value in SMALL.items() for part in ("--set", f"{key}={value}")]
-        assert cli.run(["generate", "plate.toml", "--quality", "draft", "-o", "plate", *settings]) in (0, 1)
-        yield (tmp_path_factory.getbasetemp() / "sun0" / "plate").resolve()
+        words = [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]
+        assert cli.run(["generate", "plate.toml", "--quality", "draft", "-o", "plate", *words]) in (0, 1)
+        return (folder / "plate").resolve()
+
+
+@pytest.fixture(scope="module")
+def plate(tmp_path_factory):
+    return plate_of(SMALL, tmp_path_factory.mktemp("sun"))
 
 
 def test_the_stated_rrmsd_is_that_of_rays_from_the_sun(plate):
@@ -47,3 +52,18 @@ def test_the_finest_detail_is_the_image_of_the_sun(plate):
     page = (plate / "report.html").read_text(encoding="utf-8")
     assert "Finest detail on the target" in page
     assert "it would be 1.7 mm with the target 100 mm instead of 200 mm from the lens" in page
+
+
+def test_the_light_of_two_divergences_is_that_of_rays(tmp_path):
+    """An ellipse of directions, turned by 30 degrees: RRMSD and picture; exchanged axes have another picture."""
+    folder = plate_of(SMALL | {"source.divergence": "[1.6, 0.4]", "source.rotate": 30}, tmp_path)
+    report, text = json.loads((folder / "report.json").read_text()), (folder / "scene.toml").read_text(encoding="utf-8")
+    judged, light = judge(folder, points=1 << 15), np.load(folder / "design.npz")["irradiance"].astype(float)
+    assert report["rrmsd"] == pytest.approx(judged.rrmsd, rel=0.03)
+    assert report["finest_detail"]["of"] == "source.divergence = [1.6, 0.4] degrees"
+    mean = math.hypot(1.6, 0.4) / math.sqrt(2)  # full angle of the disc of the same variance
+    assert report["finest_detail"]["source_image"] == pytest.approx(400 * math.tan(math.radians(mean / 2)), rel=0.03)
+    (folder / "scene.toml").write_text(text.replace("rotate = 30.0", "rotate = -60.0"), encoding="utf-8")
+    own, other = (part.picture / part.picture.mean() for part in (judged, judge(folder, points=1 << 14)))
+    light /= light.mean()
+    assert np.sqrt(((own - light) ** 2).mean()) < 0.1 < 0.5 < np.sqrt(((other - light) ** 2).mean())
