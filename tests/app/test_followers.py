@@ -1,5 +1,6 @@
 """Keys that follow another one: what a person would draw, nothing in silence, and nothing after a wrong entry."""
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -85,6 +86,16 @@ def test_a_choice_that_is_offered_is_possible_or_told_why_not(name, monkeypatch)
     usual["mirror"] = {"lens.front.kind": {"bspline"}}
     usual["led"] = {"effects[0].kind": {"own"}}
     assert {key: {*choices} for key, choices in greyed.items()} == usual.get(name, {})
+
+
+def test_two_divergences_keep_their_rotation():
+    """`rotate` stays while a pair is left that it turns, and goes with the last one."""
+    turned = PLATES["sun"].replace("divergence = 0.53", "divergence = [0.5, 0.2]\nrotate = 20.0")
+    assert tomllib.loads(take(turned, "source.profile", "gaussian")[0])["source"]["rotate"] == 20.0
+    round_cone = PLATES["laser"].replace('profile = "gaussian"', 'profile = "gaussian"\nrotate = 20.0')
+    round_cone = re.sub(r"radius_1e2 = [\d.]+", "radius_1e2 = [20.0, 9.0]", round_cone)
+    assert tomllib.loads(round_cone)["source"]["rotate"] == 20.0
+    assert "rotate" not in tomllib.loads(take(round_cone, "source.profile", "uniform")[0])["source"]
 
 
 def test_a_circle_takes_the_beam_with_it():
