@@ -66,11 +66,11 @@ def beam(**more):
 
 
 def measured(chosen):
-    """The picture of a beam, brighter to a side, that is wider than every rim."""
+    """The picture of a beam of two colours, brighter to a side, that is wider than every rim."""
     x, y = np.meshgrid(np.linspace(-15, 15, 64), np.linspace(15, -15, 64))
     light = np.exp(-2 * (x**2 + y**2) / 11.0**2) * (1 + 0.02 * x)
     profile = {"image": light, "width": 30.0, "origin": "picture"}
-    return beam()(chosen) | {"source.profile": profile}
+    return beam(wavelength=[[486.1, 1.0], [656.3, 1.0]])(chosen) | {"source.profile": profile}
 
 
 def lamp(**more):
@@ -182,11 +182,9 @@ def front(**more):
 CHOICES = {
     "light": {
         "laser": beam(),
-        "Gaussian beam": beam(profile="gaussian", radius_1e2=[9.0, 7.0], rotate=20.0),
+        "tilted Gaussian beam": beam(profile="gaussian", radius_1e2=[9.0, 7.0], rotate=20.0, tilt=[2.0, -3.0]),
         "measured beam": measured,
-        "tilted beam": beam(tilt=[2.0, -3.0]),
         "sun": beam(divergence=0.53),
-        "point": lamp(),
         "cone": lamp(profile="uniform", half_angle=12.0, lumens=100.0),
         "intensity file": lamp(
             intensity=IntensityFile("lamp.csv", b"g,0,90,180,270\n0,9,9,9,9\n20,8,7,6,7\n60,0,0,0,0\n")
@@ -194,7 +192,6 @@ CHOICES = {
         "ray file": lamp(rays=ray_file()),
         "round LED": lamp(diameter=1.0),
         "chip": lamp(width=1.0, height=0.5),
-        "spectrum": beam(wavelength=[[486.1, 1.0], [656.3, 1.0]]),
     },
     "rim": dict.fromkeys(SIZES, lambda chosen: {"lens.outline": rim(chosen)}),
     "wall": {
@@ -214,7 +211,6 @@ CHOICES = {
     },
     "front": {
         "plane": front(kind="plane"),
-        "sphere": front(kind="sphere", curvature=0.005),
         "free sphere": front(kind="sphere", optimise=True),
         "conic": front(kind="conic", curvature=0.005, conic_constant=-1.0),
         "toroid": front(kind="toroid", curvature_x=0.005, curvature_y=-0.003),
