@@ -184,7 +184,7 @@ CHOICES = {
         "laser": beam(),
         "tilted Gaussian beam": beam(profile="gaussian", radius_1e2=[9.0, 7.0], rotate=20.0, tilt=[2.0, -3.0]),
         "measured beam": measured,
-        "sun": beam(divergence=0.53),
+        "sun": beam(divergence=[0.53, 0.2], rotate=30.0),
         "cone": lamp(profile="uniform", half_angle=12.0, lumens=100.0),
         "intensity file": lamp(
             intensity=IntensityFile("lamp.csv", b"g,0,90,180,270\n0,9,9,9,9\n20,8,7,6,7\n60,0,0,0,0\n")
