@@ -35,7 +35,8 @@ NAMES = {
 TINY = 1e-30
 DRAWN_WIDTHS = 3.0  # distance at which directions are drawn, in widths of the lens
 MAX_VALUES = 1 << 22  # number of solid angles that are computed at a time
-NODES = 4  # Gauss-Legendre nodes per side of a cell, for its solid angle
+FINE_CELL = 1.0  # largest side (degrees) of a fine cell
+FINE_NODES, NODES = 2, 4  # Gauss-Legendre nodes per side of a fine cell, to 1e-10, and of other cells
 
 Angles = Literal["C", "A", "B"]
 
@@ -129,27 +130,24 @@ class Directions(Receiver):
 
     def areas(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray | None:
         """Return the solid angles of (rows, columns) cells of ranges x, y, divided by their mean; row 0 is y max."""
-        return _areas(self, x, y, shape=shape)
+        cells = _mean_densities(self, x, y, shape=shape)
+        return cells[::-1] / cells.mean()
 
     def cell_sizes(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray:
         """Return the solid angles (sr) of (rows, columns) cells of ranges x, y; row 0 is y max."""
         (rows, columns), width, height = shape, math.radians(x[1] - x[0]), math.radians(y[1] - y[0])
-        return self._mean_densities(x, y, shape=shape)[::-1] * (width * height / (rows * columns))
+        return _mean_densities(self, x, y, shape=shape)[::-1] * (width * height / (rows * columns))
 
-    def computed_areas(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray:
-        """Return `areas`, computed anew."""
-        cells = self._mean_densities(x, y, shape=shape)
-        return cells[::-1] / cells.mean()
-
-    def _mean_densities(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray:
+    def mean_densities(self, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray:
         """Return the mean solid angle per dx dy of (rows, columns) cells, a few rows at a time; row 0 is y min."""
         rows, columns = shape
-        node, weight = np.polynomial.legendre.leggauss(NODES)
+        fine = max((x[1] - x[0]) / columns, (y[1] - y[0]) / rows) <= FINE_CELL
+        node, weight = np.polynomial.legendre.leggauss(FINE_NODES if fine else NODES)
         at_x, at_y = (
             np.radians(low + (np.arange(n)[:, None] + (node + 1) / 2) * (high - low) / n)
             for (low, high), n in ((x, columns), (y, rows))
         )
-        cells, strip = np.empty(shape), max(MAX_VALUES // (columns * NODES**2), 1)
+        cells, strip = np.empty(shape), max(MAX_VALUES // (columns * len(node) ** 2), 1)
         for first in range(0, rows, strip):
             density = self._density(at_x[None, None], at_y[first : first + strip, :, None, None])
             cells[first : first + strip] = (density * (weight[:, None, None] * weight / 4)).sum((1, 3))
@@ -164,5 +162,7 @@ class Directions(Receiver):
 
 
 @functools.lru_cache(maxsize=4)
-def _areas(receiver: Directions, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]) -> np.ndarray:
-    return receiver.computed_areas(x, y, shape)
+def _mean_densities(
+    receiver: Directions, x: tuple[float, float], y: tuple[float, float], shape: tuple[int, int]
+) -> np.ndarray:
+    return receiver.mean_densities(x, y, shape)

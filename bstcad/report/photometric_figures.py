@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bstcad.analysis.far_field import FarField, grid_of
+from bstcad.analysis.far_field import RAYS, FarField, grid_of
 from bstcad.optics.directions import Directions
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Light
@@ -29,7 +29,11 @@ LEVELS = 0.05, 0.1, 0.2, 0.4, 0.6, 0.8  # levels of contour lines, as fractions 
 LINES = f"Lines: {', '.join(f'{100 * level:g}' for level in LEVELS)} % of the largest value."
 DARK = 0.01  # fraction of the largest intensity below which a direction is not drawn
 SECTORS = 15.0, 30.0, 60.0, 90.0  # half angles of a polar diagram (degrees); the smallest with all light is drawn
+# Rays per side for the diagrams of a point source: the noise is about a thousandth of the largest intensity.
+POINT_SOURCE_RAYS = 1024
 POLAR_POINTS, MAP_POINTS = 721, 301  # samples of a curve over γ, and of an isocandela diagram along each axis
+MAP_SIDE, MAP_LEFT, MAP_BOTTOM = 4.2, 0.95, 0.8  # side of an isocandela diagram, and its position in the figure, inches
+SCALE_GAP, SCALE_WIDTH = 0.2, 0.21  # distance of its colour scale, and width of the scale, inches
 HEIGHTS = 1.0, 2.0, 3.0, 4.0, 5.0  # distances from the lens in a cone diagram, m
 PARTS_OF_PEAK = (("half", 0.5, BLUE), ("tenth", 0.1, GREEN))  # beam edges: name, fraction of the peak, colour
 LAMP_LIKE = 0.5  # smallest intensity on the axis of a lamp with a beam about it, as a fraction of the largest
@@ -63,7 +67,7 @@ def draw_far_field(far: FarField, lens: Lens, view: View) -> dict[str, bytes]:
 
     view: its coordinates are those of the isocandela diagram if it is over directions.
     """
-    table = far.table(lens)
+    table = far.table(lens, rays=POINT_SOURCE_RAYS if far.draw is None else RAYS)
     if not table.candela.any():
         return {}
     known = far.lumens is not None
@@ -157,16 +161,25 @@ def isocandela_diagram(table: Intensity, view: View, *, known: bool) -> Figure:
     values, peak = table.at(*receiver.direction(x, y)), float(table.candela.max())
     ends = (-reach, reach)
     seen = View(ends, ends, view.seen_from, view.optic, folded=view.folded, receiver=receiver)
-    figure = new_figure(6.4, 5.2, layout="compressed")
-    axes = figure.subplots()
-    _contours(figure, axes, values, seen, label=f"luminous intensity ({unit_of(known)})", largest=peak)
+    figure = new_figure(6.8, 5.4, layout="none")
+    width, height = figure.get_size_inches()
+    axes, scale = (
+        figure.add_axes((left / width, MAP_BOTTOM / height, across / width, MAP_SIDE / height))
+        for left, across in ((MAP_LEFT, MAP_SIDE), (MAP_LEFT + MAP_SIDE + SCALE_GAP, SCALE_WIDTH))
+    )
+    _contours(figure, axes, values, seen, label=f"luminous intensity ({unit_of(known)})", largest=peak, scale=scale)
     axes.set_title(f"Lines of equal luminous intensity, {unit_of(known)}")
     seen.note(figure, f"\n{LINES}")
     return figure
 
 
-def _contours(figure: Figure, axes: Any, values: np.ndarray, view: View, *, label: str, largest: float) -> None:
-    """Draw values (rows, columns; row 0 is y max) in colours, with labelled lines at LEVELS times the largest value."""
+def _contours(
+    figure: Figure, axes: Any, values: np.ndarray, view: View, *, label: str, largest: float, scale: Any = None
+) -> None:
+    """Draw values (rows, columns; row 0 is y max) in colours, with labelled lines at LEVELS times the largest value.
+
+    scale: axes of the colour scale; None: they are placed beside the picture.
+    """
     image = draw_picture(axes, values, view, cmap=steps("cividis", 82), vmin=0.0, vmax=largest)
     rows, columns = values.shape
     (left, right), (low, high) = view.x, view.y
@@ -178,7 +191,7 @@ def _contours(figure: Figure, axes: Any, values: np.ndarray, view: View, *, labe
         lines = axes.contour(x, y, values, levels, colors=shades, linewidths=0.8)
         axes.clabel(lines, fmt=number, fontsize=7)
     axes.set(xlim=view.across, ylim=view.y, ylabel=view.labels[1], aspect="equal")
-    figure.colorbar(image, ax=axes, label=label)
+    figure.colorbar(image, ax=axes, cax=scale, label=label)
 
 
 @styled

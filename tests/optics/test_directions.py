@@ -12,7 +12,7 @@ import torch
 from bstcad.optics import sampling
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.directions import Directions
-from bstcad.optics.kernels.forward import land
+from bstcad.optics.kernels.forward import angle_by_sine, land
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Rays
 from bstcad.optics.surfaces import Sphere
@@ -54,6 +54,21 @@ def test_the_solid_angle_of_a_cell_is_the_area_of_its_directions(kind):
     one, other = d[1:, 1:] - d[:-1, :-1], d[1:, :-1] - d[:-1, 1:]
     area = np.linalg.norm(np.cross(one, other), axis=-1) / 2
     assert receiver.areas(x, y, shape) == pytest.approx(area / area.mean(), rel=2e-4)
+
+
+@pytest.mark.parametrize("kind, shape", [("C", (45, 45)), ("A", (60, 40)), ("B", (30, 90))])
+def test_the_solid_angles_of_fine_cells_sum_to_those_of_coarse_ones(kind, shape):
+    """Fine cells have fewer nodes; sr."""
+    receiver, x, y = Directions(kind), (-60.0, 30.0), (-10.0, 80.0)
+    rows, columns = shape
+    fine = receiver.cell_sizes(x, y, (4 * rows, 4 * columns)).reshape(rows, 4, columns, 4).sum((1, 3))
+    np.testing.assert_allclose(fine, receiver.cell_sizes(x, y, shape), rtol=1e-9)
+
+
+def test_the_angle_follows_from_its_sine_and_cosine_to_rounding():
+    """θ = sin θ · (θ / sin θ) from the axis, also close to it, to 90°; four units of the last place."""
+    for angle in (*np.linspace(0.0, math.pi / 2, 1001), 1e-9, 1e-5):
+        assert math.sin(angle) * angle_by_sine(math.cos(angle)) == pytest.approx(angle, rel=9e-16, abs=0.0)
 
 
 LENS = lens_of(wavy(m=17, depth=2.0, ripple=0.2, z=22.0, half=11.0), Sphere(15.0, -0.02), SQUARE, 1.5)

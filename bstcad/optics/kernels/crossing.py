@@ -231,22 +231,22 @@ def _add_tilted(faces, throw, tilted, g, status, first, count, work):
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _add_directions(tilted, g, status, first, count, work):
-    """Add ∂L/∂(direction behind the face) of rays that are collected by their directions (`forward.angles`).
+    """Add ∂L/∂(direction behind the face) of rays that are collected by their directions (`forward.to_directions`).
 
-    C: with r = hypot(x, y), s = θ / r and θ = atan2(r, z), ds = (dθ - s dr) / r and dθ = (z dr - r dz) / (r² + z²).
+    C: with r = hypot(x, y), s = θ / r and θ = atan2(r, z), ds = (dθ - s dr) / r and dθ = z dr - r dz.
     """
     n_z = tilted.n_z
-    if tilted.chart == 1:  # a loop of its own is vectorised
+    if tilted.chart == 1:
+        forward.angles_by_radius(E_X, E_Y, E_Z, n_z, count, work)
         for r in range(count):
-            at, ex, ey, ez = first + r, work[E_X + r], work[E_Y + r], n_z * work[E_Z + r]
+            at, ex, ey, ez, s = first + r, work[E_X + r], work[E_Y + r], n_z * work[E_Z + r], work[S + r]
             alive = status[at] == 0
             gx, gy = forward.DEGREES * g[0, at] if alive else 0.0, forward.DEGREES * g[1, at] if alive else 0.0
-            r2 = max(ex * ex + ey * ey, 1e-30)
-            s, along = forward.angle_by_radius(r2, ez), (gx * ex + gy * ey) / r2
-            by_radius = along * (ez / (r2 + ez * ez) - s)  # ∂L/∂r / r beside that of x and y
+            along = gx * ex + gy * ey
+            by_radius = along * (ez - s) / max(ex * ex + ey * ey, 1e-30)  # ∂L/∂r / r beside that of x and y
             work[G_DX + r] += s * gx + by_radius * ex
             work[G_DY + r] += s * gy + by_radius * ey
-            work[G_DZ + r] -= n_z * along * r2 / (r2 + ez * ez)
+            work[G_DZ + r] -= n_z * along
         return
     for r in range(count):
         at, ex, ey, ez = first + r, work[E_X + r], work[E_Y + r], n_z * work[E_Z + r]

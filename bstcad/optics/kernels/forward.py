@@ -196,63 +196,71 @@ def at_back(faces, count, work):
 
 
 DEGREES = 180.0 / math.pi
-# Coefficients of atan(t) / t in powers of t², by interpolation at Chebyshev points of t² in [0, 1], to 2e-16.  Loops
-# with this polynomial are vectorised, and take a fraction of the time of those with math.atan2.
-ARC_TANGENT = (
-    1.0, -0.333333333333307, 0.1999999999964796, -0.14285714266926733, 0.11111110578002083, -0.09090899793217341,
-    0.07692198997458294, -0.06665764910689723, 0.058768281144872724, -0.052374234719188166, 0.04668745304848529,
-    -0.040811247503178855, 0.03387126702700675, -0.02556862364437174, 0.01671959606350739, -0.00899108054265826,
-    0.003751138483965141, -0.0011252544302234645, 0.00021423810738603946, -1.93423475928923e-05,
+# Coefficients of θ / sin θ in powers of 1 - cos θ, by interpolation at Chebyshev points of [0, 1], to 6e-17.  All terms
+# have one sign up to rounding of the last ones.  A loop with this polynomial is vectorised and has no division.
+ANGLE_BY_SINE = (
+    1.0, 0.33333333333330945, 0.13333333333682526, 0.05714285694042784, 0.025396831596651948, 0.011543895604776996,
+    0.00532944828305169, 0.0024737607111697374, 0.001251083869870826, 0.00016421047913476515, 0.0017011133906985544,
+    -0.003976427223224787, 0.009195329684833449, -0.01586170544127971, 0.02153400343586953, -0.022454256450108755,
+    0.01773831596916336, -0.01025927464062151, 0.004114940516850556, -0.001025639660813829, 0.00012117305831116537,
 )  # fmt: skip
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def angle_by_radius(r2, z):
-    """Return θ / r, θ = atan2(r, z), of the components r = sqrt(r2) > 0 and z of a vector.
+def angle_by_sine(cosine):
+    """Return θ / sin θ of an angle θ from 0 to 90°; cosine: cos θ."""
+    c, u = ANGLE_BY_SINE, 1.0 - cosine  # two chains of products, since no loop over them is vectorised
+    w = u * u
+    even, odd = (c[20] * w + c[18]) * w + c[16], (c[19] * w + c[17]) * w + c[15]
+    even, odd = (even * w + c[14]) * w + c[12], (odd * w + c[13]) * w + c[11]
+    even, odd = (even * w + c[10]) * w + c[8], (odd * w + c[9]) * w + c[7]
+    even, odd = (even * w + c[6]) * w + c[4], (odd * w + c[5]) * w + c[3]
+    even, odd = (even * w + c[2]) * w + c[0], odd * w + c[1]
+    return odd * u + even
 
-    tan(θ / 2) = r / (n + z) with n its length, so that θ = 2 atan t for t = tan(θ / 2) <= 1, else π - 2 atan(1 / t).
+
+@njit(inline="always")
+def angles_by_radius(x, y, z, n_z, count, work):
+    """Store θ / r in S, θ = atan2(n_z z, r), r = hypot(x, y), of unit vectors whose components begin at x, y and z."""
+    backwards = 0
+    for r in range(count):
+        along = n_z * work[z + r]
+        work[S + r] = angle_by_sine(abs(along))
+        backwards += along < 0.0
+    if backwards > 0:
+        for r in range(count):
+            if n_z * work[z + r] < 0.0:
+                r2 = max(work[x + r] * work[x + r] + work[y + r] * work[y + r], 1e-30)
+                work[S + r] = math.pi / math.sqrt(r2) - work[S + r]
+
+
+@njit(inline="always")
+def _about_axis(one, other, at_one, at_other, n_z, count, work):
+    """Store the angles (degrees) of directions about an axis and from its normal plane, atan2(one, z) and asin(other).
+
+    With n = hypot(one, z), the cosine of the second angle, one / n and z / n are sine and cosine of the first.
     """
-    whole = math.sqrt(r2 + z * z) + z
-    w = r2 / max(whole * whole, 1e-300)
-    backwards = w > 1.0
-    w = 1.0 / w if backwards else w
-    c = ARC_TANGENT  # a chain of products, since no loop over them is vectorised
-    value = (c[19] * w + c[18]) * w + c[17]
-    value = (value * w + c[16]) * w + c[15]
-    value = (value * w + c[14]) * w + c[13]
-    value = (value * w + c[12]) * w + c[11]
-    value = (value * w + c[10]) * w + c[9]
-    value = (value * w + c[8]) * w + c[7]
-    value = (value * w + c[6]) * w + c[5]
-    value = (value * w + c[4]) * w + c[3]
-    value = (value * w + c[2]) * w + c[1]
-    value = value * w + c[0]
-    past = (math.pi - 2.0 * value * math.sqrt(w)) / math.sqrt(r2)
-    return past if backwards else 2.0 * value / whole
-
-
-@njit(error_model="numpy")
-def angles(chart, x, y, z):
-    """Return the coordinates (degrees) of a unit vector, as `Directions.coordinates` does."""
-    if chart == 1:
-        scale = DEGREES * angle_by_radius(max(x * x + y * y, 1e-30), z)
-        return scale * x, scale * y
-    if chart == 2:
-        return DEGREES * math.atan2(x, z), DEGREES * math.asin(min(max(y, -1.0), 1.0))
-    return DEGREES * math.asin(min(max(x, -1.0), 1.0)), DEGREES * math.atan2(y, z)
+    for r in range(count):
+        p, q, z = work[one + r], work[other + r], n_z * work[DZ + r]
+        n = math.sqrt(max(p * p + z * z, 1e-30))
+        angle = p / n * angle_by_sine(abs(z) / n)
+        beyond = (math.pi if p >= 0.0 else -math.pi) - angle
+        work[at_one + r] = DEGREES * (angle if z >= 0.0 else beyond)
+        work[at_other + r] = DEGREES * (q * angle_by_sine(n))
 
 
 @njit(error_model="numpy")
 def to_directions(tilted, count, work):
-    """Replace the places of rays by the coordinates of their directions."""
-    if tilted.chart == 1:  # a loop of its own is vectorised
+    """Replace the places of rays by the coordinates (degrees) of their directions (`Directions.coordinates`)."""
+    if tilted.chart == 1:
+        angles_by_radius(DX, DY, DZ, tilted.n_z, count, work)
         for r in range(count):
-            dx, dy, dz = work[DX + r], work[DY + r], tilted.n_z * work[DZ + r]
-            work[X + r], work[Y + r] = angles(1, dx, dy, dz)
-        return
-    for r in range(count):
-        dx, dy, dz = work[DX + r], work[DY + r], tilted.n_z * work[DZ + r]
-        work[X + r], work[Y + r] = angles(tilted.chart, dx, dy, dz)
+            scale = DEGREES * work[S + r]
+            work[X + r], work[Y + r] = scale * work[DX + r], scale * work[DY + r]
+    elif tilted.chart == 2:
+        _about_axis(DX, DY, X, Y, tilted.n_z, count, work)
+    else:
+        _about_axis(DY, DX, Y, X, tilted.n_z, count, work)
 
 
 @njit(error_model="numpy")
