@@ -129,6 +129,7 @@ class Design:
         The new design has no stages, history or transport map, and its report states "changed by hand".  SceneError
         names the property of a lens that does not fit.
         """
+        self.scene.lens.require_heights("with_lens")
         scene, lens = _adapted(lens, self._made.scene, self.lens.front)
         made = replace(self._made, scene=scene, lens=scene.as_mounted(lens), making=DesignCourse(stopped=BY_HAND))
         return Design(replace(made, transport=None, precision_comparison=None))
@@ -340,8 +341,8 @@ class Design:
         return f"<div>{lines}<br>{shown}</div>"
 
     def _dimensions(self) -> str:
-        lens, (x, y) = self.lens, (2 * half for half in self.scene.lens.outline.half_extent)
-        across = f"{x:g} mm across" if self.scene.lens.outline.is_round else f"{x:g} x {y:g} mm"
+        lens, (x, y) = self.lens, (2 * half for half in self.lens.plan.half_extent)
+        across = f"{x:.6g} mm across" if self.scene.lens.outline.is_round else f"{x:g} x {y:g} mm"
         axis = torch.zeros(1, dtype=torch.float64)
         thick = float(lens.back.sag_and_slope(axis, axis)[0] - lens.front.sag_and_slope(axis, axis)[0])
         glass = self.scene.lens.material or "glass"

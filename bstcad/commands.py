@@ -295,6 +295,8 @@ def verify(
         raise SceneError(f"{place}: -o is only for the report of a made part; give its points with --measured")
     with folders.amending(path, place) as amended:
         made = read(path)
+        if against or measured:
+            made.scene.lens.require_heights("--against" if against else "--measured")
         with scene_errors():  # reads the cloud first, since the next steps are slow
             cloud, part = clouds.load(measured, made.lens.apertures[1]) if measured else None, None
         with (options.drawing or Pictures)(made.scene, processes.submit) as drawn:
@@ -471,7 +473,9 @@ def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> Exp
 
 def _export(made: Made, kinds: Sequence[str], folder: Path, points: int | None = None) -> Exported:
     scene, lens = made.scene, made.lens
-    light = GridLight(scene.source.central, tuple(target.screen for target in scene.targets))
+    if kinds:
+        scene.lens.require_heights("export")
+    light = GridLight(scene.light.central, tuple(target.screen for target in scene.targets))
     far = far_field_of(scene)
     return exports.export(
         lens, kinds, folder, points=points, label=folders.label(scene), mount=scene.mount, light=light, far=far

@@ -30,6 +30,7 @@ from bstcad.cad.mesh import MIRROR_RGBA, Label
 from bstcad.optics import quadrature
 from bstcad.optics.bspline import DEGREE, BSplineSurface, is_net, knots
 from bstcad.optics.lens import Lens
+from bstcad.optics.radial import RadialSurface
 from bstcad.optics.sides import Sides, as_pair, scaled
 from bstcad.optics.surfaces import Surface
 from bstcad.report.prescription import scene_text
@@ -422,6 +423,9 @@ def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
         front = _surface(found["front_control_points"], blank.front.z)
     else:
         front = front.with_parameters(**{name.removeprefix("front_"): float(found[name]) for name in _numbers(front)})
+    if blank.dome is not None:
+        flat = scene.flat_lens(blank.back.net).with_front(front)
+        return flat.with_back(RadialSurface.like(flat.back, found["control_points"]))
     back = _surface(found["control_points"], blank.back.z)
     return scene.assembled(Lens(front, back, blank.outline, scene.index, own_passes=blank.passes))
 

@@ -188,7 +188,7 @@ def task_of(scene: Scene, goals: Sequence[Goal], knobs: ResolvedTailoring, edge:
     light = scene.with_source_scaled(0.0).channels()
     sizes = stage2.SOURCE_SIZES if scene.source.extent and knobs.method != "integration" else ()
     scaled = [scene.with_source_scaled(share) for share, _ in sizes]
-    sources = tuple(ExtendedSource(each.source, light, each.draw) for each in scaled if each.draw)
+    sources = tuple(ExtendedSource(each.light, light, each.draw) for each in scaled if each.draw)
     return Task(
         light, tuple(goals), knobs, min_thickness=scene.lens.min_thickness, bounds=scene.lens.bounds,
         free=scene.lens.front.free, rim_sags=scene.rim_sags, front_sides=scene.lens.front_net,
@@ -233,11 +233,13 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
     """
     if scene.lens.front.is_tailored:  # with two tailored faces `with_solution` finds the limits
         return None, None
+    if scene.lens.dome is not None:  # coarse maps take minutes, and a dome's light is judged in the report
+        return None, None
     channels = scene.with_source_scaled(0.0).channels()
     light = max(channels, key=lambda channel: channel.weight)  # channel of stage 1
     lens, grazing = light.through(scene.flat_lens(REACH_NET)), MAX_EXIT_ANGLE
     if refracts := lens.passes.largest_deflection(light.index) is not None:
-        grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.source, lens))
+        grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.light, lens))
     part = reachable(light.source, lens, goal, grazing=grazing)
     if part is not None and scene.lens.front.free:  # another front may send light further
         free, effort = scene.lens.front.free, stage1.FrontSearch(repeats=1)
@@ -489,7 +491,10 @@ def check_thickness(lens: Lens, scene: Scene) -> None:
             f"lens.front.z: the back that the target needs would cross the front by {-thinnest:.3g} mm; "
             f"lower lens.front.z by more than this, widen the target, or make the lens smaller"
         )
-    room, key = scene.clearance(reach := lens.front.z + thickest)
+    reach = lens.front.z + thickest
+    if scene.lens.dome is not None:
+        reach = lens.back.z + lens.back.sags(lens.outline)[1]
+    room, key = scene.clearance(reach)
     if not room > 0:
         raise SceneError(
             f"{key}: the back that the target needs would reach this position, as it extends to z = {reach:.4g} mm; "

@@ -229,18 +229,19 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
         for rays in launch_strips(channel.source, through, n, seed):
             rays = to_first_net(rays, through)
             for face in through.interfaces[through.freeform[0] : through.solid.stop]:
-                met, z_x, z_y = intersect(face.surface, rays, face.outline, face.status_if_missed)
+                met, normal = intersect(face.surface, rays, face.outline, face.status_if_missed)
+                n_x, n_y, n_z = normal
                 dx, dy, dz = met.direction
-                along = met.sense * (dz - dx * z_x - dy * z_y)
+                along = met.sense * (n_z * dz + n_x * dx + n_y * dy)
                 meets = met.alive & (met.flux > 0)
                 wrong += int((~torch.isfinite(met.position)).any(0)[meets].sum())
                 if bool(meets.any()):
                     slope = min(slope, float(along.abs()[meets].min()))
                 if bool(meets.any()) and face.law.eta > 1:
-                    cosine = (along / torch.sqrt(1 + z_x * z_x + z_y * z_y))[meets].clamp(-1.0, 1.0)
+                    cosine = (along / torch.sqrt(n_z * n_z + n_x * n_x + n_y * n_y))[meets].clamp(-1.0, 1.0)
                     critical = math.degrees(math.asin(1.0 / face.law.eta))
                     margin = min(margin, critical - float(torch.rad2deg(torch.arccos(cosine)).max()))
-                rays = deflect(met, z_x, z_y, face.law, level=face.surface.level).rays
+                rays = deflect(met, normal, face.law, level=face.surface.level).rays
             landed = screen.plane.land(across(rays, through.behind))
             wrong += int((~torch.isfinite(landed.position)).any(0)[landed.alive].sum())
     return Margins(None if math.isinf(margin) else margin, None if math.isinf(slope) else slope, wrong)
@@ -307,7 +308,7 @@ def finest_detail(source_image: float, lens: Lens, screen: Screen, of: str, assu
     """Return the finest detail on a target; source_image: diameter (pixels); of, assumed: as in FinestDetail."""
     distance, pixel = abs(image_from_lens(lens, screen).throw(lens.back.z)), _pixel(screen)
     grows = distance == abs(per_radian(lens, screen))  # False for an image over angles, which keeps its width
-    sizes = (*(2 * half for half in lens.outline.half_extent), *(high - low for low, high in (screen.x, screen.y)))
+    sizes = (*(2 * half for half in lens.plan.half_extent), *(high - low for low, high in (screen.x, screen.y)))
     nearer, image = MIN_DISTANCE_RATIO * max(sizes), source_image * pixel
     width, narrower = (detail_width(image * scale, pixel) for scale in (1.0, nearer / distance))
     gains = narrower < MAX_NEARER_RATIO * width and grows and not lens.behind

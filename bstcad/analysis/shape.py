@@ -16,10 +16,12 @@ import scipy.fft
 import torch
 from torch import Tensor
 
+from bstcad.analysis.dome_shape import extremes, radial_thickness
 from bstcad.optics.bspline import QUARTERS, BSplineSurface, span_points, weights
 from bstcad.optics.kernels import spline
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
+from bstcad.optics.radial import RadialSurface
 from bstcad.optics.sampling import sample_rim
 
 GRID_POINTS = 1025  # points per side of the grid for thickness, and along a quarter of the rim
@@ -36,6 +38,8 @@ def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
     grid: points per side.  A radius is None if the back has no such curvature.  Keys front_… describe a tailored front,
     which is seen from outside, as the back is: valleys are concave.
     """
+    if isinstance(lens.back, RadialSurface):
+        return _describe_dome(lens, lens.back, grid)
     x, y = _points(lens.outline, grid)
     front, back = _sags(lens, x, y)
     thickness, (front_vertex, back_vertex) = back - front, _sags(lens, *torch.zeros(2, 1, dtype=torch.float64))
@@ -49,6 +53,24 @@ def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
         "thickness_max": float(thickness.max()),
         **_face_figures(lens.back_net, survey(lens), (*flat, back)),
         **{f"front_{key}": value for key, value in of_front.items()},
+    }
+
+
+def _describe_dome(lens: Lens, back: RadialSurface, grid: int) -> dict[str, float | None]:
+    """Return the figures of `describe` for a dome; thicknesses are along lines from its centre."""
+    x, y = _points(lens.outline, grid)
+    axis = torch.zeros(1, dtype=torch.float64)
+    thickness, (middle,) = radial_thickness(lens.front, back, x, y), radial_thickness(lens.front, back, axis, axis)
+    edge, known = thickness[: 4 * grid], thickness.nan_to_num(math.inf)
+    position = back.at(x, y).position
+    points = position[0].numpy(), position[1].numpy(), position[2].numpy() + float(back.z)
+    return {
+        "centre_thickness": float(middle),
+        "edge_thickness_min": float(edge.nan_to_num(math.inf).min()),
+        "edge_thickness_max": float(edge.nan_to_num(-math.inf).max()),
+        "thickness_min": float(known.min()),
+        "thickness_max": float(thickness.nan_to_num(-math.inf).max()),
+        **_face_figures(back, survey(lens), points),
     }
 
 
@@ -70,7 +92,10 @@ def _face_figures(net: BSplineSurface, bends: Survey, points: tuple[np.ndarray, 
 
 
 def thickness_range(lens: Lens, edge: np.ndarray | None = None) -> tuple[float, float]:
-    """Return the minimum and maximum thickness along z (mm); edge: as in `heights`."""
+    """Return the minimum and maximum thickness (mm), along z or of a dome from its centre; edge: as in `heights`."""
+    if isinstance(lens.back, RadialSurface):
+        glass = radial_thickness(lens.front, lens.back, *_points(lens.outline, GRID_POINTS))
+        return float(glass.nan_to_num(math.inf).min()), float(glass.nan_to_num(-math.inf).max())
     front, back = heights(lens, edge)
     glass = back - front
     return float(glass.min()), float(glass.max())
@@ -81,6 +106,9 @@ def heights(lens: Lens, edge: np.ndarray | None = None) -> tuple[np.ndarray, np.
 
     edge: corners (n, 2) in mm of a polygon, once around, in place of the outline, for a lens that was cut smaller.
     """
+    if isinstance(lens.back, RadialSurface):
+        dome = lens.back.at(*_points(lens.outline, GRID_POINTS)).position[2].numpy() + float(lens.back.z)
+        return np.array([float(lens.front.around.z), float(lens.front.z)]), dome
     return _sags(lens, *(_points(lens.outline, GRID_POINTS) if edge is None else _points_in(edge)))
 
 
@@ -240,6 +268,13 @@ def survey(lens: Lens, concave: float | None = None, convex: float | None = None
     """Find the extremes of the back; concave, convex: smallest radii (mm), slope: largest angle (degrees) allowed."""
     lens = lens.plain()
     back = lens.back_net
+    if isinstance(back, RadialSurface):
+        bends = extremes(lens, back)
+        valley, ridge, steep = (
+            Extreme(value, f"at ({', '.join(f'{p:.4g}' for p in place)}) mm", 0.0)
+            for value, place in (bends.valley, bends.ridge, bends.slope)
+        )
+        return Survey(_radius(valley), _radius(ridge), steep)
     x, y, along_x, along_y = _grid(back)
     valleys, ridges = (math.inf if radius is None else AT_BOUND * (1 / radius) for radius in (concave, convex))
     near = (valleys, ridges, math.inf if slope is None else AT_BOUND * math.tan(math.radians(slope)))

@@ -54,11 +54,11 @@ def needed_steepness(
     else:
         before = lens.unbounded().interfaces[:number]
         coming = across(source.rays_through(p, q, lens.entrance.z, 1.0), before)
-        at, _, _ = intersect(face.surface, coming, face.outline, face.status_if_missed)
+        at, _ = intersect(face.surface, coming, face.outline, face.status_if_missed)
     aim = torch.stack(torch.meshgrid(torch.from_numpy(x), torch.from_numpy(y), indexing="ij"))
     out, eta = screen.plane.vector_to(at, aim), face.law.eta
     out = out / torch.sqrt((out * out).sum(0))
-    normal = normal_towards(at, out, face.law)
+    normal = at.chart.local(at.position, normal_towards(at, out, face.law))
     angle = torch.rad2deg(torch.atan2(torch.hypot(normal[0], normal[1]), normal[2]))
     limit = -1.0 if face.law.reverses else min(eta, 1 / eta)  # cosine of the largest deflection
     possible = (at.direction * out).sum(0) > limit

@@ -24,7 +24,17 @@ import numpy as np
 import torch
 from numba import njit
 
-from bstcad.optics import tubes
+from bstcad.cad import dome_mesh
+from bstcad.cad.grids import (
+    cell_corners,
+    inward_diagonals,
+    nodes,
+    on_diagonals,
+    rim,
+    triangles_over,
+    wall_triangles,
+)
+from bstcad.optics import domes
 from bstcad.optics.bspline import is_net
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
@@ -60,6 +70,9 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
     """Return the lens as a closed mesh of `cells` grid cells per side, an even number, which `fit_mesh` can choose."""
     if cells < 2 or cells % 2:
         raise ValueError(f"mesh: the number of cells per side is {cells}; give an even number of at least 2")
+    lens = domes.on_base(lens)
+    if domes.is_dome(lens):
+        return Mesh(*dome_mesh.dome_grid(lens, cells))
     x, y = nodes(lens.outline, cells)
     grid = np.arange(x.size, dtype=np.int32).reshape(x.shape)
     border, z = rim(grid), sag(lens.back, x, y)
@@ -76,9 +89,9 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
         low = sag(lens.front, x, y)
         front = np.stack([x, y, low], axis=-1).reshape(-1, 3)
         front_rim = border + x.size
-        front_faces = _triangles(grid + x.size, _diagonals(lens.outline, lens.front, (x, y, low)))[:, ::-1]
-    back_faces = _triangles(grid, _diagonals(lens.outline, lens.back, (x, y, z)))
-    triangles = [back_faces, front_faces, _wall_triangles(front_rim, border)]
+        front_faces = triangles_over(grid + x.size, _diagonals(lens.outline, lens.front, (x, y, low)))[:, ::-1]
+    back_faces = triangles_over(grid, _diagonals(lens.outline, lens.back, (x, y, z)))
+    triangles = [back_faces, front_faces, wall_triangles(front_rim, border)]
     return Mesh(np.concatenate([back, front]), np.concatenate(triangles, dtype=np.int32, casting="same_kind"))
 
 
@@ -95,28 +108,8 @@ def _recessed_front(front: Recess, around: np.ndarray, grid: np.ndarray) -> tupl
     dome, plane = np.stack([x, y, z], axis=-1).reshape(-1, 3), around.copy()
     plane[:, 2] = front.around.z
     outer, inner = 2 * grid.size + np.arange(len(border)), border + grid.size
-    triangles = _triangles(grid + grid.size, _diagonals(front.outline, front.optical, (x, y, z)))[:, ::-1]
-    return np.vstack([dome, plane]), outer, np.concatenate([triangles, _wall_triangles(inner, outer)])
-
-
-def nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return x and y (mm) of a square grid of nodes, each (cells + 1, cells + 1), whose border lies on the outline."""
-    x, y = tubes.corners(outline, cells)
-    return x.numpy(), y.numpy()
-
-
-def _triangles(grid: np.ndarray, rising: np.ndarray) -> np.ndarray:
-    """Return the nodes of two triangles per cell of `grid`, (2 n², 3), counterclockwise.  rising: from `_diagonals`."""
-    a, b, c, d = _cell_corners(grid)
-    first, second = triangles = np.empty((2, *a.shape, 3), grid.dtype)
-    first[..., 0], first[..., 1], first[..., 2] = a, b, np.where(rising, c, d)
-    second[..., 0], second[..., 1], second[..., 2] = np.where(rising, a, b), c, d
-    return triangles.reshape(-1, 3)
-
-
-def _cell_corners(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return four arrays: the values at the four corners of each cell, counterclockwise."""
-    return values[:-1, :-1], values[1:, :-1], values[1:, 1:], values[:-1, 1:]
+    triangles = triangles_over(grid + grid.size, _diagonals(front.outline, front.optical, (x, y, z)))[:, ::-1]
+    return np.vstack([dome, plane]), outer, np.concatenate([triangles, wall_triangles(inner, outer)])
 
 
 def _diagonals(outline: Outline, surface: Surface, points: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
@@ -126,29 +119,16 @@ def _diagonals(outline: Outline, surface: Surface, points: tuple[np.ndarray, np.
     so that fewer triangles suffice.  On a disc, cells on the grid's diagonals are divided towards the centre, because
     their outer corners lie on a circle and the other diagonal would make degenerate triangles.
     """
-    k = np.arange(len(points[0]) - 1)
-    inner = k < len(k) / 2
-    inwards = inner[:, None] == inner
+    cells = len(points[0]) - 1
+    inwards = inward_diagonals(cells)
     if surface.level:
         return inwards
-    (a, b, c, d), (e, f, g, h), (p, q, r, s) = map(_cell_corners, points)
+    (a, b, c, d), (e, f, g, h), (p, q, r, s) = map(cell_corners, points)
     along = np.abs(sag(surface, (a + c) / 2, (e + g) / 2) - (p + r) / 2)
     across = np.abs(sag(surface, (b + d) / 2, (f + h) / 2) - (q + s) / 2)
     if not outline.is_round:
         return along <= across
-    return np.where((k[:, None] == k) | (k[:, None] == k[::-1]), inwards, along <= across)
-
-
-def rim(grid: np.ndarray) -> np.ndarray:
-    """Return the border nodes of the grid, once around, counterclockwise from its first corner."""
-    return np.concatenate([grid[:-1, 0], grid[-1, :-1], grid[:0:-1, -1], grid[0, :0:-1]])
-
-
-def _wall_triangles(front: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """Return two triangles between each pair of neighbours on the rims of front and back, facing outwards."""
-    after_front, after_back = np.roll(front, -1), np.roll(back, -1)
-    pairs = [front, after_front, after_back], [front, after_back, back]
-    return np.concatenate([np.stack(pair, axis=1) for pair in pairs])
+    return np.where(on_diagonals(cells), inwards, along <= across)
 
 
 def _has_plane_front(lens: Lens) -> bool:
@@ -164,6 +144,7 @@ def fit_mesh(lens: Lens, tolerance: float, max_triangles: int | None = None) -> 
     If `max_triangles` (None: DEFAULT_MAX_TRIANGLES) do not suffice, the mesh is the finest with at most that many
     triangles, or at most DEFAULT_MAX_TRIANGLES if this is fewer.
     """
+    lens = domes.on_base(lens)
     allowed = DEFAULT_MAX_TRIANGLES if max_triangles is None else max_triangles
     cells, last, goal = MIN_MESH_CELLS, max_cells(lens, allowed), chordal_error_goal(lens, tolerance)
     limit = CELL_MARGIN * last if allowed > DEFAULT_MAX_TRIANGLES else last
@@ -190,12 +171,15 @@ def chordal_error_goal(lens: Lens, tolerance: float) -> float:
 
 def largest_coordinate(lens: Lens) -> float:
     """Return an upper bound (mm) of the absolute coordinates of the lens's points."""
+    if domes.is_dome(lens):
+        return float(np.abs(lens.back_net.control_points()).max())
     ends = [abs(face.z + height) for face in (lens.front, lens.back) for height in face.sags(lens.outline)]
     return max(*lens.outline.half_extent, *ends)
 
 
 def max_cells(lens: Lens, max_triangles: int | None = None) -> int:
     """Return the largest number of cells per side for at most `max_triangles` (None: DEFAULT_MAX_TRIANGLES)."""
+    lens = domes.on_base(lens)
     faces, total = 2 if _has_plane_front(lens) else 4, DEFAULT_MAX_TRIANGLES if max_triangles is None else max_triangles
     # triangles per cell along one side of the grid: 8 of the wall, and 4 of the fan over a plane front or 8 of the
     # plane around a front
@@ -235,6 +219,8 @@ def chordal_error(mesh: Mesh, lens: Lens, enough: float = math.inf) -> float:
     Since a net may bend in each knot span, facets are sampled twice per span (at most MAX_FACET_SAMPLES points in all).
     enough: error (mm) at which the search ends; the result is then a lower bound.
     """
+    if domes.is_dome(lens):
+        return dome_mesh.chordal_error(mesh.vertices, mesh.faces, domes.on_base(lens), enough)
     max_parts = max(1, int((MAX_FACET_SAMPLES / 2 / max(len(mesh.faces), 1)) ** 0.5))
     radius = float(lens.outline.radius) if isinstance(lens.outline, Circle) else 0.0
     back, front = _face_numbers(lens.back), _face_numbers(lens.front)
@@ -256,6 +242,8 @@ def vertex_error(mesh: Mesh, lens: Lens) -> float:
 
     The distance along z would contain the rounding of x and y, multiplied by |∇z|.
     """
+    if domes.is_dome(lens):
+        return dome_mesh.vertex_error(mesh.vertices, domes.on_base(lens))
     x, y, z = mesh.vertices.T
 
     def off(face: Surface) -> np.ndarray:
@@ -560,6 +548,7 @@ def _glb(mesh: Mesh, lens: Lens, label: Label, off: float) -> bytes:
 
     A vertex on an edge of the lens is repeated with the normal of each face and each facet of the wall that meet there.
     """
+    lens = domes.on_base(lens)
     import trimesh  # takes most of a second
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
@@ -597,6 +586,8 @@ def _glb(mesh: Mesh, lens: Lens, label: Label, off: float) -> bytes:
 
 
 def _upward_normals(surface: Surface, points: np.ndarray) -> np.ndarray:
+    if domes.is_radial(surface):
+        return dome_mesh.normals_on(surface.plain(), points)
     _, z_x, z_y = sampled(surface, points[:, 0], points[:, 1])
     normals = np.stack([-z_x, -z_y, np.ones_like(z_x)], axis=1)
     return normals / np.linalg.norm(normals, axis=1)[:, None]

@@ -2,6 +2,7 @@
 
 The body is any cadquery solid.  First, a prism over the lens's rim is cut out, which is quick, since it has no net.
 Then the walls of this opening are replaced by walls between the faces of the body and of the lens, with shared edges.
+Around a dome the prism stands on a circle, and the plane faces of the body are continued to the dome's rim.
 The optical faces keep the control points of the design.
 """
 
@@ -23,13 +24,23 @@ from OCP.TopAbs import TopAbs_Orientation
 from OCP.TopLoc import TopLoc_Location
 from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape
 
-from bstcad.cad import solid_properties, step_writing, walls
+from bstcad.cad import solid_properties, step_writing, walls, wires
 from bstcad.cad.patches import back_patch
-from bstcad.cad.solid import NamedSolid, cap, check_thickness, cut_loops, dome_cap, front_caps, named_solid, rim_points
+from bstcad.cad.solid import (
+    NamedSolid,
+    cap,
+    cut_loops,
+    dome_cap,
+    front_caps,
+    named_solid,
+    prepared,
+    rim_heights,
+    rim_points,
+)
 from bstcad.cad.walls import MIN_WALL, NO_DRAFT, Draft, Loop, NamedFace, face_inside, solid_of
 from bstcad.cad.wires import LoopPiece, shape_in
 from bstcad.optics.lens import Lens
-from bstcad.optics.surfaces import Plane, sag
+from bstcad.optics.surfaces import Plane
 from bstcad.scene.mount import Box, Flange, Mount, Part, Round
 
 if TYPE_CHECKING:
@@ -37,6 +48,7 @@ if TYPE_CHECKING:
 
 WALL_TOLERANCE = 1e-6  # largest distance (mm) between a lens's wall and an edge of the body that lies on it
 COSINE_TOLERANCE = 1e-12  # largest deviation from 1 of |z| of the unit normal of a plane z = const
+DOME_OPENING = 1.001  # ratio of the radius of the circle cut out of a body to the largest radius of a dome's rim
 EDGE_FRACTIONS = (0.0, 0.31, 0.77, 1.0)  # fractions of an edge's length at which its distance from a wall is measured
 INVALID_PART = "mount: body and lens do not form a valid solid; move the body's edges away from the lens's rim"
 
@@ -109,7 +121,7 @@ class _Opening:
     z: float  # height of the lens's frame in the body's frame (mm)
     loops: list[list[LoopPiece]]  # rim and holes
     location: TopLoc_Location  # placement of the lens in the body; one object, so that moved faces share their edges
-    outline: cadquery.Wire  # rim in the plane z = 0 of the body's frame
+    outline: cadquery.Wire  # edge of the prism in the plane z = 0 of the body's frame: the rim; for a dome a circle
     draft: Draft  # draft of the lens's walls below the body
 
     @classmethod
@@ -118,16 +130,16 @@ class _Opening:
 
         if not np.isfinite(placed.at).all():  # a prism there would crash the process
             raise ValueError(f"{name}: {placed.at} is not a position; give x, y and z in mm")
-        lens = placed.lens.plain()
-        check_thickness(lens)
+        lens = prepared(placed.lens)
         loops = cut_loops(lens, placed.trim, placed.holes)
         x, y, z = placed.at
         location = cadquery.Location(placed.at).wrapped if any(placed.at) else TopLoc_Location()
-        rim = cadquery.Wire.assembleEdges([cadquery.Edge(edge) for edge in walls.rail_on(Plane(0.0), loops[0]).edges])
+        around = loops[0] if loops[0][0].rim is None else _circle_around(lens, loops[0])
+        rim = cadquery.Wire.assembleEdges([cadquery.Edge(edge) for edge in walls.rail_on(Plane(0.0), around).edges])
         return cls(lens, name, z, loops, location=location, outline=rim.translate((x, y, 0.0)), draft=placed.draft)
 
     def prism(self, body: cadquery.Shape) -> cadquery.Solid:
-        """Return the prism over the rim, from 1 mm below the body to 1 mm above it."""
+        """Return the prism over its edge, from 1 mm below the body to 1 mm above it."""
         import cadquery
 
         box = body.BoundingBox()
@@ -157,7 +169,7 @@ class _Opening:
         return inner, planes[True][0], planes[False][0]
 
     def _touches(self, wire: cadquery.Wire) -> bool:
-        """True if all edges of a wire of the body lie on the wall over the rim."""
+        """True if all edges of a wire of the body lie on the wall over the prism's edge."""
         import cadquery
 
         points = (point for edge in wire.Edges() for point in edge.positions(EDGE_FRACTIONS))
@@ -203,6 +215,11 @@ class _Opening:
         return [[(TopoDS.Edge_s(edge.Moved(self.location)), forward) for edge, forward in loop] for loop in loops]
 
 
+def _circle_around(lens: Lens, rim: Sequence[LoopPiece]) -> list[LoopPiece]:
+    """Return a circle around the rim of a dome, along which a boolean is exact; along the rim it errs by 1e-6 mm."""
+    return wires.circle(0.0, 0.0, DOME_OPENING * float(np.hypot(*rim_points(lens, rim)).max()))
+
+
 def check_fit(lens: Lens, rim: Sequence[LoopPiece], planes: tuple[float, float], name: str) -> tuple[bool, bool | None]:
     """Return (True if the upper plane is above the back's rim, True if the lower plane is below the front's rim).
 
@@ -210,7 +227,7 @@ def check_fit(lens: Lens, rim: Sequence[LoopPiece], planes: tuple[float, float],
     lens's frame (mm).  Raises ValueError if a plane cuts a rim, or the body misses the wall.
     """
     lower, upper = planes
-    high, low = (sag(face, *rim_points(lens, rim)) for face in (lens.back, lens.front))
+    high, low = rim_heights(lens, rim)
     below = lens.front.around
     flat = below.sags(lens.outline) == (0.0, 0.0) and abs(lower - below.z) < WALL_TOLERANCE
     for side, z, face, heights in (("upper", upper, "back", high), ("lower", lower, "front", low)):

@@ -8,6 +8,7 @@ they loosen the edges or refit the faces, and a boolean with a net of 513 x 513 
 from __future__ import annotations
 
 import cmath
+import functools
 import math
 import numbers
 from collections.abc import Sequence
@@ -24,6 +25,7 @@ from bstcad.cad import patches, walls, wires
 from bstcad.cad.patches import Patch, back_patch, front_patch, level_patch
 from bstcad.cad.walls import MIN_WALL, NO_DRAFT, Draft, NamedFace, Rail, face_inside
 from bstcad.cad.wires import LoopPiece, RailCurve
+from bstcad.optics import domes
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.sides import as_pair, coarser
@@ -80,8 +82,8 @@ def lens_shape(
 
     loops: rim and holes as `cut_loops` returns them (None: the lens's outline).
     """
-    lens, loops = lens.plain(), loops or [wires.outline_loop(lens.outline)]
-    check_thickness(lens)
+    lens = prepared(lens)
+    loops = loops or [rim_loop(lens)]
     back, below = back_patch(lens), lens.front.around
     tops, inner = [walls.rail_on(lens.back, loop) for loop in loops], [walls.rail_on(below, loop) for loop in loops[1:]]
     named, low = _outer_walls(lens, loops, tops[0], draft)
@@ -90,6 +92,22 @@ def lens_shape(
     caps = [(cap(back, tops, along=True), "back"), *front_caps(lens, [low, *inner])]
     faces, names = zip(*caps, *named, strict=True)
     return walls.solid_of(faces, INVALID_LENS), names
+
+
+def prepared(lens: Lens) -> Lens:
+    """Return the lens in float64 with the base of a dome (domes.on_base); ValueError if its faces cross."""
+    lens = domes.on_base(lens.plain())
+    check_thickness(lens)
+    return lens
+
+
+def rim_loop(lens: Lens) -> list[LoopPiece]:
+    """Return the loop of the lens's outline, on which its walls stand, counterclockwise."""
+    if not domes.is_dome(lens):
+        return wires.outline_loop(lens.outline)
+    dome = domes.radial_back(lens)
+    points = functools.partial(domes.points_on, dome)
+    return wires.dome_loop(dome, domes.rim_radius(lens.outline), points, walls.RIM_TOLERANCE)
 
 
 def coarse_copy(lens: Lens, m: int) -> Lens:
@@ -117,6 +135,9 @@ def check_thickness(lens: Lens) -> None:
     The thickness must exceed MIN_WALL because of the tolerance of edges.  Since a spline lies nowhere below its lowest
     control point, most lenses need no sampling.  Others are sampled at three points per knot span in x and in y.
     """
+    if domes.is_dome(lens):
+        domes.check_dome(lens)
+        return
     lowest, highest = lens.back.sags(lens.outline)[0], lens.front.sags(lens.outline)[1]
     if lens.back.z + lowest - (lens.front.z + highest) > MIN_WALL:
         return
@@ -140,6 +161,10 @@ def check_thickness(lens: Lens) -> None:
 
 def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[list[LoopPiece]]:
     """Return rim (trim None: the outline), counterclockwise, and holes, clockwise; ValueError if they bound no lens."""
+    if domes.is_dome(lens):
+        if trim is not None or len(holes):
+            raise ValueError("trim or holes: a dome keeps its own rim, the circle of its outline; omit trim and holes")
+        return [rim_loop(lens)]
     loops = [wires.outline_loop(lens.outline) if trim is None else _wire_loop("trim", trim)]
     loops += [_hole_loop(f"hole {k}", hole) for k, hole in enumerate(holes, start=1)]
     shape = wires.polygon(*loops)
@@ -214,19 +239,20 @@ def dome_cap(lens: Lens) -> tuple[NamedFace, Rail]:
 def image(patch: Patch, curve: RailCurve) -> Geom2d_Curve:
     """Return the image in (u, v) of a curve on a patch: a line, circle or spline with the parameter of the curve."""
     piece, uv = curve.piece, patch.uv
+    located = piece if piece.rim is None else piece.rim.arc  # a dome's (u, v) follow from its chart
     assert uv is not None  # a plane needs no image
     cubic = curve.knots if curve.knots is not None and len(curve.knots) == len(curve.poles) + 4 else None
     t = np.linspace(0.0, piece.end, IMAGE_SAMPLES) if cubic is None else np.unique(cubic)
 
     def points(t: np.ndarray) -> np.ndarray:
-        return uv(*piece.points(t).T)
+        return uv(*located.points(t).T)
 
     found = points(t)
     tolerance = IMAGE_TOLERANCE * np.ptp(found, axis=0).max()
     ends, fraction = found[[0, -1]], t[:, None] / piece.end
     if np.abs(ends[0] + fraction * (ends[1] - ends[0]) - found).max() <= tolerance:
         return patches.bspline_curve_2d(ends, np.array([0.0, 0.0, piece.end, piece.end]))
-    if piece.turn > 0:  # is the image a circle, u + iv = centre + arm exp(it)?
+    if located.turn > 0:  # is the image a circle, u + iv = centre + arm exp(it)?
         start, end = ends @ (1, 1j)
         arm = (end - start) / (cmath.exp(1j * piece.end) - 1)
         centre = start - arm
@@ -250,17 +276,26 @@ def _outer_walls(lens: Lens, loops: Sequence[list[LoopPiece]], top: Rail, draft:
 
 def _parting(lens: Lens, rim: Sequence[LoopPiece]) -> float:
     """Return z (mm) of the plane from which walls lean: below the back's rim and above the front's."""
-    x, y = rim_points(lens, rim)
-    low, high = sag(lens.back, x, y).min(), sag(lens.front, x, y).max()
+    back, front = rim_heights(lens, rim)
+    low, high = back.min(), front.max()
     if not low - high > MIN_WALL:
         raise ValueError(
             f"draft: the rim of the back comes down to z = {low:.4g} mm, and the rim of the front rises to {high:.4g} "
             "mm, so that no plane between them divides the wall; omit draft, or make the lens thicker at its edge"
         )
-    return parting(lens.back, lens.front, x, y)
+    return parting(back, front)
 
 
 def rim_points(lens: Lens, rim: Sequence[LoopPiece]) -> np.ndarray:
     """Return x and y (2, n) of points along a rim (mm), several in each cell of the back's net."""
     count = RIM_POINTS_PER_CELL * max(lens.back_net.shape)
     return np.concatenate([piece.points(np.linspace(0.0, piece.end, count)) for piece in rim]).T
+
+
+def rim_heights(lens: Lens, rim: Sequence[LoopPiece]) -> tuple[np.ndarray, np.ndarray]:
+    """Return z (mm) of back and front at the points of `rim_points`."""
+    x, y = rim_points(lens, rim)
+    own = [piece.rim for piece in rim]
+    t = np.linspace(0.0, rim[0].end, len(x) // len(rim))
+    back = [piece.heights(t) for piece in own if piece is not None]
+    return np.concatenate(back) if back else sag(lens.back, x, y), sag(lens.front, x, y)

@@ -1,8 +1,9 @@
 """Area, volume and centroid of a part with lenses, from its faces and edges, with a relative error of 1e-8.
 
-Each face is integrated along its boundary with Green's theorem: a freeform net in x and y (optics.quadrature), any
-other face in its parameters u and v.  OCC's own integrals take minutes for a large net.  They have errors of 1e-5 for
-a face that shares an edge with a large net, since this edge is a curve of thousands of knots.
+Each face is integrated along its boundary with Green's theorem: a freeform net in x and y (optics.quadrature), which
+for a dome are those of its chart, any other face in its parameters u and v.  OCC's own integrals take minutes for a
+large net.  They have errors of 1e-5 for a face that shares an edge with a large net, since this edge is a curve of
+thousands of knots.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape
 
 from bstcad.cad import step_reading
 from bstcad.cad.step_reading import StepLens, parts_of
-from bstcad.optics import quadrature
+from bstcad.optics import domes, quadrature
+from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.quadrature import EDGE_PARTS, GAUSS_POINTS_PER_PART, MIN_RELATIVE_DX, Border, MassProperties, Sums
 
 if TYPE_CHECKING:
@@ -80,7 +82,7 @@ def _of_face(face: TopoDS_Face, z_ref: float) -> Sums:
     surface = BRepAdaptor_Surface(face)
     if step_reading.is_freeform(surface):
         net = step_reading.freeform_surface(face)
-        border = Border(*_concatenate(_edge_in_space(edge) for edge in _edges(face)))
+        border = Border(*_concatenate(_edge_over_net(edge, face, net) for edge in _edges(face)))
         return quadrature.of_face(net, border, net.z - z_ref)
     if surface.GetType() not in GAUSS_POINTS_V:
         raise ValueError("a face is of an unknown kind; write the file again")
@@ -116,6 +118,18 @@ def _edges(face: TopoDS_Face) -> Iterator[TopoDS_Edge]:
 
 def _concatenate(parts: Iterator[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
     return [np.concatenate(each) for each in zip(*parts, strict=True)]
+
+
+def _edge_over_net(edge: TopoDS_Edge, face: TopoDS_Face, net: BSplineSurface) -> tuple[np.ndarray, ...]:
+    """Return `_edge_in_space`; for a radial net x, y, dx and dy are those of its chart, from the edge in (u, v)."""
+    if not domes.is_radial(net):
+        return _edge_in_space(edge)
+    curve = BRepAdaptor_Curve2d(edge, face)
+    t, weight = _gauss_points(edge, [curve, BRepAdaptor_Curve(edge)], over_net=True)
+    u, v, du, dv = _evaluate(curve, t, gp_Pnt2d(), gp_Vec2d())
+    x, y = step_reading.chart_coordinates(net, np.stack([u, v], axis=1))
+    pitch_x, pitch_y = net.pitch  # x(u) is linear outside the end spans, which the rim of a dome does not reach
+    return x, y, pitch_x * weight * du, pitch_y * weight * dv
 
 
 def _edge_in_space(edge: TopoDS_Edge) -> tuple[np.ndarray, ...]:

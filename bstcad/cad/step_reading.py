@@ -8,16 +8,17 @@ checks examine only a few points of an edge, and accept a solid whose rim runs t
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from OCP.BRep import BRep_Tool
-from OCP.BRepAdaptor import BRepAdaptor_Curve, BRepAdaptor_Surface
+from OCP.BRepAdaptor import BRepAdaptor_Curve, BRepAdaptor_Curve2d, BRepAdaptor_Surface
 from OCP.BRepCheck import BRepCheck_Analyzer
 from OCP.BRepTools import BRepTools, BRepTools_WireExplorer
 from OCP.Geom import Geom_BSplineSurface
@@ -34,7 +35,9 @@ from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape, TopoDS_Solid
 from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from bstcad.cad import patches
-from bstcad.optics.bspline import BSplineSurface, knots
+from bstcad.cad.radial_nets import radial_surface
+from bstcad.optics import domes
+from bstcad.optics.bspline import BSplineSurface, knots, position
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline, Rectangle, Rounded
 from bstcad.optics.sides import MIN_SIDE
@@ -68,11 +71,13 @@ class StepLens:
     @property
     def clear(self) -> tuple[Outline, Outline]:
         """Clear apertures of front and back, from the edges of the two faces; see `clear_apertures`."""
+        if domes.is_radial(self.back):
+            return self.front.outline or Circle(_farthest(self.faces[0])), self.outline
         front, back = clear_apertures(*map(outer_edge, self.faces))
         return self.front.outline or front, back
 
 
-@contextmanager
+@contextlib.contextmanager
 def quiet_occ() -> Iterator[None]:
     """Suppress the messages that OpenCASCADE prints inside the `with` block."""
     messenger = Message.DefaultMessenger_s()
@@ -180,9 +185,9 @@ def _lens_in(solid: TopoDS_Solid) -> StepLens:
         raise ValueError(f"it has {len(nets)} freeform faces; give a lens with one, or two facing opposite ways")
     (back_face, back), fronts = found, [face for face in nets if face is not found]
     net = patches.net_of(back.BSpline())
-    middle = (net[0, 0, :2] + net[-1, -1, :2]) / 2
-    if not np.abs(middle).max() <= AXIAL_TOLERANCE:
-        x, y = middle
+    back_surface = _uniform_net(back, net)
+    x, y = (sum(ends) / 2 for ends in (back_surface.x, back_surface.y))
+    if not max(abs(x), abs(y)) <= AXIAL_TOLERANCE:
         raise ValueError(f"the net of the back is centred at ({x:g}, {y:g}) mm; centre the lens on the axis")
     rest = [face for face in faces if face not in nets]
     chosen = fronts[0] if fronts else _front_face(rest)
@@ -190,11 +195,17 @@ def _lens_in(solid: TopoDS_Solid) -> StepLens:
     front = freeform_surface(chosen[0]) if fronts else _front_surface(*chosen, others)
     if front.outline is not None:
         others = [face for face in others if not _is_level(face[1], front.around.z)]
-    outline, edge = _outline_of_walls([surface for _, surface in others]), None
-    if outline is None:
+    walls = [surface for _, surface in others]
+    outline, edge = _outline_of_walls(walls), None
+    if domes.is_radial(back_surface):
+        outline = _outline_in_chart(back_face, back_surface)
+        edge = (
+            None if all(wall.GetType() == Kind.GeomAbs_SurfaceOfExtrusion for wall in walls) else outer_edge(back_face)
+        )
+    elif outline is None:
         edge = outer_edge(back_face)
         outline = _bounding_outline(edge)
-    back_surface, both = _uniform_net(back, net), (chosen[0], back_face)
+    both = chosen[0], back_face
     return StepLens(solid, net, back_surface, front=front, outline=outline, edge=edge, faces=both)
 
 
@@ -227,13 +238,17 @@ def _is_patch(surface: BRepAdaptor_Surface) -> bool:
 
 
 def freeform_surface(face: TopoDS_Face) -> BSplineSurface:
-    """Return the surface of a face with heights from its vertex; ValueError unless its net is as bstcad writes nets."""
+    """Return the surface of a face, heights from its vertex; ValueError unless its net is as bstcad writes nets."""
     surface = BRepAdaptor_Surface(face)
-    return _uniform_net(surface, patches.net_of(surface.BSpline())).from_vertex()
+    found = _uniform_net(surface, patches.net_of(surface.BSpline()))
+    return found if domes.is_radial(found) else found.from_vertex()
 
 
 def _uniform_net(surface: BRepAdaptor_Surface, net: np.ndarray) -> BSplineSurface:
-    """Return the surface of a net; ValueError unless it is of degree 2 x 2, not rational, uniform in knots, x and y."""
+    """Return the surface of a net of degree 2 x 2 with uniform knots, of heights or of distances from a centre.
+
+    Raises ValueError unless x and y of the control points are uniform, or their directions are those of a radial net.
+    """
     patch = surface.BSpline()
     (m, n), degrees = (patch.NbUPoles(), patch.NbVPoles()), (patch.UDegree(), patch.VDegree())
     if degrees != (2, 2) or min(m, n) < MIN_SIDE or patch.IsURational() or patch.IsVRational():
@@ -249,10 +264,12 @@ def _uniform_net(surface: BRepAdaptor_Surface, net: np.ndarray) -> BSplineSurfac
     found = BSplineSurface.from_control_points(net)
     off = np.abs(net - found.control_points())[..., :2].max(axis=-1)
     if not off.max() <= GRID_TOLERANCE:
+        with contextlib.suppress(ValueError):
+            return radial_surface(net)
         i, j = divmod(int(off.argmax()), n)
         raise ValueError(
             f"control points deviate by up to {off.max():.1e} mm from a uniform grid, most at point ({i}, {j}), "
-            "counted from 0; give a file written by bstcad"
+            "counted from 0, and are no radial net about the axis; give a file written by bstcad"
         )
     return found
 
@@ -391,6 +408,34 @@ def _radius(wall: BRepAdaptor_Surface) -> float:
     return wall.Cylinder().Radius() if off <= AXIAL_TOLERANCE else math.inf
 
 
+def _outline_in_chart(face: TopoDS_Face, dome: BSplineSurface) -> Circle:
+    """Return the circle about the axis of a dome's chart on which the outer edge of its face lies."""
+    x, y = chart_points(face, dome, np.linspace(0.0, 1.0, POINTS_PER_EDGE))
+    radius = np.hypot(x, y)
+    if not np.ptp(radius) <= CIRCLE_TOLERANCE:
+        raise ValueError(f"the back's edge is {np.ptp(radius):.2g} mm off a circle in the chart; correct the edge")
+    return Circle(round(float(radius.mean()), APERTURE_DECIMALS))
+
+
+def chart_points(face: TopoDS_Face, dome: BSplineSurface, fractions: np.ndarray) -> np.ndarray:
+    """Return x and y (2, n) (mm) in a dome's chart of points at fractions of each edge of its face."""
+    edges = map(TopoDS.Edge_s, parts_of(face, TopAbs_EDGE))
+    curves = (BRepAdaptor_Curve2d(edge, face) for edge in edges)
+    uv = np.concatenate([_curve_points(curve, fractions) for curve in curves])
+    return chart_coordinates(dome, uv)
+
+
+def chart_coordinates(dome: BSplineSurface, uv: np.ndarray) -> np.ndarray:
+    """Return x and y (2, n) (mm) of the chart at parameters (u, v), (n, 2), of the net."""
+    axes = zip(uv.T, dome.shape, dome.pitch, (dome.x, dome.y), strict=True)
+    return np.stack([low + pitch * position(torch.from_numpy(t.copy()), m).numpy() for t, m, pitch, (low, _) in axes])
+
+
+def _farthest(face: TopoDS_Face) -> float:
+    """Return the largest distance (mm) of a face's outer edge from the axis, rounded as a clear aperture."""
+    return round(float(np.hypot(*outer_edge(face).T).max()), APERTURE_DECIMALS)
+
+
 def outer_edge(face: TopoDS_Face) -> np.ndarray:
     """Return points (n, 2) in mm along the outer edge of a face, once around."""
     parts, explorer = [], BRepTools_WireExplorer(BRepTools.OuterWire_s(face), face)
@@ -443,7 +488,10 @@ def points_on_edges(solid: TopoDS_Shape) -> np.ndarray:
 
 
 def edge_deviations(shape: TopoDS_Shape, lens: Lens) -> tuple[tuple[float, str], tuple[float, str]]:
-    """Return (largest distance (mm), place) of edges from the faces that they bound, and the same from the wall."""
+    """Return (largest distance (mm), place) of edges from the faces that they bound, and the same from the wall.
+
+    A dome has no other wall than its faces; the second distance is then infinite.
+    """
     spans = max(max(lens.back_net.shape) - 2, math.ceil(2 * max(lens.outline.half_extent) / lens.front.detail))
     fractions = np.linspace(0.0, 1.0, POINTS_PER_SPAN * spans + 1)
     from_faces, from_wall = [], []
@@ -452,17 +500,18 @@ def edge_deviations(shape: TopoDS_Shape, lens: Lens) -> tuple[tuple[float, str],
             points = _curve_points(BRepAdaptor_Curve(each), fractions)
             distance = np.linalg.norm(points - _curve_points(BRepAdaptor_Curve(each, face), fractions), axis=1)
             from_faces.append(_largest(distance, points))
-            from_wall.append(_largest(_distance_from_wall(points, lens), points))
+            if not domes.is_dome(lens):
+                from_wall.append(_largest(_distance_from_wall(points, lens), points))
     nothing = (float("inf"), "no edge")
     return max(from_faces, default=nothing), max(from_wall, default=nothing)
 
 
-def _curve_points(curve: BRepAdaptor_Curve, fractions: np.ndarray) -> np.ndarray:
-    """Return points (n, 3) of a curve, in space or on a face, at fractions of its parameter interval."""
+def _curve_points(curve: BRepAdaptor_Curve | BRepAdaptor_Curve2d, fractions: np.ndarray) -> np.ndarray:
+    """Return points (n, 3) of a curve, in space or on a face, or (n, 2) in (u, v), at fractions of its interval."""
     first, last = curve.FirstParameter(), curve.LastParameter()
     parameters = (first + fractions * (last - first)).tolist()
     coordinates = (coordinate for t in parameters for coordinate in curve.Value(t).Coord())
-    return np.fromiter(coordinates, float, 3 * len(fractions)).reshape(-1, 3)
+    return np.fromiter(coordinates, float).reshape(len(fractions), -1)
 
 
 def _largest(distance: np.ndarray, points: np.ndarray) -> tuple[float, str]:

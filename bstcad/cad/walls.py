@@ -138,6 +138,8 @@ def rail_on(surface: Surface, loop: Sequence[LoopPiece]) -> Rail:
 
 def _curve_on(surface: Surface, piece: LoopPiece) -> RailCurve:
     """Return the curve over a piece on a surface: exact (a line, an arc, the border of a net) or a spline."""
+    if piece.rim is not None:
+        return piece.rim.curve_on(piece, surface)
 
     def points(t: np.ndarray) -> np.ndarray:
         x, y = piece.points(t).T

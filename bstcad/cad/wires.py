@@ -32,7 +32,12 @@ MIN_BREAK_DISTANCE = 1e-7  # smallest distance of two breaks, relative to the le
 ONE_SIDED_SLOPE = np.array([-25, 48, -36, 16, -3]) / 12  # weights of 5 values (spacing 1) for the slope at the first
 CROSSING_BISECTIONS = 50  # number of bisections, which leave only rounding errors
 
+DOME_DEGREE = 3  # degree of the spline along the rim of a dome
+
 Locus = Callable[[np.ndarray], np.ndarray]  # function of t (n,) that returns points (n, k)
+PointsOnDome = Callable[
+    [np.ndarray, np.ndarray], np.ndarray
+]  # function of chart coordinates that returns points (n, 3)
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,7 @@ class LoopPiece:
     centre: tuple[float, float] | None = None  # centre of a circle (mm); None: not a circle
     turn: int = 0  # direction on a circle: +1 counterclockwise, -1 clockwise; 0: not a circle
     straight: bool = False  # True for a line
+    rim: DomeRim | None = None  # curve in space for a piece of a dome's rim; None: the curve follows from (x, y)
 
     @property
     def is_line_or_arc(self) -> bool:
@@ -58,6 +64,47 @@ class LoopPiece:
         """Return (x, y), in mm, of the point at t."""
         x, y = self.points(np.array([t]))[0]
         return float(x), float(y)
+
+
+@dataclass(frozen=True)
+class DomeRim:
+    """A piece of the rim of a dome in space, a spline with the parameter t of the piece."""
+
+    arc: LoopPiece  # piece of the circle in the dome's chart over which the rim lies, with the same t
+    poles: np.ndarray  # control points, (n, 3), mm
+    knots: np.ndarray  # full knot vector
+
+    def heights(self, t: np.ndarray) -> np.ndarray:
+        """Return z (mm) of the rim at t (n,)."""
+        return BSpline(self.knots, self.poles[:, 2], DOME_DEGREE)(t)
+
+    def curve_on(self, piece: LoopPiece, surface: Surface) -> RailCurve:
+        """Return the rim itself on a dome, or its projection along z onto a plane z = const."""
+        poles = self.poles.copy()
+        if surface.level:
+            poles[:, 2] = surface.z
+        return RailCurve(piece, poles, self.knots)
+
+
+def dome_loop(dome: BSplineSurface, radius: float, points: PointsOnDome, tolerance: float) -> list[LoopPiece]:
+    """Return the rim of a dome over the circle of a radius (mm) in its chart, counterclockwise, in two halves.
+
+    points: function that returns the points (n, 3) of the dome at (x, y) of the chart (mm).  The rim is a piecewise
+    cubic within a tolerance (mm) of the exact curve; the wall below it and its lower edge share its poles and knots.
+    """
+
+    def piece(arc: LoopPiece) -> LoopPiece:
+        poles, knots = fit_spline(lambda t: points(*arc.points(t).T), breaks(dome, arc), tolerance)
+        curve = BSpline(knots, poles[:, :2], DOME_DEGREE)
+        slope = curve.derivative()
+
+        def left(t: np.ndarray) -> np.ndarray:
+            along = slope(t)
+            return along[:, ::-1] * (-1, 1) / np.linalg.norm(along, axis=1)[:, None]
+
+        return LoopPiece(curve, left, arc.end, rim=DomeRim(arc, poles, knots))
+
+    return [piece(arc) for arc in circle(0.0, 0.0, radius)]
 
 
 def outline_loop(outline: Outline) -> list[LoopPiece]:
@@ -201,7 +248,9 @@ class RailCurve:
 def breaks(surface: Surface, *pieces: LoopPiece) -> np.ndarray:
     """Return parameters t, from 0 to the end, between which each piece lies over one smooth part of a surface."""
     t = np.linspace(0.0, pieces[0].end, MIN_INTERVALS + 1)
-    if is_net(surface):  # smooth between its knot lines
+    if pieces[0].rim is not None:  # smooth between the knots of the rim
+        t = np.unique(np.concatenate([t, pieces[0].rim.knots]))
+    elif is_net(surface):  # smooth between its knot lines
         t = np.unique(np.concatenate([t, *(_crossings(surface, piece) for piece in pieces)]))
     inner = t[1:-1]
     inner = inner[(np.diff(t)[:-1] > MIN_BREAK_DISTANCE * t[-1]) & (t[-1] - inner > MIN_BREAK_DISTANCE * t[-1])]

@@ -18,7 +18,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 import scipy.linalg
@@ -232,6 +232,15 @@ class BSplineSurface(Surface):
         return replace(self, z=self.z + vertex, heights=self.heights - vertex)
 
     @property
+    def potential(self) -> Tensor:
+        """Heights (m, n) of the net whose slopes are those of the surface in its chart (charts.py): its own heights."""
+        return self.heights
+
+    def with_potential(self, heights: Tensor) -> BSplineSurface:
+        """Return the surface with another potential."""
+        return replace(self, heights=heights)
+
+    @property
     def shape(self) -> tuple[int, int]:
         """Numbers (m, n) of control points along x and along y."""
         m, n = self.heights.shape
@@ -303,7 +312,7 @@ class BSplineSurface(Surface):
         """Return the heights of the control points (mm), by the name "heights"."""
         return {"heights": self.heights}
 
-    def plain(self) -> BSplineSurface:
+    def plain(self) -> Self:
         """Return the surface with heights in float64 on the CPU, without gradient."""
         return replace(self, heights=self.heights.detach().to("cpu", torch.float64))
 

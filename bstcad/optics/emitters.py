@@ -136,6 +136,10 @@ class Emitter(ABC):
         """Return the source with its extent multiplied by `share`."""
         raise self._missing_method("a smaller extent", "scaled(share)")
 
+    def resized(self, key: str, size: float) -> Emitter:
+        """Return the source with another size, by the key of the size."""
+        return replace(self, **{key: size})
+
     def moved(self, motion: Motion, entrance: float) -> Emitter:
         """Return the simple source after a motion; entrance: z of the plane through the first vertex (mm)."""
         raise self._missing_method("how its light moves", "moved(motion, entrance)")

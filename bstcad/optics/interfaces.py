@@ -23,6 +23,7 @@ from torch import Tensor
 
 from bstcad.optics.bspline import BSplineSurface, is_net, require_net
 from bstcad.optics.outlines import Outline
+from bstcad.optics.radial import RadialSurface
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.surfaces import Surface
 
@@ -86,6 +87,7 @@ def _capped_root(cos2: Tensor) -> Tensor:
 
 
 Law = Refract | Reflect
+Normal = tuple[Tensor, Tensor, Tensor]  # components of a normal, not of unit length
 
 
 class Loss(Protocol):
@@ -126,8 +128,8 @@ class Hit:
 
 def cross(rays: Rays, interface: Interface) -> Hit:
     """Trace rays to an interface and through it: refract or reflect rays that meet it inside the outline."""
-    at, z_x, z_y = intersect(interface.surface, rays, interface.outline, interface.status_if_missed)
-    hit = deflect(at, z_x, z_y, interface.law, level=interface.surface.level)
+    at, normal = intersect(interface.surface, rays, interface.outline, interface.status_if_missed)
+    hit = deflect(at, normal, interface.law, level=interface.surface.level)
     if not interface.losses:
         return hit
     path = _path(rays, hit.rays)
@@ -156,25 +158,26 @@ def _path(before: Rays, behind: Rays) -> Tensor:
     return torch.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
 
 
-def deflect(at: Rays, z_x: Tensor, z_y: Tensor, law: Law, level: bool = False) -> Hit:
-    """Refract or reflect rays at a surface of slopes z_x and z_y.  level: the surface is a plane z = const."""
+def deflect(at: Rays, normal: Normal, law: Law, level: bool = False) -> Hit:
+    """Refract or reflect rays at a surface with this normal (see `intersect`).  level: it is a plane z = const."""
+    n_x, n_y, n_z = normal
     if at.axial and level:  # normal incidence
-        one = torch.ones_like(z_x)
+        one = torch.ones_like(n_x)
         return Hit(replace(at, direction=-at.direction, sense=-at.sense) if law.reverses else at, one, one)
-    norm = torch.rsqrt(1 + z_x * z_x + z_y * z_y)
+    norm = torch.rsqrt(n_z * n_z + n_x * n_x + n_y * n_y)
     dx, dy, dz = torch.where(at.alive, at.direction, torch.ones_like(at.direction))
-    along = dz - dx * z_x - dy * z_y
+    along = n_z * dz + n_x * dx + n_y * dy
     cos_in = (along if at.sense > 0 else -along) * norm
     eta, (bend, cos_out, stopped) = law.eta, law.deflection(cos_in)
     shift = bend * norm if at.sense > 0 else -bend * norm
-    direction = torch.stack([eta * dx - shift * z_x, eta * dy - shift * z_y, eta * dz + shift])
+    direction = torch.stack([eta * dx + shift * n_x, eta * dy + shift * n_y, eta * dz + shift * n_z])
     status = at.lose(stopped, law.status_if_blocked)
     direction = torch.where(status == Status.ALIVE, direction, at.direction.detach())
     sense = -at.sense if law.reverses else at.sense
     return Hit(replace(at, direction=direction, status=status, axial=False, sense=sense), cos_in, cos_out)
 
 
-def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) -> tuple[Rays, Tensor, Tensor]:
+def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) -> tuple[Rays, Normal]:
     """Move the rays to the surface; those that do not meet it inside the outline are lost with the status `missed`.
 
     F(s) = z(s) - sag(x(s), y(s)) = 0.  The root is found without gradient; then one differentiable Newton step,
@@ -182,13 +185,21 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
     The path s is measured from the base plane z = surface.z.  It is then as short as the sag, so that neither a distant
     source nor a scene far from its origin loses digits.
 
-    Returns (rays at the surface, ∂z/∂x, ∂z/∂y there).
+    Returns rays at the surface and its normal there, along +z or outward, not of unit length: (-∂z/∂x, -∂z/∂y, 1) of a
+    height field.
     """
+    if isinstance(surface, RadialSurface):
+        met = surface.meet(rays)
+        before = torch.stack([*rays.position[:2], rays.above(surface.z)])
+        ok = met.found & outline.contains(met.x, met.y)
+        at = replace(rays, position=torch.where(ok, met.position, before), z=surface.z, status=rays.lose(~ok, missed))
+        n_x, n_y, n_z = met.normal
+        return replace(at, axial=False, chart=surface.chart), (n_x, n_y, n_z)
     if rays.axial:  # closed form: the hit is (x, y, sag)
         x, y, _ = rays.position
         h, z_x, z_y = surface.relative_sag_and_slope(x, y)
         status = rays.lose(~(surface.reaches(x, y) & outline.contains(x, y)), missed)
-        return replace(rays, position=torch.stack([x, y, h]), z=surface.z, status=status), z_x, z_y
+        return replace(rays, position=torch.stack([x, y, h]), z=surface.z, status=status), normal_of(z_x, z_y)
 
     start, s, meets = _plane_and_root(surface, rays)
     before = torch.stack([*rays.position[:2], rays.above(surface.z)])
@@ -196,7 +207,7 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
         ok = meets & (rays.direction[2].abs() > TANGENCY_TOLERANCE)
         status = rays.lose(~(ok & outline.contains(start[0], start[1])), missed)
         at = replace(rays, position=torch.where(ok, start, before), z=surface.z, status=status)
-        return at, torch.zeros_like(s), torch.zeros_like(s)
+        return at, normal_of(torch.zeros_like(s), torch.zeros_like(s))
     # double where: a ray without a root takes no step, and its values reach no gradient of other rays
     x, y, z = torch.where(meets, start + s * rays.direction, torch.zeros_like(start))
     h, z_x, z_y = surface.relative_sag_and_slope(x, y)
@@ -210,7 +221,12 @@ def intersect(surface: Surface, rays: Rays, outline: Outline, missed: Status) ->
     x, y = (torch.where(ok, p, torch.zeros_like(p)) for p in position[:2])
     _, z_x, z_y = surface.relative_sag_and_slope(x, y)  # slopes as differentiable functions of the hit
     met = ok & surface.reaches(x, y) & outline.contains(x, y)
-    return replace(rays, position=position, z=surface.z, status=rays.lose(~met, missed)), z_x, z_y
+    return replace(rays, position=position, z=surface.z, status=rays.lose(~met, missed)), normal_of(z_x, z_y)
+
+
+def normal_of(z_x: Tensor, z_y: Tensor) -> Normal:
+    """Return the normal (-∂z/∂x, -∂z/∂y, 1) of a height field."""
+    return -z_x, -z_y, torch.ones_like(z_x)
 
 
 def _plane_and_root(surface: Surface, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:

@@ -14,6 +14,7 @@ from bstcad.optics.bspline import BSplineSurface, is_net, require_net
 from bstcad.optics.interfaces import Interface
 from bstcad.optics.outlines import EVERYWHERE, Outline
 from bstcad.optics.passes import LENS, MIRROR, Face, Passes
+from bstcad.optics.radial import RadialSurface
 from bstcad.optics.rays import Status
 from bstcad.optics.sides import Sides
 from bstcad.optics.surfaces import Surface, sag
@@ -174,6 +175,11 @@ class Lens:
         around = list(self.interfaces)
         around[k] = replace(around[k], surface=surface)
         return replace(self, before=tuple(around[: solid.start]), behind=tuple(around[solid.stop :]))
+
+    @cached_property
+    def plan(self) -> Outline:
+        """Outline of the lens seen along the axis (mm); a circle for a dome, whose `outline` is one of directions."""
+        return self.back.plan(self.outline) if isinstance(self.back, RadialSurface) else self.outline
 
     @property
     def like(self) -> Tensor:

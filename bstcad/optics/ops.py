@@ -24,8 +24,10 @@ KERNELS: dict[str, dict[str, str | Callable[..., Any]]] = {
     "bspline.evaluate": {"cpu": "spline.BSplineSag.apply"},
     "bspline.net_gradient": {"cpu": "spline.net_gradient"},
     "irradiance.collect": {"cpu": "splat.Splat.apply"},
-    "trace.behind": {"cpu": "crossing.behind"},
-    "trace.through": {"cpu": "crossing.landed"},
+    "trace.behind bspline": {"cpu": "crossing.behind"},
+    "trace.behind radial": {"cpu": "dome.behind"},
+    "trace.through bspline": {"cpu": "crossing.landed"},
+    "trace.through radial": {"cpu": "dome.landed"},
     "trace.simulate": {"cpu": "forward.simulate"},  # the whole path, from the source to the receiver
     "trace.land": {"cpu": "forward.land"},  # the whole path of single rays
     "tubes.search": {"cpu": "search.search"},  # rays of sources through a front to given points

@@ -12,9 +12,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from bstcad.optics import domes
 from bstcad.optics.bspline import BSplineSurface, is_net
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
+from bstcad.optics.radial import RadialSurface
 from bstcad.optics.surfaces import Surface
 
 MIN_SPANS = 128  # smallest number of parts of a chord across a whole net; the spans of a coarser net are divided
@@ -71,15 +73,52 @@ def of_face(face: Surface, border: Border, raised: float = 0.0) -> Sums:
     return Sums(abs(total.area), total.volume, total.moment)  # the area is negative for a border seen from below
 
 
+def _of_revolution(face: Surface, raised: float) -> Sums:
+    """Return the sums over a conic inside its outline, raised by `raised` (mm), n up, from its profile h(r).
+
+    r = sin(s) / sqrt(K), K = (1 + k) c², in place of r: at an equator h is smooth in s, but not in r.  K <= 0: s = r.
+    """
+    assert face.outline is not None  # a Recess
+    c, k = face.conic()
+    bend, radius = (1 + k) * c * c, float(face.outline.radius)
+    scale = math.sqrt(bend) if bend > 0 else 0.0
+    point, weight = gauss_rule(CHORD_POINTS)
+    end = math.asin(scale * radius) if scale else radius
+    s, ds = end / 2 * (1 + point), end / 2 * weight
+    r, dr = (np.sin(s) / scale, np.cos(s) / scale * ds) if scale else (s, ds)
+    h, slope, _ = (
+        p.numpy() for p in face.optical.relative_sag_and_slope(torch.from_numpy(r), torch.zeros(len(r)).double())
+    )
+    ring = 2 * math.pi * r * dr
+    cone, h = ring * (h - r * slope + raised), h + raised
+    moment = np.array([0.0, 0.0, float((cone * h).sum()) / 4])
+    return Sums(float((ring * np.sqrt(1 + slope * slope)).sum()), float(cone.sum()) / 3, moment)
+
+
 def of_wall(face: Surface, border: Border, raised: float = 0.0) -> Sums:
     """Return the sums over the wall from the plane z = 0 up to the rim z = h + raised (mm) of a face, n outwards."""
     h = face.relative_sag_and_slope(torch.from_numpy(border.x), torch.from_numpy(border.y))[0].numpy() + raised
+    return _of_wall(border, h)
+
+
+def _of_wall(border: Border, h: np.ndarray) -> Sums:
+    """Return the sums over the wall on a border, up to heights h (mm)."""
     cone = h * (border.x * border.dy - border.y * border.dx)  # r·n ds, times the wall's height
     return Sums(float((border.ds * h).sum()), float(cone.sum()) / 3, _moment(cone, border.x, border.y, h / 2))
 
 
 def _sums_of_points(face: Surface, raised: float, x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> Sums:
-    """Return the sums over points (x, y) (mm) of a face, raised by `raised` (mm); weight: dx dy of each point (mm²)."""
+    """Return the sums over points (x, y) (mm) of a face, raised by `raised` (mm); weight: dx dy of each point (mm²).
+
+    On a radial surface S, x and y are coordinates of its chart, and n dA = ∂S/∂x x ∂S/∂y dx dy.
+    """
+    if domes.is_radial(face):
+        r, along_x, along_y = (
+            np.moveaxis(part.numpy(), 0, -1) for part in face.at(torch.from_numpy(x), torch.from_numpy(y))
+        )
+        r, normal = r + (0.0, 0.0, raised), np.cross(along_x, along_y)
+        area, cone = weight * np.sqrt((normal * normal).sum(axis=1)), weight * (r * normal).sum(axis=1)
+        return Sums(float(area.sum()), float(cone.sum()) / 3, _moment(cone, *r.T))
     h, h_x, h_y = (part.numpy() for part in face.relative_sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
     area, h = weight * np.sqrt(1 + h_x * h_x + h_y * h_y), h + raised
     cone = weight * (h - x * h_x - y * h_y)
@@ -143,6 +182,13 @@ def outline_border(outline: Outline, face: Surface) -> Border:
     )
 
 
+def _rim_in_space(dome: RadialSurface, border: Border) -> tuple[Border, np.ndarray]:
+    """Return the border in x and y of space, and heights (mm) over the centre, of a border in a dome's chart."""
+    patch = dome.at(torch.from_numpy(border.x), torch.from_numpy(border.y))
+    (x, y, h), (x_x, y_x, _), (x_y, y_y, _) = (part.numpy() for part in patch)
+    return Border(x, y, x_x * border.dx + x_y * border.dy, y_x * border.dx + y_y * border.dy), h
+
+
 def _chords(face: Surface, x: np.ndarray, y: np.ndarray, dx: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (x, y, weights in mm²) of points on the chords from y = 0 to border points (x, y) of weight dx (mm)."""
     ends, count = _chord_ends(face, y)
@@ -197,16 +243,30 @@ class MassProperties:
 
 def of_lens(lens: Lens) -> MassProperties:
     """Return the properties of a bare lens to 1e-9; for a large net OpenCASCADE takes minutes, and errs by 1e-5."""
-    lens, total = lens.plain(), Sums()
+    lens, total = domes.on_base(lens.plain()), Sums()
     z_ref = lens.front.z  # origin of z in the sums: a near one limits rounding
     for face, sign in ((lens.back, 1), (lens.front, -1)):
         rim, raised = face.around, face.around.z - z_ref
-        border = outline_border(lens.outline, rim)
-        cap, wall = of_face(rim, border, raised), of_wall(rim, border, raised)
+        cap, wall = _cap_and_wall(lens, rim, raised)
         if face.outline is not None:  # the optical part replaces the plane there
             inner = outline_border(face.outline, face.optical)
-            hole, dome = of_face(rim, inner, raised), of_face(face.optical, inner, face.z - z_ref)
-            cap += Sums(dome.area - hole.area, dome.volume - hole.volume, dome.moment - hole.moment)
+            hole, raised = of_face(rim, inner, raised), face.z - z_ref
+            steep = domes.is_dome(lens)  # the inner face of a dome is nearly vertical at its rim
+            own = _of_revolution(face, raised) if steep else of_face(face.optical, inner, raised)
+            cap += Sums(own.area - hole.area, own.volume - hole.volume, own.moment - hole.moment)
         volume, moment = sign * (cap.volume + wall.volume), sign * (cap.moment + wall.moment)
         total += Sums(cap.area + sign * wall.area, volume, moment)
     return MassProperties.of(total, z_ref)
+
+
+def _cap_and_wall(lens: Lens, rim: Surface, raised: float) -> tuple[Sums, Sums]:
+    """Return the sums over a face inside the lens's rim, and over the wall from the plane z = 0 up to it."""
+    if not domes.is_dome(lens):
+        border = outline_border(lens.outline, rim)
+        return of_face(rim, border, raised), of_wall(rim, border, raised)
+    dome = domes.radial_back(lens)
+    in_chart = outline_border(lens.outline, dome)
+    edge, height = _rim_in_space(dome, in_chart)
+    if domes.is_radial(rim):
+        return of_face(rim, in_chart, raised), _of_wall(edge, height + raised)
+    return of_face(rim, edge, raised), of_wall(rim, edge, raised)

@@ -14,6 +14,8 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
+from bstcad.optics.charts import HEIGHTS, Chart
+
 NO_LOSSES: Mapping[str, Tensor] = MappingProxyType({})
 MIN_AXIAL_COSINE = 1e-9  # cosine of the angle between a ray and a receiver's normal up to which the ray misses it
 
@@ -47,6 +49,13 @@ class Rays:
     z: float = 0.0  # mm, reference plane of the positions, so that sags keep their digits far from the origin
     sense: int = 1  # +1 or -1, direction of the light along z; rays of opposite sense are lost at the next surface
     taken: Mapping[str, Tensor] = field(default_factory=lambda: NO_LOSSES)  # (…) flux lost, by ledger line
+    chart: Chart = HEIGHTS  # chart of the face at which the rays are
+
+    @property
+    def places(self) -> tuple[Tensor, Tensor]:
+        """Coordinates x, y (mm) of the rays in the chart of the face at which they are."""
+        x, y, _ = self.chart.coordinates(self.position)
+        return x, y
 
     @property
     def alive(self) -> Tensor:

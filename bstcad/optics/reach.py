@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bstcad.optics.charts import HEIGHTS
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Law
 from bstcad.optics.kernels.reductions import total
@@ -75,6 +76,8 @@ def wanted_slopes(at_face: Rays, aim: Tensor, plane: Receiver, law: Law) -> tupl
 def slopes_towards(at_face: Rays, out: Tensor, law: Law) -> tuple[Tensor, Tensor]:
     """Return the slopes (∂z/∂x, ∂z/∂y) that deflect each ray into the direction d' of `out`, unit vectors (3, …).
 
+    On a dome the slopes are those in the chart of the rays (charts.py).
+
     By the laws of refraction and reflection the normal (-z_x, -z_y, 1) is parallel to ±(η d - d') (`normal_towards`).
     If no face can deflect a ray by so large an angle, the slope deflects it to the same side by the largest
     angle: that of a ray which meets or leaves the face at MAX_EXIT_ANGLE.  No slope is steeper than MAX_SLOPE.
@@ -82,10 +85,13 @@ def slopes_towards(at_face: Rays, out: Tensor, law: Law) -> tuple[Tensor, Tensor
     d = at_face.direction
     along = dot(d, out)
     largest = math.pi if law.reverses else largest_deflection(max(law.eta, 1 / law.eta))
-    out = torch.where(along < math.cos(largest), _at_angle(d, out, along, largest), out)
-    normal = normal_towards(at_face, out, law)
+    chart = at_face.chart
+    if chart is HEIGHTS:
+        out = torch.where(along < math.cos(largest), _at_angle(d, out, along, largest), out)
+    normal = chart.local(at_face.position, normal_towards(at_face, out, law))
     height = torch.maximum(normal[2], torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / MAX_SLOPE)
-    return -normal[0] / height, -normal[1] / height
+    stretch = chart.stretch(at_face.position)
+    return stretch * (-normal[0] / height), stretch * (-normal[1] / height)
 
 
 def normal_towards(at_face: Rays, out: Tensor, law: Law) -> Tensor:
@@ -96,19 +102,23 @@ def normal_towards(at_face: Rays, out: Tensor, law: Law) -> Tensor:
 def limit_refraction(
     at_face: Rays, slopes: tuple[Tensor, Tensor], law: Law, grazing: float = MAX_EXIT_ANGLE
 ) -> tuple[Tensor, Tensor]:
-    """Limit slopes (∂z/∂x, ∂z/∂y) so that no angle of refraction at a face into air exceeds `grazing` (rad).
+    """Limit slopes (in the rays' chart) so that no angle of refraction at a face into air exceeds `grazing` (rad).
 
     A normal at too large an angle to its ray is rotated towards the ray in their common plane; others do not change.
     """
     if law.reverses or law.eta <= 1:
         return slopes
-    z_x, z_y = slopes
-    d, largest = at_face.sense * at_face.direction, math.asin(math.sin(grazing) / law.eta)
+    chart = at_face.chart
+    stretch = chart.stretch(at_face.position)
+    z_x, z_y = (slope / stretch for slope in slopes)
+    d = at_face.sense * chart.local(at_face.position, at_face.direction)
+    largest = math.asin(math.sin(grazing) / law.eta)
     normal = torch.stack([-z_x, -z_y, torch.ones_like(z_x)]) / torch.sqrt(1 + z_x * z_x + z_y * z_y)
     along = dot(d, normal)
     limit = _at_angle(d, normal, along, largest)
     exceeds = (along < math.cos(largest)) & (limit[2] > 0)
-    return torch.where(exceeds, -limit[0] / limit[2], z_x), torch.where(exceeds, -limit[1] / limit[2], z_y)
+    within = torch.where(exceeds, -limit[0] / limit[2], z_x), torch.where(exceeds, -limit[1] / limit[2], z_y)
+    return stretch * within[0], stretch * within[1]
 
 
 def _at_angle(d: Tensor, towards: Tensor, along: Tensor, angle: float) -> Tensor:
@@ -125,7 +135,7 @@ def reach_margin(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing:
     MAX_SLOPE, n by `normal_towards`; and d' · m, m the receiver's unit normal, which points away from the lens.
     """
     _, out, along = directions(at_face, aim, plane)
-    normal = normal_towards(at_face, out, law)
+    normal = at_face.chart.local(at_face.position, normal_towards(at_face, out, law))
     upright = normal[2] - torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / MAX_SLOPE
     onwards = (-at_face.sense if law.reverses else at_face.sense) * dot(plane.normal(aim), out)
     margin = torch.minimum(upright, onwards)

@@ -15,9 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bstcad.optics.charts import HEIGHTS, Chart
 from bstcad.optics.outlines import STRICT, Circle, Outline
+from bstcad.optics.rays import Rays
 
 MIN_COS2 = 1e-6  # 1 - (1 + k) c² r² (for a sphere cos² of the slope angle) up to which a surface is too steep
+MIN_ARRIVAL_COSINE = 1e-3  # smallest cosine with the axis by which a height is divided
 
 
 class Surface(ABC):
@@ -51,6 +54,11 @@ class Surface(ABC):
         """Surface at the rim of the lens: the plane around the optical part, or the surface if all of it is optical."""
         return self
 
+    @property
+    def chart(self) -> Chart:
+        """Coordinates in which the surface is a function."""
+        return HEIGHTS
+
     @abstractmethod
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return (height over the plane z in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm."""
@@ -67,6 +75,11 @@ class Surface(ABC):
     def crossing(self, x: Tensor, y: Tensor, direction: Tensor, sense: int = 1) -> tuple[Tensor, Tensor]:
         """Return (path in mm along rays from (x, y) on the plane z, True if they meet the surface); sense: see Rays."""
         raise self.unknown
+
+    def arrive(self, rays: Rays, height: Tensor) -> Rays:
+        """Return rays moved along their lines to heights (mm) over the plane z."""
+        s = rays.sense * (height - rays.above(self.z)) / (rays.sense * rays.direction[2]).clamp(min=MIN_ARRIVAL_COSINE)
+        return replace(rays, position=rays.position + s * rays.direction)
 
     @abstractmethod
     def sags(self, outline: Outline) -> tuple[float, float]:

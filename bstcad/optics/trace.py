@@ -33,6 +33,7 @@ from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.losses import REFLECTED
 from bstcad.optics.outlines import Outline, Rectangle
+from bstcad.optics.radial import RadialSurface
 from bstcad.optics.ray_bundle import RayBundle
 from bstcad.optics.rays import Landed, Rays, Status
 from bstcad.optics.receivers import Receiver
@@ -73,9 +74,11 @@ def behind(rays: Rays, interface: Interface) -> Rays:
 
 
 def _net_kernel(name: str, rays: Rays, interface: Interface) -> Callable[..., Any] | None:
-    """Return the kernel of this name if the interface is a net that it supports; None: use plain torch."""
+    """Return the kernel of this name for the interface's kind of net; None: there is none, use plain torch."""
     net = interface.surface
-    return ops.kernel(name, net.heights, rays.position, rays.direction) if is_net(net) else None
+    if not is_net(net) or (isinstance(net, RadialSurface) and rays.sense < 0):  # domes: light along +z only
+        return None
+    return ops.kernel(f"{name} {net.kind}", net.heights, rays.position, rays.direction)
 
 
 def whole_kernel(
@@ -269,7 +272,7 @@ def on_underside(source: Emitter, front: Surface, outline: Outline, n: int = UND
     rays = source.rays_through(x[beside], y[beside], plane.z, area.area / n**2)
     if not rays.z < plane.z:  # a source in the dome lights no plane behind it
         return 0.0
-    met, _, _ = intersect(front.optical, rays, front.outline, Status.MISSED_FRONT)
+    met, _ = intersect(front.optical, rays, front.outline, Status.MISSED_FRONT)
     return float(total((rays.flux * ~met.alive).double()))
 
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import ops
+from bstcad.optics.charts import HEIGHTS
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Interface, cross
 from bstcad.optics.irradiance import Scale, Screen, scaled
@@ -27,6 +28,7 @@ from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed, Rays, Status, joined, stacked
 from bstcad.optics.receivers import LevelPlane, Receiver
 from bstcad.optics.sides import Sides, as_pair, spread
+from bstcad.optics.surfaces import Surface
 from bstcad.optics.trace import behind, from_first_net_to_each, is_transmitted, whole_kernel
 
 ALL = slice(None)  # all rows or columns
@@ -42,7 +44,6 @@ MAX_BROYDEN_STEPS = 30  # maximum number of Broyden steps of `rays_to`
 RAY_TOLERANCE = 1e-8  # distance of rays from their points at which the search ends, as a fraction of the grid's extent
 RELATIVE_DIFFERENCE_STEP = 1e-6  # step of the difference quotients of `rays_to`, as a fraction of the grid's extent
 MIN_BROYDEN_DIVISOR = 0.1  # divisor of a Broyden update, relative to the squared step, up to which there is no update
-MIN_ARRIVAL_COSINE = 1e-3  # smallest cosine with the axis by which a height is divided
 
 PIXELS: Scale = (0.0, 0.0, 1.0, 1.0)  # scale of corners in pixels
 
@@ -293,16 +294,17 @@ def rays_to(
     x, y = (p.to(lens.like.device) for p in (x, y))
     number = lens.number_of("back") if number is None else number
     face = lens.interfaces[number].surface
-    z = face.relative_sag_and_slope(x.to(lens.like), y.to(lens.like))[0].double()
+    h = face.relative_sag_and_slope(x.to(lens.like), y.to(lens.like))[0].double()
     sources: Sequence[Emitter] = (source,) if isinstance(source, Emitter) else source
     if not isinstance(source, Emitter):
-        x, y, z = (t.expand(len(sources), *t.shape[-2:]) for t in (x, y, z))
+        x, y, h = (t.expand(len(sources), *t.shape[-2:]) for t in (x, y, h))
     extent = float(torch.maximum(x.max() - x.min(), y.max() - y.min()))
     before = replace(lens.to(x.dtype).unbounded(), losses=None).interfaces[:number]  # in the precision of x and y
-    path = Path(tuple(sources), before, lens.entrance.z, z=face.z, sense=lens.passes.sense, extent=extent)
-    found = path.search(x, y, z)
+    path = Path(tuple(sources), before, lens.entrance.z, face=face, sense=lens.passes.sense, extent=extent)
+    found = path.search(x, y, h)
     status = found.rays.lose(found.error > 1e3 * path.tolerance, Status.VIGNETTED)
-    return found.x, found.y, replace(found.rays, position=torch.stack([x, y, z]), z=face.z, status=status)
+    at_face = face.chart.point(x, y, h)
+    return found.x, found.y, replace(found.rays, position=at_face, z=face.z, status=status, chart=face.chart)
 
 
 class Found(NamedTuple):
@@ -321,7 +323,7 @@ class Path:
     sources: tuple[Emitter, ...]
     before: Sequence[Interface]  # interfaces before the face, unbounded and without losses
     start: float  # z (mm) of the vertex plane of the first surface, through whose points rays are launched
-    z: float  # z (mm) of the plane of the face
+    face: Surface  # face, in whose chart the points and heights are given
     sense: int  # +1 or -1, direction of the light along z
     extent: float  # extent (mm) of the grid of points
 
@@ -340,7 +342,9 @@ class Path:
 
         x, y, height: (rows, columns) for one source, (k, rows, columns) for k sources.
         """
-        fast = ops.front_kernel("tubes.search", self.before, x) if x.dtype == torch.float64 else None
+        fast = None
+        if x.dtype == torch.float64 and self.face.chart is HEIGHTS:
+            fast = ops.front_kernel("tubes.search", self.before, x)
         if fast is not None and all(source.beam(self.start) is not None for source in self.sources):
             return fast(self, x=x, y=y, height=height)
         return search_plain(self, x, y, height)
@@ -361,8 +365,7 @@ class Path:
             points = zip(self.sources, x, y, strict=True)
             rays = stacked([source.rays_through(p, q, self.start, 1.0) for source, p, q in points])
         rays = functools.reduce(behind, self.before, rays)
-        s = rays.sense * (height - rays.above(self.z)) / (rays.sense * rays.direction[2]).clamp(min=MIN_ARRIVAL_COSINE)
-        return replace(rays, position=rays.position + s * rays.direction)
+        return self.face.arrive(rays, height)
 
 
 def search_plain(path: Path, x: Tensor, y: Tensor, height: Tensor) -> Found:
@@ -385,7 +388,7 @@ def search_plain(path: Path, x: Tensor, y: Tensor, height: Tensor) -> Found:
         p, q = (_interpolate(lines, sides, t) for t in (few.x, few.y))
     for _ in range(MAX_BROYDEN_STEPS):
         hit = path.arrive(p, q, height)
-        off_x, off_y = x - hit.position[0], y - hit.position[1]
+        off_x, off_y = (wanted - at for wanted, at in zip((x, y), hit.places, strict=True))
         error = torch.where(hit.alive, torch.maximum(off_x.abs(), off_y.abs()), torch.zeros_like(x))
         if not bool(error.any()):
             break  # the start is the solution, as for light along the axis
@@ -405,8 +408,10 @@ def _inverse_jacobian(
 ) -> list[Tensor]:
     """Return [xx, xy, yx, yy], the inverse of ∂(hit of `arrive`) / ∂(p, q) by difference quotients of `step` (mm)."""
     shifted = arrive(*(torch.cat(pair, dim=-2) for pair in ((p + step, p), (q, q + step), (height, height))))
-    one, two = ((moved - hit.position)[:2] / step for moved in shifted.position.chunk(2, dim=-2))
-    (xx, yx), (xy, yy) = one, two
+    (xx, xy), (yx, yy) = (
+        [(moved - at) / step for moved in place.chunk(2, dim=-2)]
+        for place, at in zip(shifted.places, hit.places, strict=True)
+    )
     det = xx * yy - xy * yx
     det = torch.where(det.abs() > 1e-6, det, torch.ones_like(det))
     return [yy / det, -xy / det, -yx / det, xx / det]

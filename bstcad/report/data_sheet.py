@@ -72,7 +72,7 @@ class DataSheet:
     @cached_property
     def apertures(self) -> dict[str, Outline | None]:
         """Clear aperture that the light needs on each face; None: the whole face."""
-        return needed_apertures(self.scene.source, self.lens)
+        return needed_apertures(self.scene.light, self.lens)
 
     @property
     def tables(self) -> dict[str, Rows]:
@@ -82,7 +82,7 @@ class DataSheet:
             mount=self.mount, light=self.scene.source, passed=self.passed, photometry=self.photometry,
             asked=self.scene.limits_light, folded=self.scene.folded,
             pairs=list(zip(self.scene.targets, self.figures, strict=True)), across=across, walls=wall_words,
-            apertures={face: _aperture(patch, self.lens.outline) for face, patch in self.apertures.items()},
+            apertures={face: _aperture(patch, self.lens.plan) for face, patch in self.apertures.items()},
             kinds_of_holes=kinds_of_holes,
             limits={face: settings_of(self.scene.tolerance, f"{face}.form").get("limit") for face in ("front", "back")},
         )  # fmt: skip

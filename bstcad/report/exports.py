@@ -139,9 +139,9 @@ def _files(
             if lens.front.is_net:
                 yield "turning-front.csv", turning_cloud(lens, (count + 1) // 2, lens.front)
         case "dxf":
-            yield "outline.dxf", dxf(lens.outline, mount, label)
+            yield "outline.dxf", dxf(lens.plan, mount, label)
         case "svg":
-            yield "outline.svg", svg(lens.outline, mount, label)
+            yield "outline.svg", svg(lens.plan, mount, label)
         case "preview":
             yield from preview_files(lens, label)
         case "ies" | "ldt" | "csv" if intensity is not None:
@@ -152,8 +152,8 @@ def _files(
 
 
 def _luminaire(lens: Lens, label: Label) -> Luminaire:
-    width, height = (2 * half for half in lens.outline.half_extent)
-    return Luminaire(label.name, size=(width, height, 0.0), is_round=isinstance(lens.outline, Circle))
+    width, height = (2 * half for half in lens.plan.half_extent)
+    return Luminaire(label.name, size=(width, height, 0.0), is_round=isinstance(lens.plan, Circle))
 
 
 @dataclass(frozen=True)
@@ -204,11 +204,11 @@ def turning_cloud(lens: Lens, points: int, face: Surface | None = None) -> str:
     same angles; neighbours on the outermost ring are one ring spacing apart.  Points outside the outline are omitted.
     The tool radius is not compensated.
     """
-    ring = np.linspace(0.0, float(np.hypot(*lens.outline.farthest)), points)
+    ring = np.linspace(0.0, float(np.hypot(*lens.plan.farthest)), points)
     count = round(2 * np.pi * (points - 1))
     radius, angle = (p.ravel() for p in np.meshgrid(ring, np.arange(count) * 360.0 / count, indexing="ij"))
     x, y = radius * np.cos(np.radians(angle)), radius * np.sin(np.radians(angle))
-    inside = lens.outline.contains(*(torch.from_numpy(p * (1 - 1e-12)) for p in (x, y))).numpy()  # with the rim
+    inside = lens.plan.contains(*(torch.from_numpy(p * (1 - 1e-12)) for p in (x, y))).numpy()  # with the rim
     face = face or lens.back
     height = sag(face, x[inside], y[inside]) - sag(face, 0.0, 0.0)
     return _csv(radius_mm=radius[inside], angle_deg=angle[inside], sag_mm=height)
@@ -226,8 +226,8 @@ def _sidecar(name: str, lens: Lens, points: int, light: GridLight | None) -> Ite
 
 
 def _inside(lens: Lens, points: int) -> tuple[np.ndarray, np.ndarray]:
-    x, y = (p.ravel() for p in np.meshgrid(*axes(lens.outline, points), indexing="ij"))
-    inside = lens.outline.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
+    x, y = (p.ravel() for p in np.meshgrid(*axes(lens.plan, points), indexing="ij"))
+    inside = lens.plan.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
     return x[inside], y[inside]
 
 

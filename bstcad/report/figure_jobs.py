@@ -79,7 +79,7 @@ class Pictures:
 
     def lens(self, lens: Lens) -> None:
         """Start the job `draw_lens`, a job `draw_transport` for each target, and the far field if it has a meaning."""
-        source, screens = self._scene.source.central, [target.screen for target in self._scene.targets]
+        source, screens = self._scene.light.central, [target.screen for target in self._scene.targets]
         self.begin(draw_lens, source, lens, screens)
         for k, screen in enumerate(screens):
             self.begin(draw_transport, source, lens, screen, number=k)
@@ -219,11 +219,11 @@ def surface_maps(lens: Lens, found: Survey, face: str = "back") -> Figure:
 
 def _sample(lens: Lens, face: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return x (n,), y (n,) and sag (mm), ∂z/∂x, ∂z/∂y (n, n) of a face, row 0 = y min, NaN outside the outline."""
-    reach_x, reach_y = lens.outline.half_extent
+    reach_x, reach_y = lens.plan.half_extent
     x = torch.linspace(-reach_x, reach_x, MAP_POINTS, dtype=torch.float64)
     y = torch.linspace(-reach_y, reach_y, MAP_POINTS, dtype=torch.float64)
     grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
-    inside = lens.outline.contains(grid_x, grid_y)
+    inside = lens.plan.contains(grid_x, grid_y)
     maps = (torch.where(inside, part, torch.nan) for part in face.plain().sag_and_slope(grid_x, grid_y))
     return tuple(part.detach().numpy() for part in (x, y, *maps))
 
@@ -236,7 +236,7 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
     """
     figure = new_figure(11.0, 3.4)
     close, whole = figure.subplots(1, 2, width_ratios=(1, 1.9))
-    reach = lens.outline.half_extent[0]
+    reach = lens.plan.half_extent[0]
     x = torch.linspace(-reach, reach, MAP_POINTS, dtype=torch.float64)
     faces = (lens.front.plain(), lens.back.plain())
     front, back = (face.sag_and_slope(x, torch.zeros_like(x))[0].detach().expand_as(x) for face in faces)
@@ -331,7 +331,7 @@ def light_path_of(scene: Scene, lens: Lens, pictures: Sequence[tuple[np.ndarray,
 
     pictures: (target, irradiance) of each target of the scene, (rows, columns) each.
     """
-    source, wanted_screens = scene.source.central, [target.screen for target in scene.targets]
+    source, wanted_screens = scene.light.central, [target.screen for target in scene.targets]
     screens = [drawn(screen, lens) for screen in wanted_screens]
     rays, flux = bundle(source, lens, max(screens, key=lambda screen: screen.plane.throw(0.0)).plane, RAYS)
     if not len(rays):
@@ -364,7 +364,7 @@ def _sizes(screens: Sequence[Screen]) -> str:
 
 def drawn(screen: Screen, lens: Lens) -> Screen:
     """Return the screen as pictures show it: directions at a distance of a few lens widths."""
-    place = screen.plane.drawn(2 * max(lens.outline.half_extent), lens.back.z)
+    place = screen.plane.drawn(2 * max(lens.plan.half_extent), lens.back.z)
     return screen if place == screen.plane else replace(screen, surface=place)
 
 

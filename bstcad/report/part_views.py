@@ -229,7 +229,7 @@ def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> Cro
     def height(surface: Surface, u: np.ndarray) -> np.ndarray:
         return (sag(surface, 0.0 * u, u) if upright else sag(surface, u, 0.0 * u)) - origin
 
-    half = mount.rim_of(lens.outline).outline.half_extent[upright]
+    half = mount.rim_of(lens.plan).outline.half_extent[upright]
     along = np.linspace(-half, half, SECTION_POINTS)
     back = height(lens.back, along)
     top = mount.top(lens) - origin if mount.draft or mount.bevel else math.inf
@@ -311,7 +311,7 @@ class Views:
     @property
     def rim(self) -> Outline:
         """Rim of the lens inside the part."""
-        return self.mount.rim_of(self.lens.outline).outline
+        return self.mount.rim_of(self.lens.plan).outline
 
     @property
     def outermost(self) -> Outline:

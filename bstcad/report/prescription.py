@@ -75,7 +75,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "wavelength": scene.source.main_wavelength,  # main line of a spectrum
         "material": material,  # None: only the index is known, or the optic is a mirror
         "index": lens.index,
-        "outline": asdict(lens.outline),
+        "outline": asdict(lens.plan),
         "clear": lens.clear and tuple(map(asdict, lens.clear)),  # clear apertures, front and back; None: whole outline
         "front": _own_outline(front) | _face(scene.lens.front.kind, lens.front_vertex, numbers) | fitted,
         "back": _face("bspline", vertex(lens), {}),
@@ -271,7 +271,7 @@ def part(
 
 def _corners(lens: Lens, whole: WholePart | None) -> tuple[Point, Point]:
     """Return the smallest and the largest x, y and z (mm) of a part."""
-    half = np.array(lens.outline.half_extent)
+    half = np.array(lens.plan.half_extent)
     edge = np.array([-half, half]) if whole is None else whole.edge
     faces = np.concatenate(heights(lens, None if whole is None else edge))
     low, high = np.array([*edge.min(0), faces.min()]), np.array([*edge.max(0), faces.max()])
@@ -304,7 +304,7 @@ def _front_radius(lens: Lens) -> float | None:
     if front.is_net:
         found = survey_front(lens).concave.largest
         return found if found < MAX_RADIUS else None
-    (x, y), (c, k) = (front.outline or lens.outline).farthest, front.conic()
+    (x, y), (c, k) = (front.outline or lens.plan).farthest, front.conic()
     if not c < 0:
         return None
     return max(1 - max(k, 0.0) * c * c * (x * x + y * y), 0.0) ** 1.5 / -c

@@ -331,7 +331,7 @@ def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> st
     For each face these are the positions x, y, z of (cells + 1)² nodes and their slopes along x and y; then x, y, z of
     the front and z of the back around the rim.  A path adds the keys of `_light`.
     """
-    from bstcad.cad.mesh import nodes, rim
+    from bstcad.cad.grids import nodes, rim
     from bstcad.optics.surfaces import sampled
 
     def at_nodes(surface: Surface) -> np.ndarray:

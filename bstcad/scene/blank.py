@@ -22,8 +22,19 @@ from bstcad.optics.passes import LENS, MIRROR, SECOND_SURFACE, Face, Passes
 from bstcad.optics.sides import MIN_SIDE, Sides, as_pair, coarser, in_proportion, simplified
 from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, Toroid
 from bstcad.runs import files
+from bstcad.scene.dome_back import RadialBack
 from bstcad.scene.errors import SceneError
-from bstcad.scene.schema import COORDINATES, LENGTHS, FileContent, OneOrTwo, Record, from_file, leaving_out
+from bstcad.scene.schema import (
+    COORDINATES,
+    LENGTHS,
+    MAX_CONTROL_POINTS,
+    NET_SIZES,
+    FileContent,
+    OneOrTwo,
+    Record,
+    from_file,
+    leaving_out,
+)
 from bstcad.step_text import part21
 from bstcad.step_text.placement import own_frame
 
@@ -34,6 +45,7 @@ if TYPE_CHECKING:  # importing this module loads numba
 MIN_CONIC_BEND, MAX_CONIC_BEND = -7.0, 0.85
 MAX_FITTED_SLOPE = 60.0  # degrees; steepest slope at the rim of a surface to which a net is fitted
 MAX_RECESS_SLOPE = 80.0  # degrees; steepest slope at the rim of a front with an outline of its own
+MAX_DOME_SLOPE = 89.5  # degrees; the same for the front of a dome
 MIN_RECESS_SAG = 1e-3  # mm; smallest sag at the rim of a front with its own outline, so that there is an edge
 MIN_RECESS_GAP = 1e-2  # mm; smallest distance between the outlines of the front and of the lens
 CONIC_CONSTANTS = (-1e3, 1e3)  # range of conic constants
@@ -46,8 +58,6 @@ NET_REMEDY = "give the folder of a design, its design.npz or its lens.step"
 MAX_AXIS_SINE = 1e-9  # sine of the largest angle between the axes of a net and x, y, z that counts as no rotation
 UNIFORM_TOLERANCE = 1e-9  # mm; largest deviation in x or y of a control point from a uniform grid
 VERTEX_TOLERANCE = 1e-12  # mm; a net whose vertex is this near to z = 0 is not shifted
-MAX_CONTROL_POINTS = 2049  # largest number of control points along a side of a net
-NET_SIZES = (MIN_SIDE, MAX_CONTROL_POINTS)  # range of the control points per side of a net
 FIT_TOLERANCE = 1e-6  # mm; largest difference in z of a fitted net and its surface (a toroid, or a user's class)
 FIT_SIZES = (33, 65, 129, 257, 513, 1025)  # control points per side of a fitted net, tried in this order
 MAX_CELL_RATIO = 1.5  # longer / shorter side of a cell of the net, above which a warning proposes another net
@@ -200,8 +210,11 @@ class _Front:
         """Return the front, fixed, with the parameters of `surface`; a front without free parameters is unchanged."""
         return replace(self, **surface.plain().parameters(), optimise=False) if self.free else self
 
-    def complaints(self, outline: Outline) -> Iterator[str]:
-        """Yield the faults of the front for a lens of this outline, as "key: sentence" with a key of lens.front."""
+    def complaints(self, outline: Outline, steepest: float = MAX_RECESS_SLOPE) -> Iterator[str]:
+        """Yield the faults of the front for a lens of this outline, as "key: sentence" with a key of lens.front.
+
+        steepest: largest slope (degrees) at the rim of a front with an outline of its own.
+        """
         own, half = self.outline, min(outline.half_extent)
         if own is None:
             return
@@ -213,9 +226,9 @@ class _Front:
         surface, (x, y) = self.surface, _farthest(own)
         _, slope, _ = surface.optical.relative_sag_and_slope(x, y)
         steep = math.degrees(math.atan(abs(float(slope)))) if bool(surface.optical.reaches(x, y)) else 90.0
-        if not steep <= MAX_RECESS_SLOPE:
+        if not steep <= steepest:
             ends = f"does not reach the rim of this outline, {own.radius:g} mm from the axis"
-            steeply = f"has a slope of {steep:.3g} degrees at its rim, and {MAX_RECESS_SLOPE:g} is the maximum"
+            steeply = f"has a slope of {steep:.3g} degrees at its rim, and {steepest:g} is the maximum"
             yield f"outline.diameter: the {self.kind} {ends if steep == 90.0 else steeply}; make the outline smaller"
         if not max(map(abs, surface.sags(own))) >= MIN_RECESS_SAG:
             flat = f"a front of curvature {surface.curvature:g} 1/mm is too flat to have an edge"
@@ -249,9 +262,9 @@ class SphereFront(_Front):
 
     __pydantic_config__ = STRICT
 
-    def complaints(self, outline: Outline) -> Iterator[str]:
+    def complaints(self, outline: Outline, steepest: float = MAX_RECESS_SLOPE) -> Iterator[str]:
         """Yield the faults: those of every front, and a sphere that does not reach the rim of the lens."""
-        yield from super().complaints(outline)
+        yield from super().complaints(outline, steepest)
         if self.outline is not None:
             return
         if not bool(self.surface.reaches(*_farthest(outline))):
@@ -273,9 +286,9 @@ class ConicFront(_Front):
 
     __pydantic_config__ = STRICT
 
-    def complaints(self, outline: Outline) -> Iterator[str]:
+    def complaints(self, outline: Outline, steepest: float = MAX_RECESS_SLOPE) -> Iterator[str]:
         """Yield the faults: a conic too steep at the rim, nearly a cone, or independent of its free parameter."""
-        yield from super().complaints(outline)
+        yield from super().complaints(outline, steepest)
         outline = self.outline or outline
         rim = sum(p * p for p in outline.farthest) ** 0.5
         bend = (1 + self.conic_constant) * (self.curvature * rim) ** 2
@@ -296,7 +309,7 @@ class _FittedFront(_Front):
         """Return the net fitted to the surface within FIT_TOLERANCE, with its vertex at self.z."""
         return _net_of(self.surface, outline)
 
-    def complaints(self, outline: Outline) -> Iterator[str]:
+    def complaints(self, outline: Outline, steepest: float = MAX_RECESS_SLOPE) -> Iterator[str]:
         """Yield the faults: a surface that does not reach the rim, or is too steep there for a net."""
         x, y = map(torch.from_numpy, outline.rim_points())
         _, z_x, z_y = self.surface.relative_sag_and_slope(x, y)
@@ -357,7 +370,7 @@ class NetFront(_Front):
         """Empty: a net has heights instead of parameters."""
         return ()
 
-    def complaints(self, outline: Outline) -> Iterator[str]:
+    def complaints(self, outline: Outline, steepest: float = MAX_RECESS_SLOPE) -> Iterator[str]:
         """Yield the faults: keys that need or exclude each other, or the net of a lens with another outline.
 
         A net may end two control-point spacings outside the outline (net_extent), or at the sides of a rectangle.
@@ -492,6 +505,9 @@ class Back(Record):
         return simplified(self.control_points)
 
 
+AnyBack = Annotated[Back | RadialBack, Field(discriminator="kind")]
+
+
 @dataclass(frozen=True)
 class Bounds:
     """Bounds on tailored faces everywhere inside the outline; a field that is None is no bound.
@@ -519,7 +535,7 @@ class LensBlank(Record):
     outline: Annotated[Outlined, Key("Rim of the lens.", example={"shape": "rectangle", "width": 24.0, "height": 24.0})]
     front: Annotated[Front, Key("Face at smaller z, where light enters a lens.", example={"kind": "plane", "z": 8.0})]
     back: Annotated[
-        Back,
+        AnyBack,
         Key("Face at larger z, tailored by default.", example={"kind": "bspline", "z": 20.0, "control_points": 257}),
     ]
     tool_radius: Annotated[
@@ -530,6 +546,16 @@ class LensBlank(Record):
     min_thickness: Annotated[float, Key("Minimum thickness along z; faces move to keep it.", "mm", *LENGTHS)] = 0.5
     max_thickness: Annotated[float | None, Key("Maximum thickness along z.", "mm", *LENGTHS)] = None
     edge_thickness: Annotated[float | None, Key("Minimum thickness along the rim.", "mm", *LENGTHS)] = None
+
+    @property
+    def dome(self) -> RadialBack | None:
+        """The back, if it is a dome."""
+        return self.back if isinstance(self.back, RadialBack) else None
+
+    def require_heights(self, what: str) -> None:
+        """Raise SceneError for a dome, with which the command or option `what` is not possible."""
+        if self.dome is not None:
+            raise SceneError(f"{what}: is not possible for a dome yet; use lens.step, lens.stl and the report")
 
     @property
     def passes(self) -> Passes:
@@ -651,13 +677,18 @@ class LensBlank(Record):
         if not self.back.optimise and not self.front.is_tailored:
             tailored = f'lens.front = {{ kind = "bspline", z = {self.front.z:g}, optimise = true }}'
             yield f"lens.back.optimise: false leaves no face to tailor; write {tailored}, or remove this key"
-        yield from (f"lens.front.{complaint}" for complaint in self.front.complaints(self.outline))
+        steepest = MAX_RECESS_SLOPE if self.dome is None else MAX_DOME_SLOPE
+        yield from (f"lens.front.{complaint}" for complaint in self.front.complaints(self.outline, steepest))
         (lowest, highest), thinnest, thickest = self.front_sags, self.min_thickness, self.max_thickness
         rim = "thinnest point" if self.front.surface.is_net else "rim"
         for where, front in (("centre", self.front.z), (rim, self.front.z + highest)):
             if not self.back.z - front >= thinnest:
                 thick = f"{self.back.z - front:g} mm thick at its {where}, and lens.min_thickness is {thinnest:g} mm"
-                yield f"lens.back.z: the lens is {thick}; move the back to z = {front + thinnest:g} or further"
+                remedy = f"z: the lens is {thick}; move the back to z = {front + thinnest:g} or further"
+                if self.dome is not None:
+                    least = front + thinnest - self.dome.centre[2]
+                    remedy = f"radius: the lens is {thick}; make the dome larger, {least:g} mm or more"
+                yield f"lens.back.{remedy}"
         if self.mould and self.tool_radius is None:
             yield "lens.mould: has no effect without lens.tool_radius; add that key, or remove mould"
         for key in ("min_thickness", "edge_thickness"):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from bstcad.optics import sampling
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.outlines import Outline
 from bstcad.scene.blank import INDICES, LensBlank
+from bstcad.scene.dome_back import MIN_DOME_POINTS
 
 UNITS = {
     "radius_1e2": " in mm",
@@ -15,6 +16,7 @@ UNITS = {
     "order": ", such as order = 10",
 }  # units of keys, in messages
 MIN_BEAM_COVERAGE = 0.9  # ratio of the widths of beam and lens below which a warning calls the rest of the lens dark
+DOME_FRONTS = ("sphere", "conic", "plane")  # kinds of fronts that a dome can have
 IRRADIANCE_SAMPLES = 200  # points per side of the lens at which the irradiance is sampled
 
 
@@ -106,3 +108,25 @@ def doubts(source: Emitter, rim: Outline, key: str) -> Iterator[str]:
             f"source.aperture: the beam is {2 * b:g} mm wide along {axis} and the lens {2 * h:g} mm; the lens is dark "
             f"outside {axis} = -{b:g} to {b:g} mm, so widen the beam or make {key} smaller"
         )
+
+
+def dome_complaints(source: Emitter, lens: LensBlank, given: Mapping[str, bool]) -> Iterator[str]:
+    """Yield what does not go with a dome; given: True for each further key that the scene has and a dome excludes."""
+    dome, instead = lens.dome, 'or give the lens a back of kind "bspline"'
+    if dome is None:
+        return
+    if source.parallel or source.kind != "point":
+        yield f'source.kind: a dome needs a lamp, kind = "point"; write one, {instead}'
+    if getattr(source, "rays", None) is not None:
+        yield f"source.rays: rays of a file cannot be traced through a dome yet; give source.intensity, {instead}"
+    if source.tilted:
+        yield f"source.tilt: the lamp of a dome shines along +z; remove this key, {instead}"
+    if any(dome.centre[:2]):
+        yield "lens.back.centre: lies beside the axis; give 0 for x and y, and shift source.position"
+    if dome.control_points is not None and dome.control_points < MIN_DOME_POINTS:
+        yield f"lens.back.control_points: {dome.control_points} are too few for a dome; give {MIN_DOME_POINTS} or more"
+    if lens.front.kind not in DOME_FRONTS or not lens.front.fixed or lens.front.reflect:
+        yield f"lens.front.kind: the front of a dome is a fixed sphere, conic or plane; write one of them, {instead}"
+    limits = {f"lens.{key}": True for key in (*lens.bounded_by, *(("mould",) if lens.mould else ()))}
+    for key in (key for key, has in (limits | dict(given)).items() if has):
+        yield f"{key}: is not possible with a dome yet; remove it, {instead}"

@@ -201,7 +201,8 @@ class Mount(Record):
         """Return z (mm) in the scene where draft begins: the flange's lower face, or without a flange `parting`."""
         if self.flange is not None:
             return self.flange.z
-        return parting(lens.back, lens.front, *self.rim_of(lens.outline).outline.rim_points())
+        rim = self.rim_of(lens.outline).outline.rim_points()
+        return parting(sag(lens.back, *rim), sag(lens.front, *rim))
 
     def _inset(self, rim: Outline, front: Surface, top: float) -> float:
         """Return the largest distance (mm) by which draft and bevel move the edge of the front inwards.
@@ -230,9 +231,12 @@ def as_cut(lens: Lens, mount: Mount | None) -> Lens:
     return lens if mount is None or mount.rim is None else replace(lens, outline=mount.rim.outline)
 
 
-def parting(back: Surface, front: Surface, x: np.ndarray, y: np.ndarray) -> float:
-    """Return z (mm) of the plane below the back's rim where draft begins without a flange; x, y: points of the rim."""
-    low, high = sag(back, x, y).min(), sag(front, x, y).max()
+def parting(back: np.ndarray, front: np.ndarray) -> float:
+    """Return z (mm) of the plane below the back's rim where draft begins without a flange.
+
+    back, front: z (mm) of points of the rims of back and front.
+    """
+    low, high = back.min(), front.max()
     return float(low - min(LAND, LAND * (low - high)))
 
 

@@ -29,12 +29,14 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Status
 from bstcad.optics.sides import Sides, as_pair
+from bstcad.optics.sphere_light import SphereLight
 from bstcad.optics.wavefront import MAX_RAY_ANGLE, PlaneWave, Wave, ZernikeWave
 from bstcad.runs import files
 from bstcad.scene import effects, elements, lighting, mount, picture, quality, scene_file
 from bstcad.scene.accept import Accept
 from bstcad.scene.beam import Collimated, of_beam
 from bstcad.scene.blank import LensBlank, as_front, net_extent
+from bstcad.scene.dome_back import RadialBack, complete
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
 from bstcad.scene.effects import Effects
 from bstcad.scene.elements import Around, Elements, LightPath
@@ -108,6 +110,7 @@ class Scene(Record):
         if not (self.title.isprintable() and len(self.title) <= 200):  # the terminal prints the title too
             yield "title: must be one line of up to 200 printable characters; shorten it"
         yield from self._of_targets(lambda target: target.complaints())
+        yield from lighting.dome_complaints(source, lens, self._of_dome)
         yield from lens.complaints()
         yield from lighting.complaints(source, lens)
         yield from effects.complaints(self.effects, lens)
@@ -141,6 +144,13 @@ class Scene(Record):
         yield from self.part.complaints(lens)
         if self.mount is not None:
             yield from mount.complaints(self.mount, lens)
+
+    @property
+    def _of_dome(self) -> dict[str, bool]:
+        """True for each key that the scene has and that does not go with a dome."""
+        tables = {key: bool(getattr(self, key)) for key in ("before", "behind", "wavefront", "mount", "tolerance")}
+        several, method = len(self.targets) > 1, self.tailoring.chosen_method != "least-squares"
+        return tables | {"target[1]": several, "tailoring.method": method, "output.export": bool(self.output.export)}
 
     def _of_targets(self, sentences: Callable[[Target], Iterable[str]]) -> Iterator[str]:
         """Yield the sentences on each target, with that target's key."""
@@ -275,11 +285,21 @@ class Scene(Record):
         """
         from bstcad.optics.bspline import BSplineSurface  # loads numba, which a scene alone does not need
 
+        if self.lens.dome is not None:
+            return self.assembled(self._flat_dome(self.lens.dome, net, as_wide_as or net))
         half_x, half_y = net_extent(self.lens.outline, as_wide_as or net)
         heights = torch.zeros(as_pair(net), dtype=torch.float64)
         back = BSplineSurface(self.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
         front, outline, passes = self.lens.flat_front(net, as_wide_as), self.lens.outline, self.lens.passes
         return self.assembled(Lens(front, back, outline, self.index, own_passes=passes))
+
+    def _flat_dome(self, dome: RadialBack, net: Sides, as_wide_as: Sides) -> Lens:
+        """Return a lens with a sphere about the centre as its back; its outline is the lit disc of the back's chart."""
+        from bstcad.optics.radial import RadialSurface
+
+        back = RadialSurface.sphere(dome.centre[2], dome.radius, net_extent(dome.lit, as_wide_as), as_pair(net))
+        front = self.lens.flat_front(net, as_wide_as)
+        return Lens(front, back, dome.lit, self.index, clear=(front.outline or self.lens.outline, dome.lit))
 
     def assembled(self, lens: Lens) -> Lens:
         """Return the lens with the scene's windows, mirrors and mount, and with its tailored faces marked."""
@@ -298,7 +318,7 @@ class Scene(Record):
         """
         if points is None:
             points = self.tailoring.points_of_source
-        return self._with_losses(channels_of(self.source, self.lens.index_at, points, draw))
+        return self._with_losses(channels_of(self.light, self.lens.index_at, points, draw))
 
     def verification_channels(self) -> tuple[Channel, ...]:
         """Return the channels of a verification: an extended source has other points than in tailoring."""
@@ -312,7 +332,7 @@ class Scene(Record):
         if self.source.extent is None:
             return None
         return Draw(
-            lambda points, seed: self._with_losses(drawn_channels(self.source, self.lens.index_at, points, seed))
+            lambda points, seed: self._with_losses(drawn_channels(self.light, self.lens.index_at, points, seed))
         )
 
     def _with_losses(self, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:
@@ -321,6 +341,14 @@ class Scene(Record):
         around = {nm: self.around(nm) for nm in lines}
         own = ((c, c.source.main_wavelength) for c in channels)
         return merge_wavelengths([replace(c, losses=losses[nm], around=around[nm]) for c, nm in own])
+
+    @property
+    def light(self) -> Emitter:
+        """The source, which a dome needs by the points of a sphere about its centre instead of by points of planes."""
+        dome = self.lens.dome
+        if dome is None:
+            return self.source
+        return SphereLight.of(self.source, dome.centre[2], dome.chart, half_angle=math.radians(dome.half_angle))
 
     def with_source_scaled(self, share: float) -> Self:
         """Return the scene with the size of its source times `share`; 0 makes it a point or a parallel beam."""
@@ -505,6 +533,7 @@ def _validated(
     if isinstance(listed := data.get("target"), list) and len(listed) == 1:  # messages call a single target "target"
         [data["target"]] = listed
     scene_file.check_plain(data)
+    complete(data.get("lens"))
     for outline in OUTLINES:
         for key, table in tables_at(data, outline):
             _circle(table, key)

@@ -19,12 +19,15 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Tag,
 from pydantic.functional_serializers import PlainSerializer, model_serializer
 from pydantic.json_schema import GenerateJsonSchema, WithJsonSchema
 
+from bstcad.optics.sides import MIN_SIDE
 from bstcad.runs import files
 
 FILE = Path(__file__).with_name("schema.json")
 TAGS = ("kind", "shape")  # keys whose value selects the record of a union
 ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # characters that escapes in TOML or Python denote, such as \n in "C:\new.png"
 LENGTHS, COORDINATES = (1e-3, 1e6), (-1e8, 1e8)  # ranges of lengths and of coordinates, mm
+MAX_CONTROL_POINTS = 2049  # largest number of control points along a side of a net
+NET_SIZES = (MIN_SIDE, MAX_CONTROL_POINTS)  # range of the control points per side of a net
 
 Node = Mapping[str, Any]
 # A number, or a pair of numbers along x and along y; the tags make messages refer to the form that was given.

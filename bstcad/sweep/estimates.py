@@ -77,7 +77,7 @@ def _downsample(picture: np.ndarray, limit: int) -> np.ndarray:
 
 def _central_channel(scene: Scene, *more: Effect) -> Channel:
     """Return the central channel of the source at its main wavelength; losses: by the scene's effects and `more`."""
-    source = scene.source.central
+    source = scene.light.central
     loss_factors = losses((*scene.effects, *more), scene.lens, source.main_wavelength)
     return Channel(source, scene.index, losses=loss_factors, around=scene.around(source.main_wavelength))
 
@@ -188,7 +188,7 @@ def _source_size(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
     if scene.source.extent is not None or (key := scene.source.size_key) is None:
         return
     stated, (default, shape, unit) = getattr(scene.source, f"real_{key}"), DEFAULT_SIZES[key]
-    wide = replace(reference.channel.source, **{key: stated or default})
+    wide = reference.channel.source.resized(key, stated or default)
     assert isinstance(wide.extent, Circle)  # the size is a diameter or an angle
     radius = wide.extent.radius
     points = ((wide.element(radius * u, radius * v), weight) for u, v, weight in DISC_POINTS)

@@ -26,6 +26,7 @@ from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.passes import Face
+from bstcad.optics.radial import RadialSurface
 from bstcad.optics.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError
@@ -52,6 +53,8 @@ def place_back(lens: Lens, z: float, least: float, bounds: Bounds | None = None)
     With bounds, the minimum thickness at the rim and the maximum thickness are met too, the latter also by a plane
     below `z`.  If the bounds are incompatible, the thickness violates minimum and maximum by equal lengths.
     """
+    if isinstance(lens.back, RadialSurface):  # its vertex stays
+        return lens
     x, y = thickness_points(lens)
     relative = lens.back.relative_sag_and_slope(x, y)[0]
     glass = z - lens.front.z + relative - lens.front.relative_sag_and_slope(x, y)[0]

@@ -9,7 +9,7 @@ best fit is a linear least-squares problem, which takes a few preconditioned con
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -54,7 +54,7 @@ def fit_slopes(
     u, v = surface.along_net(x, y)
     spectrum = Spectrum.of(surface)
     weight = weight / total(weight)
-    start = surface.heights
+    start = surface.potential
     damping = fit.bending * spectrum.energy * pitch_x * pitch_y
 
     def slopes(h: Tensor, some: slice = slice(None)) -> tuple[Tensor, Tensor]:
@@ -81,7 +81,7 @@ def fit_slopes(
         return adjoint(partial(slopes, spectrum.heights(c))) + damping * c
 
     c = conjugate_gradients(normal, torch.zeros_like(start), adjoint(missing), fit.steps)
-    return replace(surface, heights=start + spectrum.heights(c))
+    return surface.with_potential(start + spectrum.heights(c))
 
 
 def blocks(count: int) -> Iterator[slice]:
@@ -160,10 +160,10 @@ def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: Receiver, repeats:
     coming = across(rays, lens.interfaces[: lens.freeform[-1]])
     for _ in range(repeats):
         face = lens.last_freeform
-        at_face, _, _ = intersect(face.surface, coming, face.outline, face.status_if_missed)
+        at_face, _ = intersect(face.surface, coming, face.outline, face.status_if_missed)
         lit = at_face.alive & (at_face.flux > 0)
         z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in wanted_slopes(at_face, aim, plane, face.law))
-        samples = (*at_face.position[:2], z_x, z_y, lit.to(z_x))
+        samples = (*at_face.places, z_x, z_y, lit.to(z_x))
         x, y, z_x, z_y, weight = (t.reshape(-1) for t in samples)
         net = face.net
         lens = lens.with_last_net(fit_slopes(net, x, y, z_x=z_x, z_y=z_y, weight=weight).from_vertex().moved(net.z))

@@ -24,6 +24,7 @@ and the aim of each ray.  Stage 1 falls back on this map, and the baselines use 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +33,7 @@ from torch import Tensor
 
 from bstcad.optics import sampling
 from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.charts import HEIGHTS
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
@@ -45,7 +47,7 @@ from bstcad.optics.trace import across, behind, clear_window, is_transmitted
 from bstcad.optics.tubes import rays_to
 from bstcad.optics.unfolding import image_screen
 from bstcad.scene.errors import SceneError
-from bstcad.tailoring.slope_fit import Fit, blocks, fit_slopes
+from bstcad.tailoring.slope_fit import Fit, blocks, fit_slopes, monomials, with_polynomial
 from bstcad.transport.density import Density, resample_flux
 from bstcad.transport.mapping import Frame, Mapping, Points, TransportMap, nodes, solve
 from bstcad.transport.mapping import Solver as Solver  # exported to packages that may not import transport
@@ -57,6 +59,8 @@ GATHERING_NET, GATHERING_SAMPLES = 33, 96  # control points per side of g, and s
 GATHERING_WIDTH = (GATHERING_NET - 1) / (GATHERING_NET - 5)  # width of g / width of the window: end spans lie outside
 GATHERING_FIT = Fit(bending=1e-3, steps=40, degree=5)  # fit of g
 PARABOLOID_FIT = Fit(steps=0, degree=2)  # fit of g by a paraboloid, if no face can send all light to m
+BENDING_DEGREE, BENDING_STEP = 8, 1e-3  # degree of g on a dome; step of its differences / width of the window
+BENT_SHARE = 0.5  # share of a round's b(t) on a dome; with all of it large deflections make the rounds diverge
 PREVIEW_FIT, PREVIEW_SAMPLES = Fit(steps=0, degree=5), 32  # fit and samples per side of g in a preview, 5 times faster
 TARGET_FLOOR = 1e-3  # smallest irradiance of the target in the map of the paper, relative to its mean
 
@@ -114,7 +118,7 @@ def lit_window(source: Emitter, lens: Lens, n: int = 128) -> Rectangle:
         raise SceneError(
             "source: no ray reaches the tailored face; move the source away from the front, or lower lens.back.z"
         )
-    x, y, _ = grid.at_face.position
+    x, y = grid.at_face.places
     x_max, y_max = (float(p.abs()[lit].max()) + 2.5 * 2 * half / n for p, half in ((x, half_x), (y, half_y)))
     return Rectangle(2 * min(x_max, half_x), 2 * min(y_max, half_y))
 
@@ -148,12 +152,31 @@ def slope_map(
     """
     picture, screen, law = goal.picture, image_screen(lens, goal.receiver), lens.last_freeform.law
     t = pixel_corners(screen)
-    b = previous.face_points if previous else (np.zeros_like(t[0]), np.zeros_like(t[1]))
-    g = gathering(grid, lens, screen.plane, centroid(picture, screen), preview=preview)
+    flat = grid.at_face.chart is HEIGHTS
+    if previous:
+        b = previous.face_points
+    else:
+        b = (np.zeros_like(t[0]), np.zeros_like(t[1])) if flat else straight_points(grid, screen, lit_corners(picture))
+    if flat:
+        g = gathering(grid, lens, screen.plane, centroid(picture, screen), preview=preview)
+    else:
+        g = bending(grid, lens, screen.plane, t, points=b, lit=lit_corners(picture))
     needed = wanted_slopes(rays_at(grid, b), torch.from_numpy(np.stack(t)), screen.plane, law)
     sign = -1.0 if law.reverses or law.eta < 1 else 1.0
     found = transport_slopes(grid, picture, g, needed, points=b, sign=sign, solver=solver)
+    if not flat:
+        x, y = (BENT_SHARE * now + (1 - BENT_SHARE) * old for now, old in zip(found.face_points, b, strict=True))
+        found = replace(found, face_points=(x, y))
     return found if previous else replace(found, moved=math.nan)
+
+
+def straight_points(grid: FaceGrid, screen: Screen, lit: np.ndarray) -> Points:
+    """Return b for the pixel corners: points of the chart in the directions of the target, scaled to the lit window."""
+    aim = torch.from_numpy(np.stack(pixel_corners(screen)))
+    centre = Rays(torch.zeros_like(aim[:1]).expand(3, *aim.shape[1:]), aim, aim[0], aim[0], z=grid.at_face.z)
+    x, y, _ = (p.numpy() for p in grid.at_face.chart.coordinates(screen.plane.vector_to(centre, aim)))
+    scale = min(grid.window.width, grid.window.height) / 2 / float(np.hypot(x, y)[lit].max())
+    return scale * x, scale * y
 
 
 def square_grid(source: Emitter, lens: Lens, window: Rectangle, n: int) -> FaceGrid:
@@ -226,11 +249,46 @@ def gathering(
     """
     count, fit = (PREVIEW_SAMPLES, PREVIEW_FIT) if preview else (GATHERING_SAMPLES, GATHERING_FIT)
     few, law = grid.thinned(count), lens.last_freeform.law
-    x, y, _ = few.at_face.position
+    x, y = few.at_face.places
     aim = torch.stack([torch.full_like(x, m) for m in middle])
     reaches = reach_margin(few.at_face, aim, plane, law=law) >= 0  # False: the slope is a placeholder
-    fit = fit if bool(reaches[few.density > 0].all()) else PARABOLOID_FIT
+    fit = fit if few.at_face.chart is not HEIGHTS or bool(reaches[few.density > 0].all()) else PARABOLOID_FIT
     return fit_gathering(few, wanted_slopes(few.at_face, aim, plane, law), fit)
+
+
+def bending(
+    grid: FaceGrid, lens: Lens, plane: Receiver, corners: Points, *, points: Points, lit: np.ndarray
+) -> BSplineSurface:
+    """Return g whose second derivatives fit those of the slopes p(b, t) in b best, at the pairs b(t) of a round.
+
+    Where light is deflected by large angles, ∂p/∂b depends on t so much that the slopes towards one point m do not
+    serve: rounds with them diverge.  With this g the coordinate y of a target point hardly depends on b near b(t).
+    corners, points: t and b of the target's pixel corners.  lit: True at the corners that count.
+    """
+    half_x, half_y = (GATHERING_WIDTH * size / 2 for size in (grid.window.width, grid.window.height))
+    flat = torch.zeros((GATHERING_NET, GATHERING_NET), dtype=torch.float64)
+    net, law = BSplineSurface(0.0, flat, (-half_x, half_x), (-half_y, half_y)), lens.last_freeform.law
+    few = tuple(slice(None, None, max(1, n // GATHERING_SAMPLES)) for n in lit.shape)
+    x, y, *aims = (p[few][lit[few]] for p in (*points, *corners))
+    aim, step = torch.from_numpy(np.stack(aims)), BENDING_STEP * grid.window.width
+
+    def derivatives(slopes: Callable[[np.ndarray, np.ndarray], Slopes]) -> tuple[Tensor, ...]:
+        """Return ∂p_x/∂x, √2 times the mean of ∂p_x/∂y and ∂p_y/∂x, and ∂p_y/∂y by central differences."""
+        right, left, up, down = (slopes(x + i * step, y + j * step) for i, j in ((1, 0), (-1, 0), (0, 1), (0, -1)))
+        xx, yx = ((a - b) / (2 * step) for a, b in zip(right, left, strict=True))
+        xy, yy = ((a - b) / (2 * step) for a, b in zip(up, down, strict=True))
+        return xx, (xy + yx) / math.sqrt(2), yy
+
+    def needed(x: np.ndarray, y: np.ndarray) -> Slopes:
+        return wanted_slopes(rays_at(grid, (x, y)), aim, plane, law)
+
+    def of_net(heights: Tensor) -> tuple[Tensor, ...]:
+        surface = replace(net, heights=heights)
+        return derivatives(lambda x, y: surface.relative_sag_and_slope(torch.from_numpy(x), torch.from_numpy(y))[1:])
+
+    weight = torch.full((len(x),), 1 / len(x), dtype=torch.float64)
+    heights = with_polynomial(flat, monomials(net, BENDING_DEGREE), of_net, data=derivatives(needed), weight=weight)
+    return replace(net, heights=heights)
 
 
 def fit_gathering(grid: FaceGrid, slopes: Slopes, fit: Fit) -> BSplineSurface:
@@ -238,7 +296,7 @@ def fit_gathering(grid: FaceGrid, slopes: Slopes, fit: Fit) -> BSplineSurface:
     half_x, half_y = (GATHERING_WIDTH * size / 2 for size in (grid.window.width, grid.window.height))
     flat = torch.zeros((GATHERING_NET, GATHERING_NET), dtype=torch.float64)
     net = BSplineSurface(0.0, flat, (-half_x, half_x), (-half_y, half_y))
-    samples = (*grid.at_face.position[:2], *slopes, grid.density > 0)
+    samples = (*grid.at_face.places, *slopes, grid.density > 0)
     x, y, z_x, z_y, weight = (p.reshape(-1).cpu().double() for p in samples)
     return fit_slopes(net, x, y, z_x=z_x, z_y=z_y, weight=weight, fit=fit)
 
@@ -256,8 +314,10 @@ def interpolate(grid: FaceGrid, values: Tensor, b: Points) -> Tensor:
 
 def rays_at(grid: FaceGrid, b: Points) -> Rays:
     """Return the rays that meet the face at points b (mm), with sag and direction interpolated from the grid."""
-    sag, d_x, d_y, d_z = interpolate(grid, torch.cat([grid.at_face.position[2:], grid.at_face.direction]), b)
-    position = torch.stack([torch.from_numpy(b[0]), torch.from_numpy(b[1]), sag])
+    chart = grid.at_face.chart
+    *_, height = chart.coordinates(grid.at_face.position)
+    sag, d_x, d_y, d_z = interpolate(grid, torch.cat([height[None], grid.at_face.direction]), b)
+    position = chart.point(torch.from_numpy(b[0]), torch.from_numpy(b[1]), sag)
     direction = torch.stack([d_x, d_y, d_z]) / torch.sqrt(d_x * d_x + d_y * d_y + d_z * d_z)
     return replace(grid.at_face, position=position, direction=direction)
 

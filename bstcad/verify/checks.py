@@ -177,7 +177,7 @@ def verify(
     lit_goals = list(zip(nominal.goals, lights, strict=True))
     checks = (
         *text_checks.lens_checks(text, nominal.lens),
-        *text_checks.measure_checks(text.properties, whole, lens.outline),
+        *text_checks.measure_checks(text.properties, whole, lens.plan),
         *text_checks.part_checks(text, part),
         *solid_checks(),
         *of_aperture,

@@ -21,6 +21,7 @@ from bstcad.analysis.shape import thickness_range
 from bstcad.cad import mounting, solid_properties, step_reading
 from bstcad.cad.solid_properties import WholePart
 from bstcad.cad.step_reading import StepLens
+from bstcad.optics import domes
 from bstcad.optics.bspline import BSplineSurface, is_net
 from bstcad.optics.lens import Lens
 from bstcad.optics.passes import LENS, Passes
@@ -164,7 +165,7 @@ def _edge_checks(reread: StepLens, lens: Lens, bare: bool = True) -> Iterator[Ch
     (faces, on_face), (wall, on_wall) = step_reading.edge_deviations(reread.shape, lens)
     name = "solid: distance of edges from the faces they bound"
     yield Check.at_most(name, faces, GAP_TOLERANCE, unit="mm", where=on_face, id="edges-off-faces")
-    if bare:
+    if bare and not domes.is_dome(lens):
         name = "solid: distance of edges from the wall of the lens"
         yield Check.at_most(name, wall, GAP_TOLERANCE, unit="mm", where=on_wall, id="edges-off-wall")
 
@@ -179,11 +180,20 @@ def _form_checks(
         return
     points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(count, dtype=torch.float64)
     x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (face.x, face.y), strict=True))
-    found, normals = step_reading.sample(reread, x.numpy(), y.numpy(), of=of)
-    z, z_x, z_y = sampled(face, *found[:, :2].T)
-    wanted = np.stack([-z_x, -z_y, np.ones_like(z)], axis=1)
-    wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
-    off = np.abs(found - np.stack([x.numpy(), y.numpy(), z], axis=1)).max(axis=1)
+    in_file = getattr(reread, of)
+    if domes.is_radial(face) != domes.is_radial(in_file):
+        yield Check.true(form, False, f"the file's {of} is no {face.kind} surface as designed", id="form")
+        return
+    if domes.is_radial(face):
+        scale = in_file.x[1] / face.x[1]  # coordinates of a chart are proportional to the radius of its sphere
+        found, normals = step_reading.sample(reread, scale * x.numpy(), scale * y.numpy(), of=of)
+        place, wanted = domes.points_and_normals(face.plain(), x.numpy(), y.numpy())
+    else:
+        found, normals = step_reading.sample(reread, x.numpy(), y.numpy(), of=of)
+        z, z_x, z_y = sampled(face, *found[:, :2].T)
+        place, wanted = np.stack([x.numpy(), y.numpy(), z], axis=1), np.stack([-z_x, -z_y, np.ones_like(z)], axis=1)
+        wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
+    off = np.abs(found - place).max(axis=1)
     turned = np.linalg.norm(normals - wanted, axis=1)
     j, k = int(off.argmax()), int(turned.argmax())
     at_j, at_k = (f"at ({x[worst]:.4g}, {y[worst]:.4g}) mm" for worst in (j, k))
@@ -206,7 +216,7 @@ def _front_checks(reread: Surface, lens: Lens, tolerance: float) -> Iterator[Che
     name = f"form: curvature of the front, {difference}"
     yield Check.at_most(name, abs(found[0] - curvature), CURVATURE_TOLERANCE, "1/mm", id="front-curvature")
     if constant:
-        sag = abs(found[1] - constant) * abs(curvature) ** 3 * math.hypot(*lens.outline.farthest) ** 4 / 8
+        sag = abs(found[1] - constant) * abs(curvature) ** 3 * math.hypot(*lens.plan.farthest) ** 4 / 8
         name = f"form: sag at the rim due to the front's conic constant, {difference}"
         yield Check.at_most(name, sag, CONIC_TOLERANCE, "mm", id="front-conic")
 
@@ -272,7 +282,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
         name = f"{PART_FILE}: area, volume and centroid can be computed from the faces"
         stated = iter([Check.true(name, False, "a face is of an unknown kind", id="measures-unknown")])
     else:
-        stated = text_checks.measure_checks(text.properties, properties, lens.outline, PART_FILE)
+        stated = text_checks.measure_checks(text.properties, properties, lens.plan, PART_FILE)
     name = f"{PART_FILE}: deviation of the control points"
     return (
         *text_checks.structure_checks(text, lens.back_net.shape, PART_FILE),

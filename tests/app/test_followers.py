@@ -85,7 +85,8 @@ def test_a_choice_that_is_offered_is_possible_or_told_why_not(name, monkeypatch)
     usual["two_pictures"] |= {f"target[{k}].kind": {"intensity"} for k in (0, 1)}
     usual["mirror"] = {"lens.front.kind": {"bspline"}}
     usual["led"] = {"effects[0].kind": {"own"}}
-    assert {key: {*choices} for key, choices in greyed.items()} == usual.get(name, {})
+    usual.setdefault(name, {})["lens.back.kind"] = {"radial"}  # a dome needs a lamp and a radius
+    assert {key: {*choices} for key, choices in greyed.items()} == usual[name]
 
 
 def test_two_divergences_keep_their_rotation():

@@ -10,7 +10,7 @@ from bstcad.baselines import integration
 from bstcad.baselines.integration import FINEST_FIT, fit_heights, march
 from bstcad.optics import sampling
 from bstcad.optics.collimated import Collimated
-from bstcad.optics.interfaces import Reflect, Refract, deflect, intersect
+from bstcad.optics.interfaces import Reflect, Refract
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
@@ -22,6 +22,7 @@ from bstcad.scene import scene
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import stage1
 from bstcad.tailoring.run import Driver, Task
+from tests.by_slope import deflect, intersect
 from tests.lenses import net
 
 WIDE, LEVEL = Rectangle(40.0, 40.0), LevelPlane(900.0)

@@ -18,13 +18,14 @@ import torch
 
 from bstcad.optics import tubes
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.interfaces import MIN_COS_REFRACTION, Refract, deflect
+from bstcad.optics.interfaces import MIN_COS_REFRACTION, Refract
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.outlines import Circle
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Rays, Status
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Plane
+from tests.by_slope import deflect
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import DTYPES, NAMES, eps, landing_gradient, largest
 from tests.lenses import N, bundle, lens_of, uniform, wavy

@@ -17,13 +17,14 @@ import torch
 from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.collimated import Collimated
-from bstcad.optics.interfaces import Refract, deflect, intersect
+from bstcad.optics.interfaces import Refract
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import MIN_COS2, Plane, Sphere
+from tests.by_slope import deflect, intersect
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import DTYPES, ENGINES, NAMES, eps, first_crossing, largest, tracing
 from tests.lenses import N, bundle, lens_of, net, places, uniform, wavy

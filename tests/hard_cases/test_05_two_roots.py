@@ -17,7 +17,6 @@ import torch
 
 from bstcad.optics import trace
 from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.interfaces import intersect
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
@@ -25,6 +24,7 @@ from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Plane, Sphere
+from tests.by_slope import intersect
 from tests.hard_cases.lenses import DTYPES, ENGINES, NAMES, eps, first_crossing, largest, tracing
 from tests.lenses import SQUARE, N, bundle, net, places, uniform
 from tests.tracing import from_first_net_plain

@@ -16,12 +16,12 @@ import torch
 
 from bstcad.optics import trace
 from bstcad.optics.collimated import Collimated
-from bstcad.optics.interfaces import intersect
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Plane, Sphere
+from tests.by_slope import intersect
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import DTYPES, NAMES, engines, eps, largest
 from tests.lenses import bundle, lens_of, places, uniform, wavy

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from bstcad.optics import trace
 from bstcad.optics.collimated import Collimated
-from bstcad.optics.interfaces import Refract, deflect, intersect
+from bstcad.optics.interfaces import Refract
 from bstcad.optics.irradiance import LEDGER, Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
@@ -24,6 +24,7 @@ from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Sphere
 from bstcad.scene.scene import load
+from tests.by_slope import deflect, intersect
 from tests.conftest import DISK
 from tests.hard_cases.lenses import eps, examples, largest
 from tests.lenses import SQUARE, N, places, uniform, wavy

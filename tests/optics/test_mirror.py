@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bstcad.optics.collimated import Collimated
-from bstcad.optics.interfaces import Interface, Reflect, Refract, cross, deflect
+from bstcad.optics.interfaces import Interface, Reflect, Refract, cross
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.outlines import EVERYWHERE, Circle
 from bstcad.optics.point import Point
@@ -18,6 +18,7 @@ from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Conic, Plane, Sphere
 from bstcad.optics.trace import from_first_net, to_first_net, trace
 from bstcad.optics.tubes import launch_tubes, picture, rays_to
+from tests.by_slope import deflect
 from tests.lenses import bundle, lens_of, net
 from tests.tracing import from_first_net_plain, simulated
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bstcad.optics.goal import restricted
-from bstcad.optics.interfaces import Reflect, Refract, deflect
+from bstcad.optics.interfaces import Reflect, Refract
 from bstcad.optics.reach import (
     MAX_EXIT_ANGLE,
     MAX_SLOPE,
@@ -19,6 +19,7 @@ from bstcad.optics.reach import (
     wanted_slopes,
 )
 from bstcad.optics.receivers import LevelPlane, TiltedPlane
+from tests.by_slope import deflect
 from tests.lenses import bundle
 
 INDEX = 1.4936

@@ -7,12 +7,12 @@ import torch
 
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.collimated import Collimated
-from bstcad.optics.interfaces import intersect
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Toroid, sag
 from bstcad.optics.trace import to_first_net
+from tests.by_slope import intersect
 from tests.lenses import SQUARE, bundle, lens_of, net
 
 N = 1.5

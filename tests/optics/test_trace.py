@@ -8,13 +8,14 @@ import torch
 
 from bstcad.optics import sampling, trace
 from bstcad.optics.collimated import Collimated
-from bstcad.optics.interfaces import Refract, deflect, intersect
+from bstcad.optics.interfaces import Refract
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Plane, Sphere
+from tests.by_slope import deflect, intersect
 from tests.lenses import SQUARE, N, bundle, net, places, tilted, wavy
 from tests.tracing import from_first_net_plain, stratified
 

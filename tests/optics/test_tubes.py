@@ -7,12 +7,12 @@ import torch
 
 from bstcad.optics import tubes
 from bstcad.optics.collimated import Collimated
-from bstcad.optics.interfaces import intersect
 from bstcad.optics.irradiance import Screen, rrmsd
 from bstcad.optics.outlines import EVERYWHERE, Circle, Rectangle, Rounded
 from bstcad.optics.point import Point
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import to_first_net
+from tests.by_slope import intersect
 from tests.lenses import lens_of, net
 from tests.tracing import simulated
 

@@ -7,7 +7,7 @@ import torch
 
 from bstcad.optics import sampling
 from bstcad.optics.collimated import Collimated
-from bstcad.optics.interfaces import Refract, deflect, intersect
+from bstcad.optics.interfaces import Refract
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
@@ -18,6 +18,7 @@ from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.trace import to_first_net, trace
 from bstcad.tailoring.merit import mean_square_miss
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, tailor_to_aim
+from tests.by_slope import deflect, intersect
 from tests.lenses import SQUARE, net
 from tests.tracing import stratified
 

@@ -15,7 +15,7 @@ Rays that land on several screens are traced to the face once.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -43,8 +43,8 @@ CROSSING_WORK, ADJOINT_WORK = WORK + 3 * BLOCK, WORK + 20 * BLOCK  # lengths of 
 
 
 @njit(error_model="numpy")
-def _load(position, direction, status, first, count, work):
-    """Store rays first … first + count - 1; status (k, n): a ray is lost if its status is so for all k screens."""
+def load(position, direction, status, first, count, work):
+    """Load rays first … first + count - 1; status (k, n): a ray is lost if its status is so for all k screens."""
     for r in range(count):
         at = first + r
         work[X + r], work[Y + r], work[Z + r] = position[0, at], position[1, at], position[2, at]
@@ -77,17 +77,18 @@ def _tilted_screen(tilted, k):
 
 
 @compiled()
-def _cross(net, faces, screens, width, position, direction, status, outs, path, cosine, first, last):
+def _cross(net, faces, screens, width, position, direction, status, outs, hits, cosine, first, last):
     """Trace rays first … last - 1 to the face and refract or reflect them.
 
     screens: None, or `Screens` on which rays land.  outs: (2, n) for each screen, which receives the landing points;
-    or (3, n) and (3, n), which receive hit (mm) and direction behind the face.  path (n,) receives the path to the face
-    (mm), status (screens, n) is updated, and cosine (n,) receives the cosine of the angle of incidence, if not empty.
+    or (3, n) and (3, n), which receive hit (mm) and direction behind the face.  hits: one array (n,), which receives
+    the path to the face (mm).  status (screens, n) is updated, and cosine (n,) receives the cosine of the angle of
+    incidence, if not empty.
     """
-    work, active = np.empty(CROSSING_WORK), np.empty(BLOCK, np.uint32)
+    work, active, path = np.empty(CROSSING_WORK), np.empty(BLOCK, np.uint32), hits[0]
     for begin in range(first, last, BLOCK):
         count = min(BLOCK, last - begin)
-        _load(position, direction, status, begin, count, work)
+        load(position, direction, status, begin, count, work)
         forward.start_search(net, faces, count, work)
         forward.to_net(faces, count, work)
         if width >= BLOCK:  # the rows before are in earlier blocks
@@ -109,14 +110,14 @@ def _cross(net, faces, screens, width, position, direction, status, outs, path, 
             for r in range(count):
                 cosine[begin + r] = work[forward.COS_BACK + r] if work[FATE + r] == 0.0 else 1.0
         if screens is None:
-            _store(0, count, work, begin, status, outs[0])
-            _store_directions(count, work, begin, direction, outs)
+            store(0, count, work, begin, status, outs[0])
+            store_directions(count, work, begin, direction, outs)
         else:
-            _land(faces, screens, count, work, begin, status, outs)
+            land_on_each(faces, screens, count, work, begin, status, outs)
 
 
 @njit(error_model="numpy")
-def _land(faces, screens, count, work, first, status, outs):
+def land_on_each(faces, screens, count, work, first, status, outs):
     """Trace rays from the face to each screen, and store where they land."""
     for k in range(screens.throws.size):
         for r in range(count):
@@ -125,11 +126,12 @@ def _land(faces, screens, count, work, first, status, outs):
             else:
                 work[X + r], work[Y + r], work[FATE + r] = work[HIT_X + r], work[HIT_Y + r], work[HIT_FATE + r]
         forward.to_screen(faces, screens.throws[k], _tilted_screen(screens.tilted, k), count, work)
-        _store(k, count, work, first, status, outs[k])
+        store(k, count, work, first, status, outs[k])
 
 
 @njit(error_model="numpy")
-def _store(k, count, work, first, status, out):
+def store(k, count, work, first, status, out):
+    """Store status k and the places of rays first … first + count - 1 in out (2, n); 0 for lost rays."""
     for r in range(count):
         fate = work[FATE + r]
         status[k, first + r] = np.uint8(fate)
@@ -138,7 +140,7 @@ def _store(k, count, work, first, status, out):
 
 
 @njit(error_model="numpy")
-def _store_directions(count, work, first, direction, outs):
+def store_directions(count, work, first, direction, outs):
     """Store the height of the hit and the direction behind the face; a lost ray keeps its direction."""
     hit, behind = outs[0], outs[-1]
     for r in range(count):
@@ -177,6 +179,12 @@ def _restore_hit(net, faces, flat, path, first, count, work):
         work[H_YY + r] = hyy * faces.per_y * faces.per_y
 
 
+@njit(inline="always")
+def cosine_behind(eta, cos_in):
+    """Return cos θ' of Snell's law; 0 beyond the critical angle, or where rounding makes its square negative."""
+    return math.sqrt(max(1.0 - eta * eta * (1.0 - cos_in * cos_in), 0.0))
+
+
 @njit(error_model="numpy", fastmath={"contract"})
 def _leave(faces, count, work):
     """Compute, at the slopes of the hit, the direction behind the face and what the chain rule needs for it."""
@@ -191,7 +199,7 @@ def _leave(faces, count, work):
         if faces.reflects:
             cos_out, s = cos_in, -2.0 * along * norm2
         else:
-            cos_out = math.sqrt(max(1.0 - eta * eta * (1.0 - cos_in * cos_in), 0.0))  # rounding may make it negative
+            cos_out = cosine_behind(eta, cos_in)
             s = norm * cos_out - eta * along * norm2
         work[NORM + r], work[COS_OUT + r], work[SHIFT + r] = norm, cos_out, s
         work[E_X + r], work[E_Y + r], work[E_Z + r] = eta * dx - s * p, eta * dy - s * q, eta * dz + s
@@ -331,7 +339,8 @@ def _chain(faces, count, work, path, d_rays, first):
 
 
 @njit(error_model="numpy")
-def _load_gradient(faces, screens, g, more, status, first, count, work):
+def load_gradient(faces, screens, g, more, status, first, count, work):
+    """Load ∂L/∂(hit, direction behind the face, path, cosine of incidence); g, more: as in `_cross_adjoint`."""
     if screens is None:
         hit, direction = g[0], g[-1]
         for r in range(count):
@@ -349,32 +358,42 @@ def _load_gradient(faces, screens, g, more, status, first, count, work):
 
 
 @compiled()
-def _cross_adjoint(net, faces, screens, position, direction, status, path, g, more, d_rays, first, last, own, touched):
-    """Add to `own` (m, n) the gradient of the merit in the net, from rays first … last - 1 (see reductions.py).
+def _cross_adjoint(net, faces, screens, position, direction, status, hits, g, more, d_rays, first, last, own, touched):
+    """Add to own[0] (m, n) the gradient of the merit in the net, from rays first … last - 1 (see reductions.py).
 
     g: gradients in `outs` of `_cross`.  more: gradients in path and cosine of incidence (2, n), or (2, 0).  d_rays:
     None, or (6, n), which receives the gradient in positions and directions.
     """
-    work = np.empty(ADJOINT_WORK)
+    work, path = np.empty(ADJOINT_WORK), hits[0]
     for begin in range(first, last, BLOCK):
         count = min(BLOCK, last - begin)
-        _load(position, direction, status, begin, count, work)
+        load(position, direction, status, begin, count, work)
         flat = d_rays is None and forward.are_axial(count, work)  # the slopes at the hit do not change with the path
         _restore_hit(net, faces, flat, path, begin, count, work)
         _leave(faces, count, work)
-        _load_gradient(faces, screens, g, more, status, begin, count, work)
+        load_gradient(faces, screens, g, more, status, begin, count, work)
         _chain(faces, count, work, path, d_rays, begin)
         for r in range(count):
             if work[FATE + r] != 0.0:
                 work[Z + r] = work[SLOPE_X + r] = work[SLOPE_Y + r] = 0.0
         u, v, g_h = work[U : U + count], work[V : V + count], work[Z : Z + count]
-        scatter(own, touched, u, v, g_h, work[SLOPE_X : SLOPE_X + count], work[SLOPE_Y : SLOPE_Y + count])
+        scatter(own[0], touched[0], u, v, g_h, work[SLOPE_X : SLOPE_X + count], work[SLOPE_Y : SLOPE_Y + count])
+
+
+class Form(NamedTuple):
+    """Kernels for one kind of spline surface."""
+
+    cross: Callable[..., None]  # trace of rays across the face, as `_cross`
+    adjoint: Callable[..., None]  # adjoint of `cross`, as `_cross_adjoint`
+    hits: int  # number of arrays (n,) that `cross` stores for `adjoint`; the first is the path to the face (mm)
+    prepare: Callable[[Rays, Interface], tuple[Rays, Tensor, Any]]  # (rays to be traced, nets, face as numbers)
 
 
 class Crossing(NamedTuple):
-    """Parameters of a crossing besides the net and the rays."""
+    """Parameters of a crossing besides the nets and the rays."""
 
-    faces: Faces  # face as numbers; the fields of the front and of a screen are unused
+    form: Form
+    faces: Any  # face as numbers; the fields of the front and of a screen are unused
     screens: Screens | None  # screens on which the rays land; None: they go on behind the face
     lossy: bool  # True if the face has losses, which need path and angle of incidence
     width: int  # number of rays in a row of the grid of rays
@@ -386,8 +405,9 @@ class Crossing(NamedTuple):
 
 
 class Cross(torch.autograd.Function):
-    """Map (heights, position (3, n), direction (3, n), status (n,), crossing) to (status, path, cos θ, *outs).
+    """Map (nets, position (3, n), direction (3, n), status (n,), crossing) to (status, path, cos θ, *outs).
 
+    nets: heights (1, m, n), or the components (3, m, n) of control points (mm).
     outs: landing points (2, n) mm for each screen; or, if rays go on, hit (mm) and direction behind the face, (3, n)
     each.  status: (screens, n), or (1, n).  path (n,) to the face (mm) and cos θ (n,) of incidence have a gradient if
     `crossing.lossy`; otherwise cos θ is empty.  The gradient is taken in heights, positions and directions, where
@@ -396,27 +416,30 @@ class Cross(torch.autograd.Function):
 
     @staticmethod
     def forward(  # noqa: D102
-        ctx: Any, heights: Tensor, position: Tensor, direction: Tensor, status: Tensor, crossing: Crossing
+        ctx: Any, nets: Tensor, position: Tensor, direction: Tensor, status: Tensor, crossing: Crossing
     ) -> Any:
         n, (count, components) = status.numel(), crossing.shapes
         outs = tuple(torch.empty((components, n), dtype=position.dtype) for _ in range(count))
-        path, cosine = torch.empty(n, dtype=torch.float64), torch.ones(n if crossing.lossy else 0, dtype=torch.float64)
+        hits = [torch.empty(n, dtype=torch.float64) for _ in range(crossing.form.hits)]
+        cosine = torch.ones(n if crossing.lossy else 0, dtype=torch.float64)
         fate = status.expand(count if crossing.screens else 1, n).clone()
-        inputs = [net_of(heights), *crossing[:2], crossing.width, *(t.detach().numpy() for t in (position, direction))]
-        results = fate.numpy(), tuple(out.numpy() for out in outs), path.numpy(), cosine.numpy()
-        reductions.on_threads(lambda first, last: _cross(*inputs, *results, first, last), reductions.shares(n, BLOCK))
-        ctx.save_for_backward(heights, position, direction, fate, path)
+        inputs = [net_of(nets), *crossing[1:3], crossing.width, *(t.detach().numpy() for t in (position, direction))]
+        results = fate.numpy(), _arrays(outs), _arrays(hits), cosine.numpy()
+        cross = crossing.form.cross
+        reductions.on_threads(lambda first, last: cross(*inputs, *results, first, last), reductions.shares(n, BLOCK))
+        ctx.save_for_backward(nets, position, direction, fate, *hits)
         ctx.crossing = crossing
-        ctx.mark_non_differentiable(fate, *(() if crossing.lossy else (path, cosine)))
+        ctx.mark_non_differentiable(fate, *(() if crossing.lossy else (hits[0], cosine)))
         ctx.set_materialize_grads(False)
-        return fate, path, cosine, *outs
+        return fate, hits[0], cosine, *outs
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, _: None, g_path: Tensor | None, g_cosine: Tensor | None, *g: Tensor | None) -> Any:  # noqa: D102
-        heights, position, direction, fate, path = ctx.saved_tensors
-        n, shape = path.numel(), (ctx.crossing.shapes[1], path.numel())
-        known = tuple((position.new_zeros(shape) if each is None else each.contiguous()).numpy() for each in g)
+        (nets, position, direction, fate, *hits), crossing = ctx.saved_tensors, ctx.crossing
+        n = hits[0].numel()
+        shape = (crossing.shapes[1], n)
+        known = _arrays([position.new_zeros(shape) if each is None else each.contiguous() for each in g])
         more = np.empty((2, 0))
         if g_path is not None or g_cosine is not None:
             more = np.zeros((2, n))
@@ -424,41 +447,59 @@ class Cross(torch.autograd.Function):
                 row[:] = 0.0 if part is None else part.numpy()
         d_rays = torch.empty((6, n), dtype=position.dtype) if any(ctx.needs_input_grad[1:3]) else None
         shares = reductions.shares(n, BLOCK)
-        buffers = reductions.buffers(len(shares), *heights.shape)
-        inputs = [net_of(heights), *ctx.crossing[:2], *(t.detach().numpy() for t in (position, direction, fate, path))]
+        buffers = [reductions.buffers(len(shares), *nets.shape[1:]) for _ in nets]
+        inputs = [net_of(nets), *crossing[1:3], *_arrays([position, direction, fate]), _arrays(hits)]
         inputs += [known, more, None if d_rays is None else d_rays.numpy()]
-        tasks = [(*share, own, rows) for share, own, rows in zip(shares, *buffers, strict=True)]
-        reductions.on_threads(lambda *task: _cross_adjoint(*inputs, *task), tasks)
+        owns, ranges = (zip(*each, strict=True) for each in zip(*buffers, strict=True))
+        tasks = [(*share, own, touched) for share, own, touched in zip(shares, owns, ranges, strict=True)]
+        reductions.on_threads(lambda *task: crossing.form.adjoint(*inputs, *task), tasks)
+        d_nets = torch.from_numpy(np.stack([reductions.merged(*each) for each in buffers])).to(nets.dtype)
         d_position, d_direction = (None, None) if d_rays is None else (d_rays[:3], d_rays[3:])
-        return torch.from_numpy(reductions.merged(*buffers)).to(heights.dtype), d_position, d_direction, None, None
+        return d_nets, d_position, d_direction, None, None
 
 
-def landed(rays: Rays, interface: Interface, planes: Sequence[Receiver]) -> tuple[Landed, ...]:
+def _arrays(tensors: Sequence[Tensor]) -> tuple[np.ndarray, ...]:
+    return tuple(t.detach().numpy() for t in tensors)
+
+
+def prepare_heights(rays: Rays, interface: Interface) -> tuple[Rays, Tensor, Faces]:
+    """Return (rays that start below the net, heights (1, m, n) in the frame of the kernels, face as numbers)."""
+    if rays.axial and interface.status_if_missed == Status.MISSED_FRONT:
+        rays = _start_below_net(rays, interface)
+    heights, (faces, _) = interface.net.heights[None], kernel_arguments.faces(interface, None, rays.sense, rays.z)
+    return rays, -heights if rays.sense < 0 else heights, faces
+
+
+HEIGHTS = Form(_cross, _cross_adjoint, 1, prepare_heights)
+
+
+def landed(rays: Rays, interface: Interface, planes: Sequence[Receiver], form: Form = HEIGHTS) -> tuple[Landed, ...]:
     """Trace rays across a net to each of the receivers, as `interfaces.cross` and `Receiver.land` do."""
-    status, traced, positions = _across(rays, interface, planes)
+    status, traced, positions = _across(rays, interface, planes, form)
     pairs = zip(positions, status, strict=True)
     return tuple(Landed(position, traced.flux, fate, traced.taken) for position, fate in pairs)
 
 
-def behind(rays: Rays, interface: Interface) -> Rays:
+def behind(rays: Rays, interface: Interface, form: Form = HEIGHTS) -> Rays:
     """Trace rays across a net, as `interfaces.cross` does."""
-    _, traced, outs = _across(rays, interface, ())
+    surface = interface.surface
+    _, traced, outs = _across(rays, interface, (), form)
     position, direction = (reflect_z(out, rays.sense) for out in outs)
     sense = -rays.sense if interface.law.reverses else rays.sense
-    return replace(traced, position=position, direction=direction, z=interface.surface.z, axial=False, sense=sense)
+    traced = replace(traced, position=position, direction=direction, z=surface.z, axial=False, sense=sense)
+    return replace(traced, chart=surface.chart)
 
 
-def _across(rays: Rays, interface: Interface, planes: Sequence[Receiver]) -> tuple[Tensor, Rays, tuple[Tensor, ...]]:
+def _across(
+    rays: Rays, interface: Interface, planes: Sequence[Receiver], form: Form
+) -> tuple[Tensor, Rays, tuple[Tensor, ...]]:
     """Return (status for each plane; rays behind the face, with old positions and directions; `outs` of `Cross`)."""
-    shape, heights, lossy = rays.status.shape, interface.net.heights, bool(interface.losses)
-    if rays.axial and interface.status_if_missed == Status.MISSED_FRONT:
-        rays = _start_below_net(rays, interface)
+    shape, lossy = rays.status.shape, bool(interface.losses)
+    rays, nets, faces = form.prepare(rays, interface)
     vectors = (reflect_z(t, rays.sense).reshape(3, -1).contiguous() for t in (rays.position, rays.direction))
-    faces, _ = kernel_arguments.faces(interface, None, rays.sense, rays.z)
     screens = kernel_arguments.screens(interface, planes, rays.sense) if planes else None
     status, path, cos_in, *outs = Cross.apply(
-        -heights if rays.sense < 0 else heights, *vectors, rays.status.reshape(-1),
-        Crossing(faces, screens, lossy, width=shape[-1]),
+        nets, *vectors, rays.status.reshape(-1), Crossing(form, faces, screens, lossy, width=shape[-1]),
     )  # fmt: skip
     status = status.view(len(status), *shape)
     traced = replace(rays, status=status.amin(0) if len(status) > 1 else status[0])  # lost: on none of the planes

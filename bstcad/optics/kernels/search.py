@@ -13,7 +13,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from bstcad.optics import tubes
+from bstcad.optics import surfaces, tubes
 from bstcad.optics.kernels import kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.forward import (
@@ -50,7 +50,7 @@ class Limits(NamedTuple):
     tolerance: float  # error (mm) at which the search ends
     steps: float  # maximum number of Broyden steps
     divisor: float  # tubes.MIN_BROYDEN_DIVISOR
-    cosine: float  # tubes.MIN_ARRIVAL_COSINE
+    cosine: float  # surfaces.MIN_ARRIVAL_COSINE
 
 
 @njit(error_model="numpy")
@@ -162,11 +162,11 @@ def search(path: Path, x: Tensor, y: Tensor, height: Tensor) -> Found:
     shape, count = x.shape, len(path.sources)
     rays, (flux, error) = torch.empty((3, *shape), dtype=torch.float64), torch.empty((2, *shape), dtype=torch.float64)
     points, fate = torch.empty((2, *shape), dtype=torch.float64), torch.empty(shape, dtype=torch.uint8)
-    given = [x, y, path.sense * (height + (path.z - path.start)), *points, rays, flux, fate, error]
+    given = [x, y, path.sense * (height + (path.face.z - path.start)), *points, rays, flux, fate, error]
     arrays = [t.reshape(*t.shape[: t.ndim - len(shape)], count, -1).numpy() for t in given]
     beams = [source.beam(path.start) for source in path.sources]
     front = kernel_arguments.front_face(path.before, path.sense)
-    numbers = path.step, path.tolerance, tubes.MAX_BROYDEN_STEPS, tubes.MIN_BROYDEN_DIVISOR, tubes.MIN_ARRIVAL_COSINE
+    numbers = path.step, path.tolerance, tubes.MAX_BROYDEN_STEPS, tubes.MIN_BROYDEN_DIVISOR, surfaces.MIN_ARRIVAL_COSINE
     limits = Limits(*map(float, numbers))
 
     def some(k: int, first: int, last: int) -> None:
@@ -177,5 +177,5 @@ def search(path: Path, x: Tensor, y: Tensor, height: Tensor) -> Found:
     if path.sense < 0:
         rays[2].neg_()
     axial = all(source.is_shift_invariant for source in path.sources) and all(f.surface.level for f in path.before)
-    found = Rays(torch.stack([x, y, height]), rays, flux, fate, axial=axial, z=path.z, sense=path.sense)
+    found = Rays(torch.stack([x, y, height]), rays, flux, fate, axial=axial, z=path.face.z, sense=path.sense)
     return tubes.Found(points[0], points[1], found, error)

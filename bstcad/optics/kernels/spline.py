@@ -75,11 +75,9 @@ def _row(net, at, b0, b2, q0, q2):
 
 
 @njit(inline="always")
-def sag(net, m, n, u, v):
-    """Return (h, ∂h/∂u, ∂h/∂v) from differences of heights; net: flattened (m, n); u, v in spacings (bspline.py)."""
-    i, a0, a2, p0, p2 = basis(u, m)
-    j, b0, b2, q0, q2 = basis(v, n)
-    at = np.uint64(i * n + j)  # unsigned, so that no negative index is tested for
+def piece(net, n, at, along_u, along_v):
+    """Return (h, ∂h/∂u, ∂h/∂v) of the span whose first control point has the index `at`; the others: from `basis`."""
+    (a0, a2, p0, p2), (b0, b2, q0, q2) = along_u, along_v
     f0, g0, _ = _row(net, at, b0, b2, q0, q2)
     f1, g1, _ = _row(net, at + np.uint64(n), b0, b2, q0, q2)
     f2, g2, _ = _row(net, at + np.uint64(2 * n), b0, b2, q0, q2)
@@ -88,12 +86,9 @@ def sag(net, m, n, u, v):
 
 
 @njit(inline="always")
-def curved(net, m, n, u, v):
-    """Return (h, ∂h/∂u, ∂h/∂v, ∂²h/∂u², ∂²h/∂u∂v, ∂²h/∂v²), as `sag` does."""
-    i, a0, a2, p0, p2 = basis(u, m)
-    j, b0, b2, q0, q2 = basis(v, n)
-    c_u, c_v = bend(u, m), bend(v, n)
-    at = np.uint64(i * n + j)
+def curved_piece(net, n, at, along_u, along_v, bends):
+    """Return (h, ∂h/∂u, ∂h/∂v, ∂²h/∂u², ∂²h/∂u∂v, ∂²h/∂v²), as `piece` does; bends: `bend` along u and v."""
+    (a0, a2, p0, p2), (b0, b2, q0, q2), (c_u, c_v) = along_u, along_v, bends
     f0, g0, k0 = _row(net, at, b0, b2, q0, q2)
     f1, g1, k1 = _row(net, at + np.uint64(n), b0, b2, q0, q2)
     f2, g2, k2 = _row(net, at + np.uint64(2 * n), b0, b2, q0, q2)
@@ -102,6 +97,24 @@ def curved(net, m, n, u, v):
     low, high = g1 - g0, g2 - g1
     h_v, h_uv = g1 - a0 * low + a2 * high, p0 * low + p2 * high
     return h, h_u, h_v, h_uu, h_uv, c_v * (k1 - a0 * (k1 - k0) + a2 * (k2 - k1))
+
+
+@njit(inline="always")
+def sag(net, m, n, u, v):
+    """Return (h, ∂h/∂u, ∂h/∂v) from differences of heights; net: flattened (m, n); u, v in spacings (bspline.py)."""
+    i, a0, a2, p0, p2 = basis(u, m)
+    j, b0, b2, q0, q2 = basis(v, n)
+    # the index is unsigned, so that no negative index is tested for
+    return piece(net, n, np.uint64(i * n + j), (a0, a2, p0, p2), (b0, b2, q0, q2))
+
+
+@njit(inline="always")
+def curved(net, m, n, u, v):
+    """Return (h, ∂h/∂u, ∂h/∂v, ∂²h/∂u², ∂²h/∂u∂v, ∂²h/∂v²), as `sag` does."""
+    i, a0, a2, p0, p2 = basis(u, m)
+    j, b0, b2, q0, q2 = basis(v, n)
+    at, bends = np.uint64(i * n + j), (bend(u, m), bend(v, n))
+    return curved_piece(net, n, at, (a0, a2, p0, p2), (b0, b2, q0, q2), bends)
 
 
 @njit(inline="always")

@@ -1,0 +1,124 @@
+"""Light of a lamp described on a sphere about a point, where planes would end: light of a half space for domes.
+
+Emitters describe their light by points (x, y) of a plane.  Light that leads along this plane never meets it, and light
+near that direction meets it far away.  `SphereLight` describes the light of a point near the centre c of a sphere by
+the stereographic coordinates (x, y) of the point q = c + R d at which it leaves the sphere (charts.SphereChart).  With
+the radiant intensity I of the source at p, the unit vector s = (q - p) / |q - p| and the stretch s_c of the chart,
+
+    E(x, y) = I(s) (s · d) / |q - p|² s_c²    (1/mm² of the chart).
+
+I follows from the irradiance E_D of the source on the plane at the distance D: I = E_D D² / cos³ θ, θ from +z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from bstcad.optics.charts import SphereChart
+from bstcad.optics.emitters import Emitter, Wavelength, all_alive
+from bstcad.optics.motion import Motion
+from bstcad.optics.outlines import Circle, Outline, Rectangle
+from bstcad.optics.rays import Rays, Vector
+
+MIN_AXIAL_COSINE = 1e-6  # smallest cosine with +z of light: beyond it no irradiance on a plane is known
+
+
+@dataclass(frozen=True)
+class SphereLight(Emitter):
+    """Light of a source above its plane, within `half_angle` of +z, by points of a sphere about (0, 0, z)."""
+
+    source: Emitter  # lamp near the centre of the sphere
+    z: float  # z of the centre of the sphere, mm
+    chart: SphereChart
+    half_angle: float  # angle (rad) from +z, seen from the centre, up to which light is launched
+
+    wavelength: Wavelength = 0.0  # wavelength of the source, nm
+
+    kind = "sphere"
+
+    @classmethod
+    def of(cls, source: Emitter, z: float, chart: SphereChart, half_angle: float) -> SphereLight:
+        """Return the light of a source."""
+        return cls(source, z, chart, half_angle=half_angle, wavelength=source.wavelength)
+
+    def irradiance(self, x: Tensor, y: Tensor, z: float) -> Tensor:
+        """Return E(x, y) (1/mm² of the chart); z: not used.  The total flux is 1."""
+        return self._light(x, y)[2]
+
+    def rays_through(self, x: Tensor, y: Tensor, z: float, area: float) -> Rays:
+        """Return rays through (x, y) of the sphere, each with the flux of a cell of `area` (mm² of the chart)."""
+        position, direction, density = self._light(x, y)
+        return Rays(position, direction, density * area, all_alive(x), z=self.z)
+
+    def _light(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return (position of the source relative to the centre, unit vectors s, E) for points of the sphere."""
+        d = self.chart.direction(x, y)
+        start_x, start_y, start_z = self.source.start_point(self.z)
+        start = torch.tensor((start_x, start_y, start_z - self.z)).to(x).view(3, *([1] * x.ndim))
+        path = self.chart.radius * d - start
+        length = torch.sqrt((path * path).sum(0))
+        s = path / length
+        ahead = s[2] > MIN_AXIAL_COSINE
+        axial = torch.where(ahead, s[2], torch.ones_like(length))
+        distance = self.chart.radius
+        on_plane = [p * (distance / axial) for p in s[:2]]
+        e = self.source.irradiance(on_plane[0] + start_x, on_plane[1] + start_y, start_z + distance)
+        intensity = torch.where(ahead, e * distance**2 / axial**3, torch.zeros_like(e))
+        stretch = (1 + d[2]) / 2
+        density = intensity * (s * d).sum(0) / length**2 * stretch**2
+        return start.expand_as(s), s, torch.where(self._within(x, y), density, torch.zeros_like(density))
+
+    def _within(self, x: Tensor, y: Tensor) -> Tensor:
+        return x * x + y * y <= self.chart.length(self.half_angle) ** 2 * (1 + 1e-12)
+
+    def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
+        """Return the square of the chart with all directions within the half angle."""
+        side = 2 * self.chart.length(self.half_angle)
+        return Rectangle(side, side)
+
+    @property
+    def extent(self) -> Outline | None:
+        """Extent of the source."""
+        return self.source.extent
+
+    @property
+    def central(self) -> SphereLight:
+        """Light of the centre of the source, at the main wavelength."""
+        return replace(self, source=self.source.central, wavelength=self.main_wavelength)
+
+    def element(self, x: float, y: float) -> SphereLight:
+        """Return the light of the simple source at (x, y) of the extent."""
+        return replace(self, source=self.source.element(x, y))
+
+    def scaled(self, share: float) -> SphereLight:
+        """Return the light of the source with its extent multiplied by `share`."""
+        return replace(self, source=self.source.scaled(share))
+
+    def resized(self, key: str, size: float) -> SphereLight:
+        """Return the light of the source with another size."""
+        return replace(self, source=self.source.resized(key, size))
+
+    def moved(self, motion: Motion, entrance: float) -> SphereLight:
+        """Return the light of the moved source; the sphere stays."""
+        return replace(self, source=self.source.moved(motion, entrance))
+
+    def sizes(self) -> Iterator[tuple[str, float | tuple[float, float], str]]:
+        """Yield (key, size, unit) for each key that defines the extent of the source."""
+        yield from self.source.sizes()
+
+    def start_point(self, entrance: float) -> Vector:
+        """Return the centre of the source (mm)."""
+        return self.source.start_point(entrance)
+
+    @property
+    def size_key(self) -> str | None:  # type: ignore[override]
+        """Scene key of the size of the source."""
+        return self.source.size_key
+
+    def spot(self, z: float) -> tuple[Outline | None, tuple[float, float]]:
+        """Return (disc of the half angle, its centre in the chart)."""
+        return Circle(self.chart.length(self.half_angle)), (0.0, 0.0)
