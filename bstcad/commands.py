@@ -473,8 +473,6 @@ def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> Exp
 
 def _export(made: Made, kinds: Sequence[str], folder: Path, points: int | None = None) -> Exported:
     scene, lens = made.scene, made.lens
-    if kinds:
-        scene.lens.require_heights("export")
     light = GridLight(scene.light.central, tuple(target.screen for target in scene.targets))
     far = far_field_of(scene)
     return exports.export(

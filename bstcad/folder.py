@@ -425,7 +425,10 @@ def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
         front = front.with_parameters(**{name.removeprefix("front_"): float(found[name]) for name in _numbers(front)})
     if blank.dome is not None:
         flat = scene.flat_lens(blank.back.net).with_front(front)
-        return flat.with_back(RadialSurface.like(flat.back, found["control_points"]))
+        try:
+            return flat.with_back(RadialSurface.like(flat.back, found["control_points"]))
+        except ValueError as error:
+            raise SceneError(f"{DESIGN}: {error}; {REMEDY}") from None
     back = _surface(found["control_points"], blank.back.z)
     return scene.assembled(Lens(front, back, blank.outline, scene.index, own_passes=blank.passes))
 

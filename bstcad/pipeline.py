@@ -35,7 +35,7 @@ from bstcad.tailoring.feasibility import find_demand, is_infeasible
 from bstcad.tailoring.grazing import without_reflection
 from bstcad.tailoring.machinability import BOUNDS_STAGE, active_bounds, enforce_bounds, place_back
 from bstcad.tailoring.merit import PictureError
-from bstcad.tailoring.reachable import reachable
+from bstcad.tailoring.reachable import DomeReach, reachable, reachable_by_dome
 from bstcad.tailoring.run import (
     BEST_LENS_STAGE,
     NO_HOOKS,
@@ -70,6 +70,7 @@ COMPARISON_STAGE = "float32 beside float64"  # name of the stage that compares p
 # picture of 512 x 512 pixels, and per target for the finer flux tubes that two nets need.
 BASE_SECONDS, SECONDS_PER_NET, SECONDS_PER_PICTURE, SECONDS_PER_WITNESS = 4.0, 5.0, 3.0, 15.0
 REACH_NET = 33  # control points per side of the flat back with which the reach of light is computed
+MAX_ASTRAY = 0.05  # largest fraction of a dome's light that may reach no lit part of the target
 MIN_REACHABLE = 1e-3  # reachable fraction of a target's light up to which a scene is refused
 REACH_REMEDIES = {  # advice for a target that light cannot reach completely, for each optic
     "lens": "move the target nearer to the axis or further away, raise lens.index, or use a mirror",
@@ -233,13 +234,16 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
     """
     if scene.lens.front.is_tailored:  # with two tailored faces `with_solution` finds the limits
         return None, None
-    if scene.lens.dome is not None:  # coarse maps take minutes, and a dome's light is judged in the report
-        return None, None
     channels = scene.with_source_scaled(0.0).channels()
     light = max(channels, key=lambda channel: channel.weight)  # channel of stage 1
     lens, grazing = light.through(scene.flat_lens(REACH_NET)), MAX_EXIT_ANGLE
     if refracts := lens.passes.largest_deflection(light.index) is not None:
         grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.light, lens))
+    if scene.lens.dome is not None:
+        found = reachable_by_dome(light.source, lens, goal, grazing=grazing)
+        if found.astray > MAX_ASTRAY:
+            raise SceneError(light_astray(scene, found))
+        return found.part, None  # no part of the light is held from total internal reflection yet
     part = reachable(light.source, lens, goal, grazing=grazing)
     if part is not None and scene.lens.front.free:  # another front may send light further
         free, effort = scene.lens.front.free, stage1.FrontSearch(repeats=1)
@@ -252,6 +256,17 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
     if scene.target.unreachable == "refuse":
         raise SceneError(f"{goal.key}: {unreachable(scene, part, goal.picture)}; {REACH_REMEDIES[scene.optic]}")
     return part, Edge(light, grazing) if refracts else None
+
+
+def light_astray(scene: Scene, found: DomeReach) -> str:
+    """Return a sentence on light that a dome cannot send to the target."""
+    deflection, angle = scene.lens.passes.largest_deflection(scene.index), math.degrees(found.beyond)
+    limit = "" if deflection is None else f", which bends light by up to {deflection:.3g} degrees"
+    return (
+        f"lens.back.half_angle: {100 * found.astray:.2g} % of the light, {angle:.3g} degrees and more from the axis, "
+        f"cannot reach a lit part of the target through the dome{limit}; give a smaller half_angle, a wider target, "
+        "or a front that bends light to the axis, such as a plane"
+    )
 
 
 def unreachable(scene: Scene, part: np.ndarray, picture: np.ndarray) -> str:
@@ -486,6 +501,11 @@ def require_bounded_light(scene: Scene, rrmsd: float) -> float:
 def check_thickness(lens: Lens, scene: Scene) -> None:
     """Raise SceneError, before stage 2, if the back crosses the front or reaches the next element or target."""
     thinnest, thickest = thickness_range(lens.plain())
+    if not thinnest > 0 and scene.lens.dome is not None:
+        raise SceneError(
+            f"lens.back.radius: the dome that the target needs would cross the front by {-thinnest:.3g} mm; "
+            "increase the radius, or move the target to where the light falls without the lens"
+        )
     if not thinnest > 0:
         raise SceneError(
             f"lens.front.z: the back that the target needs would cross the front by {-thinnest:.3g} mm; "

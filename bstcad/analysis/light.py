@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bstcad.analysis.neglected_effects import difference
 from bstcad.analysis.shape import ripple
-from bstcad.optics import sampling
+from bstcad.optics import domes, sampling
 from bstcad.optics.channels import Channel, points_per_line
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import cross, deflect, intersect
@@ -168,6 +168,7 @@ def mount_losses(lens: Lens, channels: Sequence[Channel], flange: tuple[float, f
     """Return the losses of a lens at its mount; flange: z (mm) of the two ends of its opening; None: no flange."""
     uncut = passing = blocked = 0.0
     n = max(MIN_MOUNT_RAYS, math.ceil(MOUNT_RAYS / math.sqrt(len(channels))))
+    rim = domes.opening(lens) if domes.is_dome(lens) else lens.apertures[1]
     for channel in channels:
         own = replace(channel.through(lens), losses=None)
         bare = replace(own, clear=None)
@@ -180,7 +181,7 @@ def mount_losses(lens: Lens, channels: Sequence[Channel], flange: tuple[float, f
         uncut += float(whole.flux[whole.alive].sum())
         passing += float(out.flux[out.alive].sum())
         if flange is not None:
-            blocked += float(out.flux[out.alive & _misses_opening(through, own.apertures[1], flange)].sum())
+            blocked += float(out.flux[out.alive & _misses_opening(through, rim, flange)].sum())
     return MountLosses(1 - passing / uncut if uncut else 0.0, blocked / passing if passing else 0.0)
 
 

@@ -2,6 +2,7 @@
 
 A beam that fills the lens keeps filling it.  A lens that is moved or made thicker keeps its distance from the wall.
 A beam with another profile gets the width that it needs.  With a closed lock, width and height keep their ratio.
+A back that becomes a dome gets a front about the lamp.
 No key follows an invalid value.  In the text of a scene, each key can still be set alone.
 
 `impossible_choices` tries the choices of a form and returns those that the scene cannot have, with the reasons.
@@ -14,6 +15,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from bstcad.app.dome_offer import BACK_KIND, changes_of_kind
 from bstcad.app.form import LOCKED_SIDES, form
 from bstcad.app.kinds import are_numbers, extent, table_at, value_at
 from bstcad.app.scene_text import changed, is_same, tables
@@ -81,6 +83,8 @@ def with_followers(data: Mapping[str, Any], key: str, value: Any, locked: bool =
         targets = data.get("target")
         names = [f"target[{k}].z" for k in range(len(targets))] if isinstance(targets, list) else ["target.z"]
         changes |= {name: _rounded(z + value - before) for name in names if are_numbers(z := value_at(name, data))}
+    if key == BACK_KIND:
+        return changes | changes_of_kind(data, value)
     return changes | (_profile_widths(data, value) if key == "source.profile" else {})
 
 

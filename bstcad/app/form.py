@@ -36,7 +36,8 @@ MAIN_FIELDS: tuple[Mapping[str, str], ...] = (
         "lens.outline.radius": "Radius of the lens",
     },
     {"lens.outline.height": "Height of the lens"},
-    {"lens.back.z": "Position of the back face at its centre (z)"},
+    {"lens.back.z": "Position of the back face at its centre (z)", "lens.back.radius": "Radius of the dome"},
+    {"lens.back.half_angle": "Half angle of the dome"},
     {"lens.material": "Material", "lens.index": "Refractive index"},
     {"source.kind": "Light source"},
     {"source.wavelength": "Wavelength"},
@@ -225,6 +226,8 @@ def _group(key: str, node: Node, table: Table, data: Table, removable: bool = Fa
             groups.append(_list(at, inner, value, data, maximum=maximum))
         elif isinstance(value, dict):
             groups.append(_group(at, inner, value, data, removable=name not in required))
+        elif at == "lens.outline" and value_at("lens.back.kind", data) == "radial":
+            continue  # a dome ends at its half angle
         elif at in OPTIONAL_TABLES or len(may_be) > 1 or may_be[0].get("required"):
             additions.append(Addition(at, ADDITIONS.get(at, f"Add {_label(at)}"), new_table(at, data)))
         else:  # a table that exists by default

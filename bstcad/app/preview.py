@@ -26,6 +26,7 @@ from bstcad.optics.sides import as_pair, coarser
 from bstcad.optics.source_images import landing_pixels
 from bstcad.optics.tubes import corners, middle
 from bstcad.report.light_figures import rrmsd
+from bstcad.scene.dome_back import MIN_DOME_POINTS
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Hooks, Progress
@@ -111,7 +112,7 @@ def reduced_scene(scene: Scene, size: PreviewSize) -> Scene:
     """Return the scene with the pixels, control points and tailoring settings of a preview, and the default method."""
     several = len(scene.targets) > 1 or scene.wavefront is not None
     size_factor, evaluations_factor = (GOALS_SIZE_FACTOR, GOALS_EVALUATIONS_FACTOR) if several else (1.0, 1)
-    max_net = round(size_factor * size.net)
+    max_net = max(round(size_factor * size.net), 0 if scene.lens.dome is None else MIN_DOME_POINTS)
     net = scene.lens.back.control_points or max_net
     if max(as_pair(net)) > max_net:
         net = coarser(net, max_net)

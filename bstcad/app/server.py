@@ -14,6 +14,7 @@ import sys
 import traceback
 import zipfile
 from collections.abc import Awaitable, Callable, Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +27,12 @@ from starlette.staticfiles import StaticFiles
 
 import bstcad
 from bstcad import folder as folders
-from bstcad.app import crop, design_runs, form, preview_json, scene_text, sketch
+from bstcad.app import crop, design_runs, dome_offer, form, preview_json, scene_text, sketch
 from bstcad.app.connections import bound, uvicorn_server
 from bstcad.app.design_runs import SCENE_TEXT, Run
 from bstcad.app.followers import impossible_choices, take_change
 from bstcad.app.guard import POLICY, SANDBOX, Guard
+from bstcad.app.preview import Preview
 from bstcad.app.preview_desk import STAGES, PreviewDesk, PreviewRequest
 from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
 from bstcad.report import manual, record
@@ -346,7 +348,7 @@ class Workbench:
         page, number = str(_required(body, "page"))[:40], _integer(_required(body, "number"))
         asking = PreviewRequest(page, number, self.workspace.scene(name, text), text)
         self.desk.ask(asking)
-        return self._answered(asking, 0)
+        return self._answered(name, asking, 0)
 
     def answer(self, request: Request) -> Response:
         """Answer with the result of a stage (?page, number, stage); {}: not finished; {replaced: true}: outdated."""
@@ -355,9 +357,9 @@ class Workbench:
         body = self.desk.last(_required(query, "page"))
         if body is None or body.number != number or not 0 <= stage < len(STAGES):
             return JSONResponse({"replaced": True})
-        return JSONResponse(self._answered(body, stage))
+        return JSONResponse(self._answered(request.path_params["name"], body, stage))
 
-    def _answered(self, body: PreviewRequest, stage: int) -> dict[str, Any]:
+    def _answered(self, scene: str, body: PreviewRequest, stage: int) -> dict[str, Any]:
         answer = self.desk.answer(body, stage, ANSWER_TIMEOUT)
         if answer is None:
             return {"replaced": True} if body.replaced else {}
@@ -369,8 +371,20 @@ class Workbench:
             why = self.workspace.without_paths(files.first_line(found))
             return head | {"refused": f"the computation failed ({why}); a design may still succeed"}
         if name in ("preview", "settled"):
-            return head | preview_json.of_preview(found)
+            return head | preview_json.of_preview(found) | {"offer": self._offer(scene, body.text, found)}
         return head | (preview_json.of_plan(found) if name == "effects" else preview_json.of_predictions(found))
+
+    def _offer(self, name: str, text: str, found: Preview) -> dict[str, Any] | None:
+        """Return the offer of a dome in place of the lens of a preview; None without an offer."""
+
+        def fault(each: str) -> str | None:
+            return (self._fault(name, each) or {}).get("sentence")
+
+        if found.scene.lens.dome is not None or found.scene.source.parallel:
+            return None
+        changed, _ = take_change(text, dome_offer.BACK_KIND, dome_offer.DOME, is_valid=lambda each: fault(each) is None)
+        made = dome_offer.offer(found, scene_text.tables(changed), fault(changed))
+        return None if made is None else asdict(made)
 
     # ---- designs ----
 

@@ -19,10 +19,17 @@ def svg(data: Mapping[str, Any]) -> str:
     targets = target if isinstance(target, list) else [target]
     if not all(isinstance(table, Mapping) for table in (lens, source, *targets)) or not targets:
         return ""
-    front, back, wall = _number("front.z", lens), _number("back.z", lens), _number("z", targets[0])
+    is_dome = value_at("back.kind", lens) == "radial"
+    front, wall = _number("front.z", lens), _number("z", targets[0])
+    back = _dome_z(lens) if is_dome else _number("back.z", lens)
     sizes = {"outline": _across(lens.get("outline")), "thickness": _between(front, back)}
     sizes |= {"width": _range(targets[0].get("x")), "height": _range(targets[0].get("y"))}
-    kinds = {"mirror": is_mirror(data), "point": source.get("kind") != "collimated", "walls": len(targets)}
+    kinds = {
+        "mirror": is_mirror(data),
+        "point": source.get("kind") != "collimated",
+        "walls": len(targets),
+        "dome": is_dome,
+    }
     template = environment().get_template("sketch.svg.j2")
     return template.render(distance=_between(back, wall), **sizes, **kinds)
 
@@ -30,6 +37,13 @@ def svg(data: Mapping[str, Any]) -> str:
 def _number(key: str, data: Any) -> float | None:
     value = value_at(key, data) if isinstance(data, Mapping) else None
     return value if are_numbers(value) else None
+
+
+def _dome_z(lens: Any) -> float | None:
+    """Return z (mm) of the vertex of a dome; None if a number is missing."""
+    centre, radius = value_at("back.centre", lens) or [0.0], _number("back.radius", lens)
+    known = isinstance(centre, list) and are_numbers(centre[-1]) and radius is not None
+    return centre[-1] + radius if known else None
 
 
 def _between(start: float | None, end: float | None) -> str:

@@ -232,6 +232,11 @@ class BSplineSurface(Surface):
         return replace(self, z=self.z + vertex, heights=self.heights - vertex)
 
     @property
+    def vertex_z(self) -> float:
+        """Position (mm) of the vertex on the axis."""
+        return float(self.from_vertex().z)
+
+    @property
     def potential(self) -> Tensor:
         """Heights (m, n) of the net whose slopes are those of the surface in its chart (charts.py): its own heights."""
         return self.heights

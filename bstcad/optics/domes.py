@@ -12,6 +12,7 @@ itself, without a ring.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -21,11 +22,13 @@ from typing_extensions import TypeIs
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.radial import RadialSurface
+from bstcad.optics.rays import Rays
 from bstcad.optics.surfaces import Conic, Recess, Sphere, Surface, sag
 
 BASE_MARGIN = 0.5  # largest default distance of the base plane below both lit rims (mm)
 MIN_HEIGHT_FRACTION = 2e-3  # smallest height of the base plane over the inner face's equator, relative to its radius
 MIN_WALL = 1e-3  # smallest height of the wall, width of the ring and thickness along z (mm)
+SILHOUETTE_RINGS = 181  # number of angles from the axis among which the edge of a dome is searched
 RIM_SAMPLES = 1440  # number of points of the rim at which its height is examined
 SAMPLES_PER_SPAN = 2  # number of points per knot span, along each axis, at which the thickness is examined
 
@@ -73,6 +76,67 @@ def rim_radius(outline: Outline) -> float:
     if not isinstance(outline, Circle):
         raise ValueError(f"lens.outline: {outline.words} is not a circle; give a dome a circle in its chart")
     return float(outline.radius)
+
+
+def in_chart_of(other: RadialSurface, surface: Surface, outline: Outline) -> tuple[RadialSurface, Circle]:
+    """Return a radial surface and the circle of an outline in the chart of another one, of the same angles.
+
+    The coordinates of a chart are proportional to its radius R, and the distances R + h do not depend on it.
+    Raises ValueError if the surface is not radial.
+    """
+    if not is_radial(surface):
+        raise ValueError("the back is not the radial surface of a dome; generate the design again")
+    factor = other.radius / surface.radius
+    (x0, x1), (y0, y1) = surface.x, surface.y
+    heights = surface.heights + (surface.radius - other.radius)
+    x, y = (factor * x0, factor * x1), (factor * y0, factor * y1)
+    moved = replace(surface, heights=heights, x=x, y=y, radius=other.radius)
+    return moved, Circle(factor * rim_radius(outline))
+
+
+def opening(lens: Lens) -> Circle:
+    """Return the smallest circle about the axis around the rim of a dome, seen along the axis (mm)."""
+    return Circle(float(np.hypot(*rim_of(lens)[:, :2].T).max()))
+
+
+def towards(surface: RadialSurface, theta: np.ndarray, psi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points (…, 3) (mm) of a radial surface in directions from its centre, and its unit normals (…, 3).
+
+    theta, psi: angle from +z, and azimuth from +x towards +y (rad).  ValueError if the surface has no point there.
+    """
+    theta, psi = np.broadcast_arrays(theta, psi)
+    sin = np.sin(theta)
+    along = torch.from_numpy(np.stack([sin * np.cos(psi), sin * np.sin(psi), np.cos(theta)]))
+    flux, status = torch.ones(theta.shape, dtype=torch.float64), torch.zeros(theta.shape, dtype=torch.uint8)
+    met = surface.plain().meet(Rays(torch.zeros_like(along), along, flux, status, z=surface.z))
+    if not bool(met.found.all()):
+        raise ValueError("lens.back: the dome has no point in some directions; reduce lens.back.half_angle")
+    unit = met.normal / torch.sqrt((met.normal * met.normal).sum(0))
+    return _in_space(surface, met.position), np.moveaxis(unit.numpy(), 0, -1)
+
+
+def section(lens: Lens, upright: bool, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return u and z (mm) of `count` points of a dome's back in a plane through its axis, from rim to rim.
+
+    upright: the plane x = 0 with u = y, else the plane y = 0 with u = x.
+    """
+    dome, radius = radial_back(lens), rim_radius(lens.outline)
+    ends = np.array([-radius, radius]), np.zeros(2)
+    rim = points_on(dome, *(ends[::-1] if upright else ends)) - (0.0, 0.0, dome.z)
+    low, high = np.arctan2(np.hypot(rim[:, 0], rim[:, 1]), rim[:, 2])
+    theta = np.linspace(-low, high, count)
+    points, _ = towards(dome, np.abs(theta), np.where(theta < 0, math.pi, 0.0) + upright * math.pi / 2)
+    return points[:, int(upright)], points[:, 2]
+
+
+def silhouette(lens: Lens, count: int = 361) -> np.ndarray:
+    """Return points (count, 2) (mm) of the edge of a dome seen along its axis, the last equal to the first."""
+    dome = radial_back(lens)
+    theta = np.linspace(0.0, dome.chart.angle(rim_radius(lens.outline), dome.radius), SILHOUETTE_RINGS)
+    psi = np.linspace(0.0, 2 * math.pi, count)
+    points, _ = towards(dome, theta[:, None], psi)
+    r = np.hypot(points[..., 0], points[..., 1]).max(axis=0)
+    return np.stack([r * np.cos(psi), r * np.sin(psi)], axis=1)
 
 
 def on_base(lens: Lens, z: float | None = None) -> Lens:

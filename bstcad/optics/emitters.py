@@ -20,7 +20,7 @@ from typing import Annotated, Any, ClassVar
 import torch
 from torch import Tensor
 
-from bstcad.optics.kernels.records import Beam
+from bstcad.optics.kernels.records import Beam, SphereBeam
 from bstcad.optics.key import Key
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Outline, Rectangle
@@ -223,7 +223,7 @@ class Emitter(ABC):
         """Axes (e_x, e_y, n) of the source in space; the light goes along n, or along -n to a lens below the source."""
         return axes(self.tilt or (0.0, 0.0))
 
-    def beam(self, z: float) -> Beam | None:
+    def beam(self, z: float) -> Beam | SphereBeam | None:
         """Return the parameters of `irradiance` on the plane z (mm) for the kernels; None: the kernels use a table."""
         return None
 

@@ -28,17 +28,19 @@ KERNELS: dict[str, dict[str, str | Callable[..., Any]]] = {
     "trace.behind radial": {"cpu": "dome.behind"},
     "trace.through bspline": {"cpu": "crossing.landed"},
     "trace.through radial": {"cpu": "dome.landed"},
-    "trace.simulate": {"cpu": "forward.simulate"},  # the whole path, from the source to the receiver
-    "trace.land": {"cpu": "forward.land"},  # the whole path of single rays
+    "trace.simulate bspline": {"cpu": "forward.simulate"},  # the whole path, from the source to the receiver
+    "trace.simulate radial": {"cpu": "dome.simulate"},
+    "trace.land bspline": {"cpu": "forward.land"},  # the whole path of single rays
+    "trace.land radial": {"cpu": "dome.land"},
     "tubes.search": {"cpu": "search.search"},  # rays of sources through a front to given points
     "tubes.collect": {"cpu": "clip.Clip.apply"},
     "reductions.dot": {"cpu": "reductions.dot_of_arrays"},
 }
 DTYPES = (torch.float32, torch.float64)  # precisions that the kernels support
 # Form of the equation by kind of Surface; the kernels of the whole path implement no others.
-SURFACE_FORMS = {"bspline": "net", "plane": "revolved", "sphere": "revolved", "conic": "revolved"}
+SURFACE_FORMS = {"bspline": "net", "radial": "radial", "plane": "revolved", "sphere": "revolved", "conic": "revolved"}
 # Sequences of interfaces that these kernels trace, each interface as (its form, True if it reflects).
-WHOLE_PATHS = [("net", True)], [("revolved", False), ("net", False)]
+WHOLE_PATHS = [("net", True)], [("revolved", False), ("net", False)], [("revolved", False), ("radial", False)]
 FRONTS = [path[:-1] for path in WHOLE_PATHS]  # interfaces before the last face of these paths
 
 
@@ -52,10 +54,11 @@ def kernel(name: str, *tensors: Tensor) -> Callable[..., Any] | None:
 
 
 def whole_kernel(name: str, interfaces: Sequence[Any]) -> Callable[..., Any] | None:
-    """Return kernel `name` of KERNELS for rays across all these Interfaces; None: no kernel supports them."""
+    """Return kernel `name` for rays across all these Interfaces, the last of its kind; None: none supports them."""
     if _forms(interfaces) not in WHOLE_PATHS or not all(loss.fused for each in interfaces for loss in each.losses):
         return None
-    return kernel(name, interfaces[-1].surface.heights)
+    last = interfaces[-1].surface
+    return kernel(f"{name} {last.kind}", last.heights)
 
 
 def front_kernel(name: str, before: Sequence[Any], *tensors: Tensor) -> Callable[..., Any] | None:

@@ -27,15 +27,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface, evaluate
+from bstcad.optics.bspline import BSplineSurface, evaluate, interpolating_net
 from bstcad.optics.charts import SphereChart
 from bstcad.optics.kernels.reductions import elementary
+from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.rays import Rays
 from bstcad.optics.surfaces import Surface
@@ -47,6 +48,8 @@ MIN_COSINE = 1e-6  # smallest cosine of the angle of incidence at which a ray me
 APPROACH_STEPS = 400  # maximum number of steps of the approach, after which a ray misses
 APPROACH_DISTANCE = 1e-4  # distance from the surface at which an approach ends, as a fraction of R
 APPROACH_COSINE = 1e-2  # smallest cosine of incidence at which Newton's method may lead on from the approach
+DIRECTION_TOLERANCE = 1e-9  # largest distance of control points from their directions, as a fraction of R
+CARRYING_STEPS = 6  # corrections of the distances of a surface after a small motion
 DIRECTION_STEPS = 4  # corrections of (x, y) by which the surface is found in a given direction
 ROOT_TOLERANCE = 64  # distance from the ray at which the search ends, in units of R times the precision of the numbers
 
@@ -109,17 +112,21 @@ class RadialSurface(BSplineSurface):
         x, y, _ = chart.coordinates(torch.from_numpy(np.ascontiguousarray(np.moveaxis(from_centre, -1, 0))))
         of_x, of_y = ((float(p[0, 0]), float(p[-1, -1])) for p in (x, y))
         surface = cls(z, torch.from_numpy(rho - chart.radius), of_x, of_y, radius=chart.radius)
-        off = float(np.abs(surface.control_points() - net).max())
-        if not off <= 1e-9 * chart.radius:
-            raise ValueError(f"the control points leave the directions of a radial net by {off:.3g} mm")
-        return surface
+        return surface._checked(net)
 
     @staticmethod
     def like(surface: Surface, net: np.ndarray) -> RadialSurface:
-        """Return a radial surface with other control points (m, n, 3) (mm), which must have its directions."""
+        """Return a radial surface with other control points (m, n, 3) (mm); ValueError if they leave its directions."""
         assert isinstance(surface, RadialSurface)
         rho = np.sqrt(((net - np.array([0.0, 0.0, surface.z])) ** 2).sum(-1))
-        return replace(surface, heights=torch.from_numpy(rho - surface.radius))
+        return replace(surface, heights=torch.from_numpy(rho - surface.radius))._checked(net)
+
+    def _checked(self, net: np.ndarray) -> Self:
+        """Return the surface; ValueError if its control points are not `net` (m, n, 3) (mm)."""
+        off = float(np.abs(self.control_points() - net).max())
+        if not off <= DIRECTION_TOLERANCE * self.radius:
+            raise ValueError(f"the control points leave the directions of a radial net by {off:.3g} mm")
+        return self
 
     @cached_property
     def chart(self) -> SphereChart:
@@ -145,6 +152,39 @@ class RadialSurface(BSplineSurface):
         axis = torch.zeros(1, dtype=self.heights.dtype, device=self.heights.device)
         vertex = float(self.at(axis, axis).position[2])
         return replace(self, heights=(self.radius + self.heights) * (self.radius / vertex) - self.radius)
+
+    @property
+    def vertex_z(self) -> float:
+        """Position (mm) of the vertex on the axis."""
+        axis = torch.zeros(1, dtype=self.heights.dtype, device=self.heights.device)
+        return float(self.z + self.at(axis, axis).position[2])
+
+    def scaled(self, factor: float, about: float) -> RadialSurface:
+        """Return the surface scaled by a factor about the point of the axis at z = `about` (mm)."""
+        (x_0, x_1), (y_0, y_1), z = self.x, self.y, about + factor * (self.z - about)
+        x, y = (factor * x_0, factor * x_1), (factor * y_0, factor * y_1)
+        return replace(self, z=z, heights=factor * self.heights, x=x, y=y, radius=factor * self.radius)
+
+    def carried(self, motion: Motion) -> RadialSurface:
+        """Return the surface after a small motion, as distances from the same centre.
+
+        The point c + ρ d of the moved surface was at q before the motion.  The residual ρ_surface(q) - |q - c| is added
+        to ρ until it vanishes; each step multiplies it by about the slope of log ρ times the angle of the motion.  The
+        control points change by the difference of the distances in their directions.
+        """
+        centre = np.array([0.0, 0.0, self.z])
+        back, d = motion.inverse, self.directions
+        rotation = torch.from_numpy(np.ascontiguousarray(back.rotation))
+        shift = torch.tensor(back.point(tuple(centre.tolist())), dtype=torch.float64) - torch.from_numpy(centre)
+        exact = replace(self, heights=self.heights.detach().cpu().double())
+        before = exact._below(d)[2]
+        rho = before
+        for _ in range(CARRYING_STEPS):
+            place = rho * d
+            q = torch.stack([dot(row, place) + s for row, s in zip(rotation, shift, strict=True)])
+            rho = rho + exact._below(q)[2] - torch.sqrt(dot(q, q))
+        change = torch.from_numpy(interpolating_net((rho - before).numpy()))
+        return replace(self, heights=self.heights + change.to(self.heights))
 
     def control_points(self) -> np.ndarray:
         """Return the control net (m, n, 3) in mm, float64, x along the first axis."""
@@ -314,19 +354,19 @@ class RadialSurface(BSplineSurface):
         path = torch.where(inside, path_to_sphere(origin, along, nearest), torch.zeros_like(middle))
         end = path_to_sphere(origin, along, farthest)
         near = APPROACH_DISTANCE * self.radius
-        arrived, under_way = torch.zeros_like(inside), torch.ones_like(inside)
-        x = y = torch.zeros_like(path)
+        arrived, x, y = torch.zeros_like(inside), torch.zeros_like(path), torch.zeros_like(path)
+        moving = torch.arange(len(path), device=path.device)  # numbers of the rays under way, ever fewer
         for step in range(APPROACH_STEPS):
-            place = origin + path * along
-            x, y, rho = self._below(place)
+            place = origin[:, moving] + path[moving] * along[:, moving]
+            x[moving], y[moving], rho = self._below(place)
             residual = rho - torch.sqrt(dot(place, place))
-            if step == 0:
-                under_way = residual >= -near
-            arrived |= under_way & (residual <= near)
-            under_way = under_way & ~arrived & (path <= end)
-            if not bool(under_way.any()):
+            begun = residual >= -near if step == 0 else torch.ones_like(moving, dtype=torch.bool)
+            arrived[moving] = begun & (residual <= near)
+            left = begun & ~arrived[moving] & (path[moving] <= end[moving])
+            if not bool(left.any()):
                 break
-            path = torch.where(under_way, path + residual / rate, path)
+            moving = moving[left]
+            path[moving] = path[moving] + residual[left] / rate[moving]
         return path, (x, y), arrived
 
     def _below(self, place: Tensor) -> tuple[Tensor, Tensor, Tensor]:

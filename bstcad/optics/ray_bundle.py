@@ -90,7 +90,7 @@ def fates(rays: Rays, lens: Lens) -> Tensor:
     """
     first, last = (lens.front, lens.back) if rays.sense > 0 else (lens.back, lens.front)
     x, y = rays.position[0], rays.position[1]
-    within = lens.outline.contains(x, y)
+    within = lens.plan.contains(x, y)
     entered, left = _past(first, rays, within) >= 0, _past(last, rays, within) >= 0
     beside = ~within & (_past(lens.entrance, rays, torch.zeros_like(within)) >= 0)
     if lens.before:
@@ -110,6 +110,5 @@ def _past(face: Surface, rays: Rays, over: Tensor) -> Tensor:
     face = face.plain()
     own = over if face.outline is None else over & face.outline.contains(rays.position[0], rays.position[1])
     x, y = (torch.where(own, p, torch.zeros_like(p)).double() for p in rays.position[:2])
-    height = torch.where(own, face.optical.relative_sag_and_slope(x, y)[0], torch.zeros_like(x))
-    plane = torch.where(own, torch.full_like(height, float(face.optical.z)), float(face.around.z))
-    return rays.sense * (rays.position[2].double() + rays.z - plane - height)
+    level = torch.where(own, face.optical.sag_and_slope(x, y)[0], float(face.around.z))
+    return rays.sense * (rays.position[2].double() + rays.z - level)

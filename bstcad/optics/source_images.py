@@ -17,14 +17,16 @@ from torch import Tensor
 
 from bstcad.optics import tubes
 from bstcad.optics.channels import Channel
+from bstcad.optics.domes import is_radial
 from bstcad.optics.irradiance import Screen, rrmsd, tent
 from bstcad.optics.kernels.reductions import total
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Landed
 from bstcad.optics.sampling import point_pairs
-from bstcad.optics.trace import through
+from bstcad.optics.trace import behind, through
 
+STEP_BACK = 0.01  # distance before a dome at which rays start, as a fraction of its radius
 MAX_IMAGE_RAYS = 1 << 17  # maximum rays of the images of a source that are traced at a time, which limits the memory
 IMAGE_POINTS_PER_SIDE = 48  # number of points per side of the back face through which the source is imaged
 # Largest distance of landing light from the screen's centre, divided by (longer side of the screen + median distance).
@@ -125,13 +127,21 @@ def _through(channels: Sequence[Channel], lens: Lens, screen: Screen, x: Tensor,
     """
     lens = channels[0].through(lens)
     p, q, rays = tubes.rays_to([channel.source for channel in channels], lens, x, y)
-    behind = replace(lens.unbounded(), losses=None).interfaces[lens.number_of("back") :]
-    [landed] = through(rays, behind, [screen.plane])
+    last = replace(lens.unbounded(), losses=None).interfaces[lens.number_of("back") :]
+    dome = lens.back
+    if is_radial(dome):  # its points in given directions are known to the square of the pitch: start before the face
+        rays = replace(rays, position=rays.position - STEP_BACK * dome.radius * rays.direction)
+    [landed] = through(rays, last, [screen.plane])
     centre = tubes.middle(p), tubes.middle(q)
     cells = zip(channels, *centre, strict=True)
     density = [each.weight * each.source.irradiance(x, y, lens.entrance.z) for each, x, y in cells]
     flux = torch.stack(density) * tubes.area_of(p, q)
     if lens.passes.sense > 0:  # light comes to the front
-        flux = torch.where(lens.apertures[0].contains(*centre), flux, torch.zeros_like(flux))
+        enters = lens.apertures[0].contains(*centre)
+        if is_radial(dome):  # the centres of the cells lie on the sphere of the dome
+            cells = zip(channels, *centre, strict=True)
+            coming = [each.source.rays_through(x, y, lens.entrance.z, 1.0) for each, x, y in cells]
+            enters = torch.stack([behind(rays, lens.interfaces[0]).alive for rays in coming])
+        flux = torch.where(enters, flux, torch.zeros_like(flux))
     flux = tubes.arriving_flux(flux, landed).double()
     return tubes.middle(landed.position).flatten(-2), flux.flatten(-2)

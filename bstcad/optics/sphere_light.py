@@ -12,6 +12,7 @@ I follows from the irradiance E_D of the source on the plane at the distance D: 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -20,11 +21,31 @@ from torch import Tensor
 
 from bstcad.optics.charts import SphereChart
 from bstcad.optics.emitters import Emitter, Wavelength, all_alive
+from bstcad.optics.kernels.records import Beam, Frame3, SphereBeam
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Circle, Outline, Rectangle
 from bstcad.optics.rays import Rays, Vector
+from bstcad.optics.surfaces import Surface
 
 MIN_AXIAL_COSINE = 1e-6  # smallest cosine with +z of light: beyond it no irradiance on a plane is known
+
+CONCENTRIC = 1e-9  # distance of a front's centre from the dome's, relative to its radius, up to which it bends no light
+FRONT_MARGIN = 1e-4  # relative angle by which a front may end beyond the rim of the dome
+RIM_ROUNDING = 1 + 1e-12  # factor of the square of the disc's radius, so that points of its rim lie inside
+
+
+def light_angle(source: Emitter, front: Surface, centre: Vector, rim: float) -> float:
+    """Return the angle (rad) from +z, seen from a dome's centre, up to which light is launched; rim: of the dome.
+
+    It is 90 degrees, since a front may bend light from beyond the rim to the dome.  A front about a point source bends
+    none.  If it ends at the rim, the light ends there, too, so that no flux tube crosses the rim.
+    """
+    if front.kind != "sphere" or source.extent is not None or source.start_point(centre[2]) != centre:
+        return math.pi / 2
+    c, _ = front.conic()
+    ends = math.pi / 2 if front.outline is None else math.asin(min(front.outline.radius * abs(c), 1.0))
+    bends = not c < 0 or abs(float(front.z) + 1 / c - centre[2]) > CONCENTRIC * abs(1 / c)
+    return math.pi / 2 if bends or ends > rim * (1 + FRONT_MARGIN) else rim
 
 
 @dataclass(frozen=True)
@@ -42,8 +63,10 @@ class SphereLight(Emitter):
 
     @classmethod
     def of(cls, source: Emitter, z: float, chart: SphereChart, half_angle: float) -> SphereLight:
-        """Return the light of a source."""
-        return cls(source, z, chart, half_angle=half_angle, wavelength=source.wavelength)
+        """Return the light of a source, for a file of rays the light of its model, with all spectral lines."""
+        lines = source.lines  # of a file of rays: their wavelengths, in place of source.wavelength
+        wavelength = lines if len(lines) > 1 else lines[0][0]
+        return cls(source, z, chart, half_angle=half_angle, wavelength=wavelength)
 
     def irradiance(self, x: Tensor, y: Tensor, z: float) -> Tensor:
         """Return E(x, y) (1/mm² of the chart); z: not used.  The total flux is 1."""
@@ -58,7 +81,7 @@ class SphereLight(Emitter):
         """Return (position of the source relative to the centre, unit vectors s, E) for points of the sphere."""
         d = self.chart.direction(x, y)
         start_x, start_y, start_z = self.source.start_point(self.z)
-        start = torch.tensor((start_x, start_y, start_z - self.z)).to(x).view(3, *([1] * x.ndim))
+        start = x.new_tensor((start_x, start_y, start_z - self.z)).view(3, *([1] * x.ndim))
         path = self.chart.radius * d - start
         length = torch.sqrt((path * path).sum(0))
         s = path / length
@@ -73,7 +96,17 @@ class SphereLight(Emitter):
         return start.expand_as(s), s, torch.where(self._within(x, y), density, torch.zeros_like(density))
 
     def _within(self, x: Tensor, y: Tensor) -> Tensor:
-        return x * x + y * y <= self.chart.length(self.half_angle) ** 2 * (1 + 1e-12)
+        return x * x + y * y <= self.chart.length(self.half_angle) ** 2 * RIM_ROUNDING
+
+    def beam(self, z: float) -> SphereBeam | None:
+        """Return the light for the kernels, whose positions are relative to the centre; z: not used."""
+        start_x, start_y, start_z = self.source.start_point(self.z)
+        formula = self.source.beam(start_z + self.chart.radius)
+        if not isinstance(formula, Beam):
+            return None
+        lamp, limit = Frame3(start_x, start_y, start_z - self.z), self.chart.length(self.half_angle) ** 2
+        limit_r2 = limit * RIM_ROUNDING
+        return SphereBeam(formula, self.chart.radius, lamp, limit_r2=limit_r2, least=MIN_AXIAL_COSINE)
 
     def window(self, outline: Outline, z: float, sags: tuple[float, ...]) -> Rectangle:
         """Return the square of the chart with all directions within the half angle."""
@@ -105,6 +138,21 @@ class SphereLight(Emitter):
     def moved(self, motion: Motion, entrance: float) -> SphereLight:
         """Return the light of the moved source; the sphere stays."""
         return replace(self, source=self.source.moved(motion, entrance))
+
+    @property
+    def is_rotation_invariant(self) -> bool:
+        """True if a rotation about the source's axis leaves the light unchanged."""
+        return self.source.is_rotation_invariant
+
+    def with_wider_cone(self, by: float) -> SphereLight | None:
+        """Return the light of the source with a wider cone; None: the source has no cone."""
+        wider = self.source.with_wider_cone(by)
+        return None if wider is None else replace(self, source=wider)
+
+    def moved_away(self, by: float, about: Vector) -> SphereLight | None:
+        """Return the light of the source at a larger distance from a point; None: the source has no position."""
+        further = self.source.moved_away(by, about)
+        return None if further is None else replace(self, source=further)
 
     def sizes(self) -> Iterator[tuple[str, float | tuple[float, float], str]]:
         """Yield (key, size, unit) for each key that defines the extent of the source."""

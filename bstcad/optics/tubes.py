@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import ops
-from bstcad.optics.charts import HEIGHTS
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Interface, cross
 from bstcad.optics.irradiance import Scale, Screen, scaled
@@ -343,7 +342,7 @@ class Path:
         x, y, height: (rows, columns) for one source, (k, rows, columns) for k sources.
         """
         fast = None
-        if x.dtype == torch.float64 and self.face.chart is HEIGHTS:
+        if x.dtype == torch.float64:
             fast = ops.front_kernel("tubes.search", self.before, x)
         if fast is not None and all(source.beam(self.start) is not None for source in self.sources):
             return fast(self, x=x, y=y, height=height)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.light import needed_apertures
+from bstcad.optics import domes
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.report import part_views
@@ -72,7 +73,8 @@ class DataSheet:
     @cached_property
     def apertures(self) -> dict[str, Outline | None]:
         """Clear aperture that the light needs on each face; None: the whole face."""
-        return needed_apertures(self.scene.light, self.lens)
+        found = needed_apertures(self.scene.light, self.lens)
+        return found | {"back": None} if domes.is_dome(self.lens) else found  # the back's are coordinates of its chart
 
     @property
     def tables(self) -> dict[str, Rows]:

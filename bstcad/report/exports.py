@@ -21,6 +21,7 @@ import torch
 
 from bstcad.analysis.far_field import NOMINAL_LUMENS, FarField
 from bstcad.cad.mesh import DEFAULT_LABEL, Label, preview_files
+from bstcad.optics import domes
 from bstcad.optics.bspline import is_net
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
@@ -30,6 +31,7 @@ from bstcad.photometry.intensity import Intensity, Luminaire
 from bstcad.report.grid_sag import MAX_POINTS, MIN_POINTS, GridLight, GridSag, axes, table_note
 from bstcad.report.units import environment, paragraphs
 from bstcad.runs import files
+from bstcad.scene.dome_back import export_complaints
 from bstcad.scene.mount import Mount
 
 SIDECAR = ".txt"  # suffix of a text file that states how far interpolation of a table moves the light
@@ -92,6 +94,9 @@ def export(
     if points is not None and not MIN_POINTS <= points <= MAX_POINTS:
         raise ValueError(f"points = {points} is not possible; give a number from {MIN_POINTS} to {MAX_POINTS}")
     lens, paths, notes, intensity = lens.plain(), [], [], None
+    if domes.is_dome(lens):
+        for complaint in export_complaints(kinds):
+            raise ValueError(complaint)
     for kind in dict.fromkeys(kinds):
         if kind in (*INTENSITIES, RAYS) and far is None:
             raise ValueError(f"'{kind}' needs the light of a scene; export it from the folder of a design")
@@ -121,6 +126,11 @@ def _files(
 ) -> Iterator[tuple[str, str | bytes]]:
     count = min(max(lens.back_net.shape), MAX_POINTS) if points is None else points
     match kind:
+        case "sag" if domes.is_dome(lens):
+            yield "sag-polar.csv", polar_table(lens, count)
+        case "points" if domes.is_dome(lens):
+            yield "points-front.csv", points_table(lens, lens.front.optical, count, lens.apertures[0])
+            yield "points-back.csv", dome_points_table(lens, count)
         case "sag":
             yield "sag.csv", sag_table(lens, count)
             yield from _sidecar("sag", lens, count, light)
@@ -183,16 +193,47 @@ def photometric_file(kind: str, lens: Lens, light: Stated, label: Label) -> byte
 
 def sag_table(lens: Lens, points: int) -> str:
     """Return a CSV table of x, y, front z and back z (mm) on a grid, `points` along its wider side, in the outline."""
-    x, y = _inside(lens, points)
+    x, y = _inside(lens.plan, points)
     return _csv(x_mm=x, y_mm=y, front_z_mm=sag(lens.front, x, y), back_z_mm=sag(lens.back, x, y))
 
 
-def points_table(lens: Lens, face: Surface, points: int) -> str:
-    """Return a CSV table of x, y, z and the unit normal, out of the lens, of a face on the grid of `sag_table`."""
-    x, y = _inside(lens, points)
+def points_table(lens: Lens, face: Surface, points: int, outline: Outline | None = None) -> str:
+    """Return a CSV table of x, y, z and the unit normal, out of the lens, of a face on the grid of `sag_table`.
+
+    outline: outline of the grid; None: that of the lens.
+    """
+    x, y = _inside(outline or lens.plan, points)
     z, z_x, z_y = (t.numpy() for t in face.plain().sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
     length = np.sqrt(1 + z_x * z_x + z_y * z_y) * (1.0 if face is lens.back else -1.0)
     return _csv(x_mm=x, y_mm=y, z_mm=z, normal_x=-z_x / length, normal_y=-z_y / length, normal_z=1 / length)
+
+
+def polar_table(lens: Lens, points: int) -> str:
+    """Return a CSV table of a dome's back over directions from its centre: distance (mm), point (mm) and unit normal.
+
+    Directions have the angle θ (degrees) from +z and the azimuth ψ (degrees) from +x towards +y; normals point out of
+    the lens.  There are (points + 1) // 2 rings of equal spacing from the axis to the half angle.
+    """
+    dome = domes.radial_back(lens)
+    half = dome.chart.angle(domes.rim_radius(lens.outline), dome.radius)
+    theta = np.append(0.0, np.repeat(np.linspace(0.0, half, (points + 1) // 2)[1:], 2 * points))
+    psi = np.append(0.0, np.tile(np.arange(2 * points) * (math.pi / points), (points + 1) // 2 - 1))
+    place, normal = domes.towards(dome, theta, psi)
+    angles = {"angle_deg": np.degrees(theta), "azimuth_deg": np.degrees(psi)}
+    distance = np.linalg.norm(place - (0.0, 0.0, dome.z), axis=1)
+    return _csv(**angles, distance_mm=distance, **_points_and_normals(place, normal))
+
+
+def dome_points_table(lens: Lens, points: int) -> str:
+    """Return a CSV table of points and unit normals, out of the lens, of a dome's back on a grid of its chart."""
+    place, normal = domes.points_and_normals(domes.radial_back(lens), *_inside(lens.outline, points))
+    return _csv(**_points_and_normals(place, normal))
+
+
+def _points_and_normals(place: np.ndarray, normal: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the columns of a table of points (n, 3) and unit normals (n, 3)."""
+    names = ("x_mm", "y_mm", "z_mm", "normal_x", "normal_y", "normal_z")
+    return dict(zip(names, (*place.T, *normal.T), strict=True))
 
 
 def turning_cloud(lens: Lens, points: int, face: Surface | None = None) -> str:
@@ -225,9 +266,9 @@ def _sidecar(name: str, lens: Lens, points: int, light: GridLight | None) -> Ite
         yield f"{name}{SIDECAR}", "\n".join(sentences) + "\n"
 
 
-def _inside(lens: Lens, points: int) -> tuple[np.ndarray, np.ndarray]:
-    x, y = (p.ravel() for p in np.meshgrid(*axes(lens.plan, points), indexing="ij"))
-    inside = lens.plan.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
+def _inside(outline: Outline, points: int) -> tuple[np.ndarray, np.ndarray]:
+    x, y = (p.ravel() for p in np.meshgrid(*axes(outline, points), indexing="ij"))
+    inside = outline.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
     return x[inside], y[inside]
 
 

@@ -19,15 +19,17 @@ import torch
 from bstcad.analysis.light import bundle, fan, ray_map
 from bstcad.analysis.shape import MAX_RADIUS, Survey, least_squares, survey, survey_front
 from bstcad.cad import mesh as meshes
+from bstcad.optics import domes
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Light, SpectralLine
 from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Surface
+from bstcad.optics.surfaces import Surface, sag
 from bstcad.optics.wavefront_error import WavefrontError
 from bstcad.report import data_sheet, light_figures, photometric_figures, rendering
 from bstcad.report.data_sheet import DataSheet
+from bstcad.report.dome_figures import ANGLE_LABELS, dome_maps, in_angles
 from bstcad.report.drawing import BLUE, GLASS, GREY, VERMILION, footnote, new_figure, png, round_up, steps, styled
 from bstcad.report.light_figures import View, plain_ticks
 from bstcad.report.record import Contents, CurvePoint, StageRecord
@@ -129,7 +131,7 @@ def draw_lens(source: Emitter, lens: Lens, screens: Sequence[Screen], view: View
     if lens.shapes("front"):
         of_front["surface_front"] = png(surface_maps(lens, survey_front(lens), face="front"))
     return {
-        "surface": png(surface_maps(lens, survey(lens))),
+        "surface": png((dome_maps if domes.is_dome(lens) else surface_maps)(lens, survey(lens))),
         **of_front,
         "side_view": png(side_view(lens, fan(source, lens, farthest.plane), screens)),
     }
@@ -137,7 +139,13 @@ def draw_lens(source: Emitter, lens: Lens, screens: Sequence[Screen], view: View
 
 def draw_transport(source: Emitter, lens: Lens, screen: Screen, view: View) -> Pngs:
     """Return the picture of the transport map from the lens to a screen."""
-    return {numbered("transport", view.number): png(transport_map(*ray_map(source, lens, screen.plane), view))}
+    grid, image = ray_map(source, lens, screen.plane)
+    dome = domes.is_dome(lens)
+    return {
+        numbered("transport", view.number): png(
+            transport_map(in_angles(lens, grid) if dome else grid, image, view, dome)
+        )
+    }
 
 
 def draw_light(target: np.ndarray, light: Light, lines: Sequence[SpectralLine], view: View) -> Pngs:
@@ -237,10 +245,7 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
     figure = new_figure(11.0, 3.4)
     close, whole = figure.subplots(1, 2, width_ratios=(1, 1.9))
     reach = lens.plan.half_extent[0]
-    x = torch.linspace(-reach, reach, MAP_POINTS, dtype=torch.float64)
-    faces = (lens.front.plain(), lens.back.plain())
-    front, back = (face.sag_and_slope(x, torch.zeros_like(x))[0].detach().expand_as(x) for face in faces)
-    rim_z, rim_x = torch.cat([front, back.flip(0)]).numpy(), torch.cat([x, x.flip(0)]).numpy()
+    rim_x, rim_z = _section(lens)
     for axes in (close, whole):
         axes.plot(rays[:, :, 2].T, rays[:, :, 0].T, color=VERMILION, linewidth=0.6, alpha=0.8)
         axes.fill(rim_z, rim_x, facecolor=GLASS, edgecolor=BLUE, linewidth=1.0)
@@ -266,11 +271,30 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
     return figure
 
 
+def _section(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """Return x and z (mm) around the section of a lens at y = 0."""
+    lens = domes.on_base(lens.plain())
+    if domes.is_dome(lens):
+        along, back = domes.section(lens, upright=False, count=MAP_POINTS)
+        x = np.linspace(along[0], along[-1], MAP_POINTS)
+    else:
+        reach = lens.plan.half_extent[0]
+        x = along = np.linspace(-reach, reach, MAP_POINTS)
+        back = sag(lens.back, x, 0.0 * x)
+    return np.concatenate([x, along[::-1]]), np.concatenate([sag(lens.front, x, 0.0 * x), back[::-1]])
+
+
 @styled
-def transport_map(source: np.ndarray, image: np.ndarray, view: View) -> Figure:
-    """Draw lines of a grid `source` (k, k, 2) on the first vertex's plane (mm), and `image` (k, k, 2) on the target."""
+def transport_map(source: np.ndarray, image: np.ndarray, view: View, dome: bool = False) -> Figure:
+    """Draw lines of a grid `source` (k, k, 2) on the first vertex's plane (mm), and `image` (k, k, 2) on the target.
+
+    dome: True if the grid is over directions from the centre of a dome, in degrees (dome_figures.in_angles).
+    """
     figure, where = new_figure(8.2, 3.9, layout="compressed"), "front of the lens" if view.optic == "lens" else "mirror"
-    sides = ((f"Grid on the {where}", source, LevelPlane(0.0).labels), ("Its image on the target", image, view.labels))
+    grid = (f"Grid on the {where}", source, LevelPlane(0.0).labels)
+    if dome:
+        grid = ("Grid of directions from the centre of the dome", source, ANGLE_LABELS)
+    sides = (grid, ("Its image on the target", image, view.labels))
     for axes, (title, points, (x, y)) in zip(figure.subplots(1, 2), sides, strict=True):
         for lines, colour in ((points, BLUE), (points.swapaxes(0, 1), VERMILION)):
             axes.plot(lines[..., 0].T, lines[..., 1].T, color=colour, linewidth=0.6)

@@ -20,6 +20,7 @@ import numpy as np
 import shapely
 from scipy.optimize import brentq
 
+from bstcad.optics import domes
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import Surface, sag
@@ -229,13 +230,19 @@ def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> Cro
     def height(surface: Surface, u: np.ndarray) -> np.ndarray:
         return (sag(surface, 0.0 * u, u) if upright else sag(surface, u, 0.0 * u)) - origin
 
-    half = mount.rim_of(lens.plan).outline.half_extent[upright]
-    along = np.linspace(-half, half, SECTION_POINTS)
-    back = height(lens.back, along)
+    if domes.is_dome(lens):
+        along, back = domes.section(lens, upright, SECTION_POINTS)
+        back, half = back - origin, float(min(-along[0], along[-1]))
+        rims = along[[0, -1]]
+    else:
+        half = mount.rim_of(lens.plan).outline.half_extent[upright]
+        along = np.linspace(-half, half, SECTION_POINTS)
+        back, rims = height(lens.back, along), np.array([-half, half])
     top = mount.top(lens) - origin if mount.draft or mount.bevel else math.inf
     walls = [
-        _wall(lambda u, s=sense: float(height(lens.front, np.float64(s * u))), min(z, top), half, mount) * (1, sense)
-        for sense, z in ((-1, back[0]), (1, back[-1]))
+        _wall(lambda u, s=sense: float(height(lens.front, np.float64(s * u))), min(z, top), sense * rim, mount)
+        * (1, sense)
+        for sense, z, rim in zip((-1, 1), back[[0, -1]], rims, strict=True)
     ]
     ends = float(walls[0][-1, 1]), float(walls[1][-1, 1])
     u = np.linspace(*ends, SECTION_POINTS)
@@ -313,6 +320,11 @@ class Views:
         """Rim of the lens inside the part."""
         return self.mount.rim_of(self.lens.plan).outline
 
+    @cached_property
+    def edge(self) -> np.ndarray:
+        """Points (n, 2) around the lens as seen along the axis (mm)."""
+        return domes.silhouette(self.lens) if domes.is_dome(self.lens) else closed(self.rim)
+
     @property
     def outermost(self) -> Outline:
         """Outline of the whole part."""
@@ -387,7 +399,7 @@ def _plan(paper: Paper, views: Views, at: PaperFrame) -> None:
     outer, x, y = views.outermost, at.x, at.y
     a, b = (at.scale * half for half in outer.half_extent)
     step = _contours(paper, views, at)
-    paper.line(at(closed(views.rim)), THICK, zorder=5)
+    paper.line(at(views.edge), THICK, zorder=5)
     if views.used is not None:
         paper.line(at(closed(views.used)), 0.25, color=VERMILION, linestyle=(0, (6, 2, 1, 2, 1, 2)), zorder=4)
         paper.text(x, y - b - 20.5, "\u2013 \u00b7\u00b7 \u2013  clear aperture", NOTES, ha="center", color=VERMILION)
@@ -407,7 +419,8 @@ def _plan(paper: Paper, views: Views, at: PaperFrame) -> None:
             paper.arrow(middle + 4.2 * seen, seen)
             paper.text(*(middle - 2.2 * seen), letter, weight="bold", ha="center", va="center_baseline")
     if outer.is_round:
-        paper.dimension((x - a, x + a), y - b - 12, (y, y), f"\u00d8{mm(2 * outer.radius)}")
+        within = "within " * (domes.is_dome(views.lens) and views.mount.flange is None)  # a dome's edge is no circle
+        paper.dimension((x - a, x + a), y - b - 12, (y, y), f"{within}\u00d8{mm(2 * outer.radius)}")
     else:
         paper.dimension((x - a, x + a), y - b - 12, (y - b, y - b), mm(outer.width))
         paper.dimension((y - b, y + b), x - a - 11, (x - a, x - a), mm(outer.height), upright=True)
@@ -456,17 +469,14 @@ def kinds_of_holes(mount: Mount) -> Iterator[tuple[str, list[tuple[float, float,
 
 def _contours(paper: Paper, views: Views, at: PaperFrame) -> str:
     """Draw contours of z; return the step between them in words, "" if the back is flat."""
-    x, y = (np.linspace(-end, end, CONTOUR_POINTS) for end in views.rim.half_extent)
-    grid_x, grid_y = np.meshgrid(x, y)
-    z = sag(views.lens.back, grid_x, grid_y) - views.origin
-    z = np.where(views.rim.depth(grid_x, grid_y) >= 0, z, np.nan)
+    x, y, z = _heights(views)
     low, high = float(np.nanmin(z)), float(np.nanmax(z))
     if not high - low > 1e-9 * max(1.0, abs(low), abs(high)):
         return ""
     step = round_up((high - low) / MAX_CONTOURS)
     levels = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
     decimals = max(0, -int(np.floor(np.log10(step) + 1e-9)))
-    on_paper = at.x + at.scale * x, at.y + at.scale * y
+    on_paper = np.moveaxis(at(np.stack([x, y], axis=-1)), -1, 0)
     drawn = paper.axes.contour(*on_paper, z, levels, colors=BLUE, linewidths=0.55, zorder=2)
     size, ground = NUMBERS / TYPE_POINT, {"facecolor": "white", "edgecolor": "none", "pad": 0.4}
     edges = [edge for edge in (views.rim, views.used) if edge is not None]
@@ -477,6 +487,19 @@ def _contours(paper: Paper, views: Views, at: PaperFrame) -> str:
             label.remove()
         label.set_bbox(ground)
     return f"{number(step)} mm" if step >= 1e-3 else f"{number(1e3 * step)} \u00b5m"
+
+
+def _heights(views: Views) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return x, y and z (mm) of the back on a grid inside the rim; z is NaN outside and where a dome overhangs."""
+    if domes.is_dome(views.lens):
+        dome, radius = domes.radial_back(views.lens), domes.rim_radius(views.lens.outline)
+        r, turn = np.linspace(0.0, radius, CONTOUR_POINTS // 2), np.linspace(0.0, 2 * math.pi, CONTOUR_POINTS)
+        chart = r[:, None] * np.cos(turn), r[:, None] * np.sin(turn)
+        points, normals = domes.points_and_normals(dome, *chart)
+        return points[..., 0], points[..., 1], np.where(normals[..., 2] > 0, points[..., 2] - views.origin, np.nan)
+    x, y = np.meshgrid(*(np.linspace(-end, end, CONTOUR_POINTS) for end in views.rim.half_extent))
+    z = sag(views.lens.back, x, y) - views.origin
+    return x, y, np.where(views.rim.depth(x, y) >= 0, z, np.nan)
 
 
 # --- the sections -----------------------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ DESIGN_FILES = ("report.json", "lens.step", "scene.toml")  # files, any of which
 # Kinds of files for a shop, as in `bstcad export --as` and the scene's output.export.
 Export = Literal["sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet", "ies", "ldt", "csv", "tm25"]
 EXPORTS: tuple[str, ...] = get_args(Export)
+HEIGHT_EXPORTS = ("zemax", "turning")  # kinds that need a back of heights z(x, y), which a dome is not
 MAX_ARCHIVE_SIZE = 600_000_000  # largest .npz (bytes), enough for a net of 2049 x 2049 and pictures of 4096 x 4096
 MAX_ARRAY_HEADER = 4096  # largest header of an array in an .npz archive (bytes), with a margin
 NO_MEMORY = re.compile(  # words of Python, torch, the system and the dynamic loader for a lack of memory

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeV
 
 import numpy as np
 import torch
-from pydantic import BeforeValidator, Discriminator, Field, Tag
+from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag
 
 from bstcad.optics.key import Key
 from bstcad.optics.media import refractive_index
@@ -523,12 +523,19 @@ class Bounds:
     edge: float | None = None  # minimum thickness along the rim, mm
 
 
+def _without_outline(node: dict[str, Any]) -> None:
+    """Let the JSON schema of a lens not require the outline, which a dome must not state."""
+    node["required"].remove("outline")
+
+
 class LensBlank(Record):
     """The lens before tailoring: light enters through the front and leaves through the back.
 
     A mirror is a plate whose back, the face with the larger z, reflects; no light meets its front.  If the front
     reflects, light crosses the back before and after the front.
     """
+
+    model_config = ConfigDict(json_schema_extra=_without_outline)
 
     material: Annotated[str | None, Key("Name of the material on refractiveindex.info; or give the index.")] = None
     index: Annotated[float | None, Key("Refractive index, in place of material.", "", *INDICES, example=1.49)] = None

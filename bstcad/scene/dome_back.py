@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, ClassVar, Literal
 
 from bstcad.optics.charts import SphereChart
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.key import Key
 from bstcad.optics.outlines import Circle
 from bstcad.optics.sides import Sides
+from bstcad.optics.sphere_light import SphereLight, light_angle
+from bstcad.optics.surfaces import Surface
+from bstcad.runs.files import HEIGHT_EXPORTS
 from bstcad.scene.errors import SceneError
 from bstcad.scene.schema import COORDINATES, LENGTHS, NET_SIZES, Record
 
@@ -42,6 +47,11 @@ class RadialBack(Record):
         return self.centre[2] + self.radius
 
     @property
+    def rim_z(self) -> float:
+        """z (mm) of the rim before tailoring."""
+        return self.centre[2] + self.radius * math.cos(math.radians(self.half_angle))
+
+    @property
     def net(self) -> Sides:
         """Control points per side; SceneError if they are not given."""
         if self.control_points is None:
@@ -58,9 +68,40 @@ class RadialBack(Record):
         """Disc of the chart up to the half angle."""
         return Circle(self.chart.length(math.radians(self.half_angle)))
 
+    def light(self, source: Emitter, front: Surface) -> SphereLight:
+        """Return the light of a lamp behind a front by the points of the dome's sphere."""
+        half_angle = light_angle(source, front, self.centre, math.radians(self.half_angle))
+        return SphereLight.of(source, self.centre[2], self.chart, half_angle=half_angle)
 
-def complete(lens: Any) -> None:
-    """Add to a table [lens] the kind of its back, and the outlines of a dome and its front, if these are not given."""
+
+def own_outline(back: RadialBack) -> Circle:
+    """Return the outline of a lens whose back is a dome: the circle at the half angle on its sphere."""
+    return Circle(_equator(back.radius, math.radians(back.half_angle)))
+
+
+def forget_outlines(lens: Any, mount: Any) -> None:
+    """Remove from a table [lens] the outlines that `complete` would add, so that they follow changes of the scene."""
+    front = lens.get("front") if isinstance(lens, dict) else None
+    if not isinstance(front, dict):
+        return
+    bare = {key: value for key, value in lens.items() if key != "outline"}
+    bare["front"] = {key: value for key, value in front.items() if key != "outline"}
+    complete(bare, mount)
+    for table, default in ((lens, bare), (front, bare["front"])):
+        if "outline" in default and table.get("outline") == default["outline"]:
+            del table["outline"]
+
+
+def _equator(radius: float, half_angle: float) -> float:
+    return radius * math.sin(half_angle)
+
+
+def complete(lens: Any, mount: Any = None) -> None:
+    """Add to a table [lens] the kind of its back, and the outlines of a dome and its front, if these are not given.
+
+    A curved front ends where the cone of the half angle meets it; with a [mount.flange], in the plane of the flange's
+    lower face, if this plane lies between the cone and the equator of the front.
+    """
     back = lens.get("back") if isinstance(lens, dict) else None
     if not isinstance(back, dict) or back.setdefault("kind", "bspline") != "radial":
         return
@@ -68,13 +109,23 @@ def complete(lens: Any) -> None:
     front = lens.get("front")
     try:
         z, half = float(centre[2]), math.radians(min(angle, 90.0))
-        lens.setdefault("outline", {"shape": "circle", "radius": float(back["radius"]) * math.sin(half)})
+        lens.setdefault("outline", {"shape": "circle", "radius": _equator(float(back["radius"]), half)})
         if isinstance(front, dict) and front.get("kind") in ("sphere", "conic") and "outline" not in front:
             radius = _radius_at(front, z, half)
+            flange = mount.get("flange") if isinstance(mount, dict) else None
+            if radius is not None and isinstance(flange, dict) and "z" in flange:
+                radius = max(radius, _radius_in_plane(front, float(flange["z"])))
             if radius is not None:
                 front["outline"] = {"shape": "circle", "radius": radius}
     except (KeyError, TypeError, ValueError, IndexError):
         return  # refused with its key, when the tables are read
+
+
+def export_complaints(kinds: Iterable[str]) -> Iterator[str]:
+    """Yield a sentence for each kind of export that needs heights z(x, y), which the back of a dome is not."""
+    for kind in (kind for kind in kinds if kind in HEIGHT_EXPORTS):
+        heights = f'"{kind}" is a table of heights z(x, y), and the back of a dome is none'
+        yield f'{heights}; use lens.step or lens.stl, or write "sag" (polar distances), "points" or "preview"'
 
 
 def _radius_at(front: dict[str, Any], z: float, angle: float) -> float | None:
@@ -93,3 +144,13 @@ def _radius_at(front: dict[str, Any], z: float, angle: float) -> float | None:
         return None
     s = max((-b - math.sqrt(square)) / a, (-b + math.sqrt(square)) / a)
     return s * sin * (1 + DOME_MARGIN) if s > 0 else None
+
+
+def _radius_in_plane(front: dict[str, Any], z: float) -> float:
+    """Return the distance from the axis (mm) at which a front crosses the plane at z; 0 if not above its equator.
+
+    The distance r follows from c r² = 2 h - (1 + k) c h², h = z - z0; the equator has h (1 + k) c = 1.
+    """
+    c, k, h = float(front.get("curvature", 0.0)), float(front.get("conic_constant", 0.0)), z - float(front["z"])
+    square = (2 * h - (1 + k) * c * h * h) / c if c and (1 + k) * c * h < 1 else 0.0
+    return math.sqrt(max(square, 0.0))

@@ -8,7 +8,7 @@ from bstcad.optics import sampling
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.outlines import Outline
 from bstcad.scene.blank import INDICES, LensBlank
-from bstcad.scene.dome_back import MIN_DOME_POINTS
+from bstcad.scene.dome_back import MIN_DOME_POINTS, own_outline
 
 UNITS = {
     "radius_1e2": " in mm",
@@ -117,12 +117,16 @@ def dome_complaints(source: Emitter, lens: LensBlank, given: Mapping[str, bool])
         return
     if source.parallel or source.kind != "point":
         yield f'source.kind: a dome needs a lamp, kind = "point"; write one, {instead}'
-    if getattr(source, "rays", None) is not None:
-        yield f"source.rays: rays of a file cannot be traced through a dome yet; give source.intensity, {instead}"
     if source.tilted:
         yield f"source.tilt: the lamp of a dome shines along +z; remove this key, {instead}"
     if any(dome.centre[:2]):
         yield "lens.back.centre: lies beside the axis; give 0 for x and y, and shift source.position"
+    if lens.outline != own_outline(dome):
+        yield f"lens.outline: a dome ends at lens.back.half_angle; remove this key, {instead}"
+    front = lens.front.outline
+    if front is not None and front.radius >= lens.outline.half_extent[0]:
+        wide = f"the front is {2 * front.radius:.5g} mm wide at the half angle, and the dome {2 * dome.radius:g} mm"
+        yield f"lens.back.radius: {wide}; make the dome larger, or the front smaller"
     if dome.control_points is not None and dome.control_points < MIN_DOME_POINTS:
         yield f"lens.back.control_points: {dome.control_points} are too few for a dome; give {MIN_DOME_POINTS} or more"
     if lens.front.kind not in DOME_FRONTS or not lens.front.fixed or lens.front.reflect:

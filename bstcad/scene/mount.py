@@ -249,6 +249,8 @@ def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
         if shape is not None and not shape.corner_radius < (half := min(shape.outline.half_extent)):
             size = f"{shape.corner_radius:g} mm is not less than {half:g} mm, half the width"
             yield f"mount.{key}.corner_radius: {size}; make it smaller"
+    if lens.dome is not None:
+        yield from _dome_complaints(mount, lens)
     rim = mount.rim_of(lens.outline)
     if (lens.outline.depth(*rim.outline.rim_points()) < -1e-9).any():
         yield "mount.rim: extends past lens.outline; make it smaller, or the lens larger"
@@ -260,6 +262,20 @@ def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
         yield from _wall_complaints(mount, lens, rim)
     if mount.flange is not None:
         yield from _flange_complaints(mount.flange, lens, rim)
+
+
+def _dome_complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
+    """Yield complaints about a mount of a dome, whose rim and wall stay as they are and whose light leaves sideways."""
+    can = "a dome can have mount.datum and mount.flange"
+    for key in (key for key in ("rim", "draft", "bevel") if getattr(mount, key)):
+        yield f"mount.{key}: a dome keeps its own rim and its low wall; remove this key; {can}"
+    dome, flange = lens.dome, mount.flange
+    if dome is None or flange is None:
+        return
+    rim, upper = dome.rim_z, flange.z + flange.thickness
+    if not upper < rim:
+        above = f"the flange reaches z = {upper:g} mm and the rim of the dome lies at about z = {rim:.4g} mm"
+        yield f"mount.flange.thickness: {above}, where light leaves; make the flange thinner, or move it down"
 
 
 def _wall_complaints(mount: Mount, lens: LensBlank, rim: Round | Box) -> Iterator[str]:

@@ -29,14 +29,13 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline
 from bstcad.optics.rays import Status
 from bstcad.optics.sides import Sides, as_pair
-from bstcad.optics.sphere_light import SphereLight
 from bstcad.optics.wavefront import MAX_RAY_ANGLE, PlaneWave, Wave, ZernikeWave
 from bstcad.runs import files
 from bstcad.scene import effects, elements, lighting, mount, picture, quality, scene_file
 from bstcad.scene.accept import Accept
 from bstcad.scene.beam import Collimated, of_beam
 from bstcad.scene.blank import LensBlank, as_front, net_extent
-from bstcad.scene.dome_back import RadialBack, complete
+from bstcad.scene.dome_back import RadialBack, complete, export_complaints, forget_outlines
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
 from bstcad.scene.effects import Effects
 from bstcad.scene.elements import Around, Elements, LightPath
@@ -111,6 +110,8 @@ class Scene(Record):
             yield "title: must be one line of up to 200 printable characters; shorten it"
         yield from self._of_targets(lambda target: target.complaints())
         yield from lighting.dome_complaints(source, lens, self._of_dome)
+        if lens.dome is not None:
+            yield from (f"output.export: {complaint}" for complaint in export_complaints(self.output.export))
         yield from lens.complaints()
         yield from lighting.complaints(source, lens)
         yield from effects.complaints(self.effects, lens)
@@ -148,9 +149,8 @@ class Scene(Record):
     @property
     def _of_dome(self) -> dict[str, bool]:
         """True for each key that the scene has and that does not go with a dome."""
-        tables = {key: bool(getattr(self, key)) for key in ("before", "behind", "wavefront", "mount", "tolerance")}
-        several, method = len(self.targets) > 1, self.tailoring.chosen_method != "least-squares"
-        return tables | {"target[1]": several, "tailoring.method": method, "output.export": bool(self.output.export)}
+        tables = {key: bool(getattr(self, key)) for key in ("before", "behind", "wavefront")}
+        return tables | {"tailoring.method": self.tailoring.chosen_method != "least-squares"}
 
     def _of_targets(self, sentences: Callable[[Target], Iterable[str]]) -> Iterator[str]:
         """Yield the sentences on each target, with that target's key."""
@@ -206,6 +206,7 @@ class Scene(Record):
     def _written(self, handler: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
         """Return the tables as they are written in a file: `target` is one table, or a list of several."""
         found = {("target" if name == "targets" else name): value for name, value in handler(self).items()}
+        forget_outlines(found.get("lens"), found.get("mount"))
         if len(found.get("target", ())) == 1:
             found["target"] = found["target"][0]
         omitted = {"before", "behind"} | (set() if self.states_effects else {"effects"})  # `effects` may be a default
@@ -307,8 +308,10 @@ class Scene(Record):
         return self.as_mounted(replace(lens, before=before, behind=behind).shaping(*self.lens.tailored_faces))
 
     def as_mounted(self, lens: Lens) -> Lens:
-        """Return the lens with the clear apertures that the mount leaves."""
-        return lens if self.mount is None else replace(lens, clear=self.mount.clear(lens))
+        """Return the lens with the clear apertures that the mount leaves; the mount of a dome cuts nothing."""
+        if self.mount is None or self.lens.dome is not None:
+            return lens
+        return replace(lens, clear=self.mount.clear(lens))
 
     def channels(self, points: int | None = None, draw: int = 0) -> tuple[Channel, ...]:
         """Return the light as a weighted sum of channels; a point source of one wavelength is one channel.
@@ -345,10 +348,7 @@ class Scene(Record):
     @property
     def light(self) -> Emitter:
         """The source, which a dome needs by the points of a sphere about its centre instead of by points of planes."""
-        dome = self.lens.dome
-        if dome is None:
-            return self.source
-        return SphereLight.of(self.source, dome.centre[2], dome.chart, half_angle=math.radians(dome.half_angle))
+        return self.source if self.lens.dome is None else self.lens.dome.light(self.source, self.lens.front.surface)
 
     def with_source_scaled(self, share: float) -> Self:
         """Return the scene with the size of its source times `share`; 0 makes it a point or a parallel beam."""
@@ -396,6 +396,7 @@ class Scene(Record):
         if not self.states_effects:
             del data["effects"]
         outline = changes.get("lens.outline", self.lens.outline)
+        forget_outlines(data["lens"], data.get("mount"))
         for key, value in changes.items():
             if key == "lens.front":
                 value = as_front(value, outline)
@@ -533,7 +534,7 @@ def _validated(
     if isinstance(listed := data.get("target"), list) and len(listed) == 1:  # messages call a single target "target"
         [data["target"]] = listed
     scene_file.check_plain(data)
-    complete(data.get("lens"))
+    complete(data.get("lens"), data.get("mount"))
     for outline in OUTLINES:
         for key, table in tables_at(data, outline):
             _circle(table, key)

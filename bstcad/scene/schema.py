@@ -15,7 +15,15 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Tag, ValidationInfo
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Tag,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+)
 from pydantic.functional_serializers import PlainSerializer, model_serializer
 from pydantic.json_schema import GenerateJsonSchema, WithJsonSchema
 
@@ -93,7 +101,11 @@ def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], exam
     lead out of them by symbolic links.
     """
 
-    def content(given: Any, info: ValidationInfo) -> Any:
+    def content(given: Any, checked: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
+        found = found_in(given, info)
+        return found if isinstance(found, kind) else checked(found)  # a copy would compute its cached values again
+
+    def found_in(given: Any, info: ValidationInfo) -> Any:
         if isinstance(given, kind):
             return given
         if not isinstance(given, str | Path):
@@ -110,7 +122,7 @@ def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], exam
         return read(folder / os.path.expanduser(given))
 
     written = PlainSerializer(lambda found: found.name, return_type=str)
-    return BeforeValidator(content), written, WithJsonSchema({"type": "string"})
+    return WrapValidator(content), written, WithJsonSchema({"type": "string"})
 
 
 def _check_links(path: Path, bounds: Sequence[Path]) -> None:

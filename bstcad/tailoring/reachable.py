@@ -13,8 +13,10 @@ there are three checks, each more expensive and only made if the previous check 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -77,6 +79,39 @@ def reachable(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT
             break
         lens = slope_map.fit_to_map(lens, slopes, grid, COARSE_FIT)
     return found if (picture[~found] > 0).any() else None
+
+
+class DomeReach(NamedTuple):
+    """Reach of the light of a dome."""
+
+    part: (
+        np.ndarray | None
+    )  # True for each pixel that some light reaches, (rows, columns); None: all of the lit picture
+    astray: float  # fraction of the light on the face that reaches no lit point of the picture
+    beyond: float  # smallest angle (rad) from the axis, seen from the centre, of such light; π / 2: there is none
+
+
+@torch.no_grad()
+def reachable_by_dome(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT_ANGLE) -> DomeReach:
+    """Return what each point of a dome can reach; `lens` and `grazing`: as for `reachable`.
+
+    Light far from the axis cannot return to it, so that some light may reach no lit point at all.  No map is computed:
+    the part is that of the first of its rounds.
+    """
+    screen, small = goal.receiver, resample(goal)
+    corners = slope_map.pixel_corners(small.receiver)
+    grid = slope_map.face_grid(source, lens, slope_map.lit_window(source, lens, FACE_CELLS), FACE_CELLS)
+    plane, law = image_from_last_net(lens, screen.plane), lens.last_freeform.law
+    margin = reach_from_each(grid, corners, plane, law, grazing=grazing)
+    found = _inside(margin.amax(0), screen, small.receiver)
+    lit = torch.from_numpy(slope_map.lit_corners(small.picture))
+    lost = margin[:, lit].amax(1) < 0
+    some = grid.density[::FACE_STRIDE, ::FACE_STRIDE].cpu()
+    position = grid.at_face.position[:, ::FACE_STRIDE, ::FACE_STRIDE][:, some > 0].cpu().double()
+    cosines = position[2] / torch.sqrt((position * position).sum(0))
+    astray = float(some[some > 0][lost].sum() / some.sum())
+    beyond = math.acos(float(cosines[lost].max())) if bool(lost.any()) else math.pi / 2
+    return DomeReach(found if (goal.picture[~found] > 0).any() else None, astray, beyond)
 
 
 def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from bstcad.optics import domes
 from bstcad.optics.lens import Lens
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import FORM, NONE, RIPPLE, TWO_FACE_ERRORS, Tolerance, settings_of
@@ -133,6 +134,8 @@ def _face_errors(lens: Lens, table: Sequence[Tolerance]) -> Iterator[Perturbatio
         face = name.partition(".")[0]
         if values.get("grade") == NONE or face not in lens.optical_faces or not (by_name or face == "back"):
             continue
+        if face == "front" and domes.is_dome(lens):
+            continue  # the front is nearly vertical at its rim, where no net of heights has its form
         grade, cost = GRADES[values.get("grade", DEFAULT_GRADE)], values.get("cost", 1.0)
         try:
             if name in RIPPLE:

@@ -18,6 +18,7 @@ from scipy import fft
 from scipy.ndimage import fourier_gaussian
 from scipy.stats import norm
 
+from bstcad.optics import domes
 from bstcad.optics.bspline import BSplineSurface, interpolating_net, is_net
 from bstcad.optics.channels import Channel
 from bstcad.optics.emitters import Emitter
@@ -28,6 +29,7 @@ from bstcad.optics.measure import tubes_picture
 from bstcad.optics.media import refractive_index
 from bstcad.optics.motion import Motion
 from bstcad.optics.outlines import Outline
+from bstcad.optics.radial import RadialSurface
 from bstcad.optics.rays import Vector
 from bstcad.optics.sides import size_text
 from bstcad.optics.surfaces import Surface
@@ -55,7 +57,7 @@ class Setup:
         if part == "screen":
             return self.screen.middle
         if part == "lens":
-            back = float(self.lens.back_net.plain().from_vertex().z)
+            back = self.lens.back_net.plain().vertex_z
             return 0.0, 0.0, (self.lens.front.z + back) / 2 if "front" in self.lens.passes.faces else back
         points = [channel.source.start_point(self.lens.entrance.z) for channel in self.channels]
         mean = np.average(points, axis=0, weights=[channel.weight for channel in self.channels])
@@ -225,7 +227,8 @@ def _shapes(setup: Setup, material: str | None) -> Iterator[Kind]:
     if refracts:
         yield Kind("lens.thickness", f"thickness of the {optic}", "mm", _change_thickness)
         yield Kind("lens.index", "refractive index", "", lambda setup, by: setup.with_indices(lambda n: n + by))
-        yield Kind("lens.front_power", "sag of the front at its rim", "mm", _change_front_power)
+        if not domes.is_dome(setup.lens):  # whose front is nearly vertical at its rim
+            yield Kind("lens.front_power", "sag of the front at its rim", "mm", _change_front_power)
     yield Kind("lens.scale", f"scale of the {optic} (shrinkage)", "", lambda s, by: s.with_lens_scaled(1 + by))
     if material in THERMAL_COEFFICIENTS and refracts:
         warm = partial(_change_temperature, material)
@@ -308,7 +311,9 @@ def _decentre_front(axis: int, setup: Setup, by: float) -> Setup:
     A lens is traced in the frame of its front.  Therefore the back is shifted inversely, and the whole lens moves with
     the front.  The net of the back is extended linearly to reach the rim; inside, the face does not change.
     """
-    back = setup.lens.back_net
+    back, shift = setup.lens.back_net, Motion.of(shift=_along(axis, by))
+    if domes.is_radial(back):
+        return replace(setup, lens=setup.lens.with_back(back.carried(shift.inverse))).moved("lens", shift)
     (low, high), pitch = (back.x, back.y)[axis], back.pitch[axis]
     missing = setup.lens.outline.half_extent[axis] + abs(by) - min(-low, high)
     more = max(0, math.ceil(missing / pitch))
@@ -316,7 +321,7 @@ def _decentre_front(axis: int, setup: Setup, by: float) -> Setup:
     ends = low - more * pitch - by, high + more * pitch - by
     x, y = (back.x, ends) if axis else (ends, back.y)
     fixed = replace(back, heights=torch.from_numpy(heights), x=x, y=y)
-    return replace(setup, lens=setup.lens.with_back(fixed)).moved("lens", Motion.of(shift=_along(axis, by)))
+    return replace(setup, lens=setup.lens.with_back(fixed)).moved("lens", shift)
 
 
 def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
@@ -324,9 +329,12 @@ def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
 
     A point p = v + (x, y, ζ) of the rotated face was at v + q before the rotation R, with q = Rᵀ (p - v).  In place of
     the face of height h, its tangent plane at (x, y) is used: q_z = h - h(v) + ∇h · ((q_x, q_y) - (x, y)), linear in ζ.
-    The error of this is curvature · (angle · sag)², 1 nm at a tenth of a degree.
+    The error of this is curvature · (angle · sag)², 1 nm at a tenth of a degree.  A dome is found by its distances.
     """
     back = setup.lens.back_net
+    if domes.is_radial(back):
+        motion = Motion.of(turn=_along(axis, by), about=(0.0, 0.0, back.vertex_z))
+        return replace(setup, lens=setup.lens.with_back(back.carried(motion)))
     turn = Motion.of(turn=_along(axis, by)).inverse.rotation.tolist()
     x, y = _control_points(back)
     h, h_x, h_y = back.relative_sag_and_slope(x, y)
@@ -339,12 +347,14 @@ def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
 
 # --- errors of the form of a face, as heights of its control net ------------------------------------------------------
 # A spline whose control points have the values of a field differs from the field by about (pitch / correlation
-# length)². A field must therefore be smooth over a few control cells.
+# length)². A field must therefore be smooth over a few control cells.  On a dome a field is added to the distances from
+# the centre; lengths are those on the sphere before tailoring, where control cells are smaller towards the rim.
 
 FRONT_SEED_OFFSET = 100  # offset of the seeds for the form of the front, so that its fields differ from the back's
 FACE_NET = 513  # control points per side of the net that replaces a plane or a conic with a form error
 FACE_MARGIN = 6  # number of control points of the FACE_NET net outside a round outline, on each side
 FACE_REACH = 1.03  # radius / rim radius up to which the net follows the face: its level part must not affect the rim
+SPHERE_WAVES = 512  # number of plane waves in a random field on a sphere
 CELLS_PER_PERIOD = 4.0  # minimum number of control cells in a correlation length or a period
 
 
@@ -361,12 +371,15 @@ def ripple(lens: Lens, period: float, pattern: Literal["raster", "spiral"]) -> K
     """Return tool marks sin(2π s / period) on the back as a kind of error; amounts are the RMS of the marks (mm).
 
     s is x for a raster, and the distance from the axis for the spiral of a diamond tool, which is almost a set of
-    circles.  Raises ValueError if the net is too coarse for the period (mm).
+    circles.  On a dome both are lengths of arcs.  Raises ValueError if the net is too coarse for the period (mm).
     """
     back = lens.back_net
     _require_resolution(back, period, "a ripple's period")
     x, y = (np.linspace(*side, m) for side, m in zip((back.x, back.y), back.shape, strict=True))
     s = np.broadcast_to(x[:, None], (len(x), len(y))) if pattern == "raster" else np.hypot(x[:, None], y[None, :])
+    if domes.is_radial(back):
+        d_x, d_y, d_z = back.directions.numpy()
+        s = back.radius * np.arctan2(d_x if pattern == "raster" else np.hypot(d_x, d_y), d_z)
     field = _normalise(np.sin(2 * np.pi * s / period), inside_outline(lens.outline, back))
     words = f"{pattern} ripple of the back, period {period:g} mm"
     return Kind("back.ripple", words, "mm RMS", partial(_add_form, "back", field))
@@ -376,9 +389,11 @@ def random_field(surface: BSplineSurface, correlation_length: float, seed: int, 
     """Return a Gaussian random field (m, n), RMS 1 and mean 0 over `where`, covariance exp(-(r / correlation_length)²).
 
     White noise is smoothed with a Gaussian of standard deviation correlation_length (mm) / 2; the covariance is wider
-    by √2.  Raises ValueError if the net is too coarse.
+    by √2.  On a dome r is the length of the chord.  Raises ValueError if the net is too coarse.
     """
     _require_resolution(surface, correlation_length, "a correlation length")
+    if domes.is_radial(surface):
+        return _normalise(_field_on_sphere(surface, correlation_length, seed), where)
     cells = [correlation_length / 2 / pitch for pitch in surface.pitch]
     margin = [int(np.ceil(4 * c)) for c in cells]
     shape = [m + 2 * k for m, k in zip(surface.shape, margin, strict=True)]  # the margin avoids effects of the boundary
@@ -386,6 +401,20 @@ def random_field(surface: BSplineSurface, correlation_length: float, seed: int, 
     noise = fft.irfftn(fourier_gaussian(noise, cells, n=shape[-1]), shape)  # 20 times as fast as gaussian_filter
     inner = tuple(slice(k, k + m) for k, m in zip(margin, surface.shape, strict=True))
     return _normalise(noise[inner], where)
+
+
+def _field_on_sphere(dome: RadialSurface, correlation_length: float, seed: int) -> np.ndarray:
+    """Return a random field (m, n) on the sphere of a dome, a sum of waves cos(k · p + φ) at the points p = R d.
+
+    Wave vectors k with the standard deviation √2 / correlation_length in each component give the covariance
+    exp(-(r / correlation_length)²), r the length of the chord (Rahimi and Recht 2007, "Random features").
+    """
+    chance = np.random.default_rng(seed)
+    waves = math.sqrt(2) / correlation_length * chance.standard_normal((SPHERE_WAVES, 3))
+    points, field = dome.radius * dome.directions.numpy(), np.zeros(dome.shape)
+    for (k_x, k_y, k_z), phase in zip(waves.tolist(), (2 * np.pi * chance.random(SPHERE_WAVES)).tolist(), strict=True):
+        field += np.cos(k_x * points[0] + k_y * points[1] + k_z * points[2] + phase)
+    return field
 
 
 def inside_outline(outline: Outline, net: BSplineSurface) -> np.ndarray:

@@ -82,7 +82,6 @@ def write_trial(folder: Path, number: int, path: Path, settings: StudySettings) 
 
 def _pictures(scene: Scene, nominal: Nominal, settings: StudySettings) -> tuple[TargetPictures, ...]:
     """Return the pictures of each target, all with the same errors; the screens move together."""
-    scene.lens.require_heights("tolerance")
     channels = scene.channels(TRACED_SOURCE_POINTS) if scene.source.extent else scene.channels()
     setup = Setup(nominal.lens, channels, scene.target.screen)
     errors = perturbations(setup, graded_table(scene.tolerance, settings.grade), scene.lens.material)

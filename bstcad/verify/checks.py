@@ -20,7 +20,7 @@ import numpy as np
 from bstcad.analysis.light import Blur, blur, margins, mount_losses, rrmsd_of_ripple
 from bstcad.analysis.shape import AT_BOUND, Extreme, describe, survey, survey_front
 from bstcad.cad import mesh as meshes
-from bstcad.optics import quadrature
+from bstcad.optics import domes, quadrature
 from bstcad.optics.channels import Channel
 from bstcad.optics.goal import Goal, worst
 from bstcad.optics.lens import Lens
@@ -251,7 +251,8 @@ def _mounted_lens(read: Future[Lens], bare: Lens, nominal: Nominal, path: Path) 
     flange = None if mount is None else mount.flange
     try:
         made = _result(read, path.with_name("part.step"))
-        lens = replace(_with_design_facts(made, designed), outline=bare.outline)
+        outline = designed.outline if domes.is_dome(designed) else bare.outline  # a dome's is in the designed chart
+        lens = replace(_with_design_facts(made, designed), outline=outline)
         pairs = zip(("front", "back"), lens.apertures, designed.apertures, strict=True)
         checks = [_aperture_check(*each) for each in pairs]
     except ValueError as error:

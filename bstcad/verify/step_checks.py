@@ -253,8 +253,12 @@ def lens_of_part(folder: Path, designed: Lens, mount: Mount) -> Lens:
     if not path.exists():
         raise ValueError(f"{PART_FILE}: is missing; generate the design again")
     reread, up = step_reading.read(path, _part(path, _stamp(path))[1]), mount.origin(designed.front_vertex)
-    front, back = (face.moved(face.z + up) for face in (reread.front, reread.back))
-    return replace(designed, front=front, back=back, clear=reread.clear, losses=None)
+    front, back, clear = reread.front, reread.back, reread.clear
+    if domes.is_dome(designed):
+        back, aperture = domes.in_chart_of(domes.radial_back(designed), back, clear[1])
+        clear = designed.apertures[0] if front.level else clear[0], aperture  # no edge bounds the light on a plane
+    front, back = front.moved(front.z + up), back.moved(back.z + up)
+    return replace(designed, front=front, back=back, clear=clear, losses=None)
 
 
 @one_sentence

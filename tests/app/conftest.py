@@ -48,6 +48,20 @@ rays = 160
 """
 
 
+# The command line in a process: previews of small nets and few tubes, and predictions without pilots.
+QUICK_PREVIEWS = """
+from dataclasses import replace
+from bstcad.app import preview, preview_desk
+from bstcad.cli import main
+from bstcad.sweep import plan
+from tests.sweep.conftest import typical_pilot
+preview_desk.QUICK = replace(preview.QUICK, net=48, tubes=96, rounds=1, evaluations=3, blurred=2)
+preview_desk.REFINED = replace(preview.QUICK, net=64, tubes=128, rounds=1, evaluations=6, blurred=3)
+plan.run_pilot = typical_pilot
+main()
+"""
+
+
 @dataclass
 class Served:
     """A workbench in a process of its own."""
@@ -68,9 +82,10 @@ class Served:
         return said
 
 
-def begin(folder: Path, *arguments: str) -> Served:
-    """bstcad app in a folder, once it answers."""
-    command = [sys.executable, "-m", "bstcad.cli", "app", str(folder), "--no-browser", *arguments]
+def begin(folder: Path, *arguments: str, quick: bool = True) -> Served:
+    """bstcad app in a folder, once it answers; quick: with QUICK_PREVIEWS."""
+    program = ["-c", QUICK_PREVIEWS] if quick else ["-m", "bstcad.cli"]
+    command = [sys.executable, *program, "app", str(folder), "--no-browser", *arguments]
     source = str(Path(__file__).parents[2])
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=folder,

@@ -10,16 +10,19 @@ import pytest
 
 from bstcad import pipeline
 from bstcad.analysis.shape import describe
-from bstcad.app.preview import REFINED, Outdated, preview
+from bstcad.app.preview import Outdated, PreviewSize, preview
 from bstcad.app.preview_desk import STAGES, PreviewDesk, PreviewRequest
 from bstcad.app.preview_json import DARK_SHAPE_ERROR, MIN_LIT_FRACTION, SHAPE_ERROR, figures
 from bstcad.optics.measure import tubes_picture
 from bstcad.report.units import quantity
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
+from tests.sweep.conftest import typical_pilot
 
 SMALL = {"tailoring.quality": "draft", "lens.back.control_points": 129, "target.pixels": 64}
 NEAR = 0.05  # RRMSD between two pictures
+FEW = PreviewSize(pixels=32, net=33, tubes=64, rounds=1, evaluations=3, blurred=2)
+MORE = replace(FEW, pixels=48, tubes=96)
 
 
 def apart(one: np.ndarray, other: np.ndarray) -> float:
@@ -57,10 +60,10 @@ def test_a_preview_is_near_the_finished_draft(name, lit):
 
 def test_a_preview_depends_on_the_scene_alone():
     scene = load("templates/caustic_portrait.toml", SMALL)
-    first = preview(scene)
+    first = preview(scene, FEW)
     other = {"target.pixels": 96, "target.text": "A", "lens.outline": {"shape": "circle", "radius": 45.0}}
-    assert np.isfinite(preview(scene.changed(other)).rrmsds).all()
-    assert np.array_equal(preview(scene).pictures[0][1], first.pictures[0][1])
+    assert np.isfinite(preview(scene.changed(other), FEW).rrmsds).all()
+    assert np.array_equal(preview(scene, FEW).pictures[0][1], first.pictures[0][1])
 
 
 @pytest.mark.parametrize(
@@ -90,7 +93,11 @@ def test_a_scene_that_a_design_would_refuse_is_refused():
         preview(scene)
 
 
-def test_the_desk_answers_the_newest_request_of_each_page_in_order():
+def test_the_desk_answers_the_newest_request_of_each_page_in_order(monkeypatch):
+    """Previews are small, and predictions have no pilots."""
+    monkeypatch.setattr("bstcad.app.preview_desk.QUICK", FEW)
+    monkeypatch.setattr("bstcad.app.preview_desk.REFINED", MORE)
+    monkeypatch.setattr("bstcad.sweep.plan.run_pilot", typical_pilot)
     desk = PreviewDesk()
     scene = load("templates/disk.toml", {"lens.back.control_points": 33, "target.pixels": 16})
     try:
@@ -108,7 +115,7 @@ def test_the_desk_answers_the_newest_request_of_each_page_in_order():
         assert late.replaced and not newer.replaced
         assert [desk.answer(newer, k, 120.0)[0] for k in range(len(STAGES))] == list(STAGES)
         settled = newer.answers[1][1]
-        assert np.array_equal(settled.pictures[0][1], preview(newer.scene, size=REFINED).pictures[0][1])
+        assert np.array_equal(settled.pictures[0][1], preview(newer.scene, size=MORE).pictures[0][1])
         assert set(newer.answers[3][1]["predicted"]) == {"draft", "standard", "fine"}
         refused = PreviewRequest("three", 1, scene.changed({"target.x": [9e4, 9.1e4]}))
         desk.ask(refused)

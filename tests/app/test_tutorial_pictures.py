@@ -172,7 +172,7 @@ def compare(page):
 def test_the_steps_of_the_tutorial_lead_to_its_pictures(open_page, tmp_path):
     folder = tmp_path / "outputs"
     folder.mkdir()
-    served = begin(folder)
+    served = begin(folder, quick=False)
     try:
         page = open_page(served.address, viewport={"width": WIDE, "height": HIGH})
         drop_the_picture(page)
@@ -182,7 +182,7 @@ def test_the_steps_of_the_tutorial_lead_to_its_pictures(open_page, tmp_path):
         compare(page)
     finally:
         served.end()
-    again = begin(folder)  # 9: closed, and come back to
+    again = begin(folder, quick=False)  # 9: closed, and come back to
     try:
         page = open_page(again.address)
         assert page.locator(".designs li").count() == 2

@@ -246,16 +246,20 @@ def axis_of(knots, place):
 
 def border_of(face):
     """The Border of a face, its holes included: a place is inside where a line from it crosses segments an odd time."""
-    segments = []
+    curves = []
     for item in _explored(face, TopAbs_EDGE):
         edge = TopoDS.Edge_s(item)
         if BRep_Tool.Degenerated_s(edge):
             continue
         curve = BRepAdaptor_Curve(edge)
         at = np.linspace(curve.FirstParameter(), curve.LastParameter(), EDGE_POINTS + 1)
-        points = np.array([(p.X(), p.Y()) for p in map(curve.Value, at)])
-        segments.append(np.hstack([points[:-1], points[1:]]))
-    segments = np.vstack(segments)
+        curves.append(np.array([(p.X(), p.Y()) for p in map(curve.Value, at)]))
+    return border_from(curves)
+
+
+def border_from(curves):
+    """The Border of closed curves, from points (n, 2) along each of their pieces."""
+    segments = np.vstack([np.hstack([points[:-1], points[1:]]) for points in curves])
     low, high = segments[:, 1::2].min(), segments[:, 1::2].max()
     per_mm = BINS / (high - low)
     bins = ((np.sort(segments[:, 1::2], axis=1) - low) * per_mm).astype(int).clip(0, BINS - 1)
@@ -789,17 +793,9 @@ def nets_of(folder, scene):
     return nets, of_name, lower
 
 
-def judge(folder, points=POINTS, seed=31, number=0, most=None):
-    """The Judgement of the design in a folder, on its target of that number.
-
-    points: of each scrambling, doubled until ACCURACY is reached or `most` traced (default: MAX_POINTS; no more than
-    `points` where these are fewer than POINTS).  Raises Declined where the judge does not trace what the folder holds.
-    """
-    folder = Path(folder)
-    scene = tomllib.loads((folder / "scene.toml").read_text(encoding="utf-8"))
-    with np.load(folder / "design.npz") as kept:
-        target = kept["target" if number == 0 else f"target_{number + 1}"].astype(float)
-    (nets, of_name, lower), glass = nets_of(folder, scene), glass_of(scene)
+def _through_nets(folder, scene, glass, screen):
+    """A function (points, picture, ledger) that traces points (n, 4) in [0, 1] through faces of heights."""
+    (nets, of_name, lower) = nets_of(folder, scene)
     back = Face(True, Conic(0.0, 0.0, 0.0), nets["back"], border_of(of_name["back"]))
     first, vertex = back, scene["lens"]["back"]["z"]
     if not glass.mirror:
@@ -817,22 +813,53 @@ def judge(folder, points=POINTS, seed=31, number=0, most=None):
     if len(before.bends):
         vertex, low, high = before.vertices[0, 2], -before.rims[0], before.rims[0]
     light = light_of(scene["source"], sense, float(vertex))
+    draw = draw_of(low, high, light, float(vertex))
+
+    def follow(points, picture, ledger):
+        at, area = draw.points(points)
+        trace(at, area, light, first, back, glass, screen, before, behind, picture, ledger)
+
+    return follow
+
+
+def _through_dome(folder, scene, glass, screen):
+    """The function of `_through_nets` for a dome."""
+    from tests.benchmarks import judged_dome  # which imports this file
+
+    lens, light = judged_dome.lens_of(folder, scene), light_of(scene["source"], 1.0, 0.0)
+
+    def follow(points, picture, ledger):
+        judged_dome.trace(points, light, lens, glass, screen, picture, ledger)
+
+    return follow
+
+
+def judge(folder, points=POINTS, seed=31, number=0, most=None):
+    """The Judgement of the design in a folder, on its target of that number.
+
+    points: of each scrambling, doubled until ACCURACY is reached or `most` traced (default: MAX_POINTS; no more than
+    `points` where these are fewer than POINTS).  Raises Declined where the judge does not trace what the folder holds.
+    """
+    folder = Path(folder)
+    scene = tomllib.loads((folder / "scene.toml").read_text(encoding="utf-8"))
+    with np.load(folder / "design.npz") as kept:
+        target = kept["target" if number == 0 else f"target_{number + 1}"].astype(float)
+    glass, follow = glass_of(scene), _through_dome if scene["lens"]["back"].get("kind") == "radial" else _through_nets
     asked = scene["target"]
     screen = screen_of(asked[number] if isinstance(asked, list) else asked, target.shape)
-    draw = draw_of(low, high, light, float(vertex))
+    trace_points = follow(folder, scene, glass, screen)
 
     engines = [qmc.Sobol(4, seed=np.random.default_rng((seed, k))) for k in range(SETS)]
     pictures, ledgers = np.zeros((SETS, *target.shape)), np.zeros((SETS, len(LEDGER)))
 
-    def follow(k, count):
+    def trace_set(k, count):
         for start in range(0, count, CHUNK):
-            at, area = draw.points(engines[k].random(min(CHUNK, count - start)))
-            trace(at, area, light, first, back, glass, screen, before, behind, pictures[k], ledgers[k])
+            trace_points(engines[k].random(min(CHUNK, count - start)), pictures[k], ledgers[k])
 
     most, traced, more = most or (MAX_POINTS if points >= POINTS else points), 0, points
     with ThreadPoolExecutor(min(SETS, os.cpu_count() or 1)) as pool:
         while True:
-            list(pool.map(follow, range(SETS), [more] * SETS))
+            list(pool.map(trace_set, range(SETS), [more] * SETS))
             traced += more
             sets = pictures.reshape(SETS, -1)
             rrmsd = paired(sets, target.ravel())

@@ -50,6 +50,8 @@ CASES = {  # name: (title, scene)
     "L1-portrait": ("L1: portrait, 90 degrees wide", SCENES / "L1_portrait.toml"),
     "L2-letters": ("L2: letters, 6 mm behind the lens", SCENES / "L2_letters.toml"),
     "L2-portrait": ("L2: portrait, 6 mm behind the lens", SCENES / "L2_portrait.toml"),
+    "L3-letters": ("L3: letters from a half space", SCENES / "L3_letters.toml"),
+    "L4-letters": ("L4: letters, 4 mm behind a lamp of 60 degrees", SCENES / "L4_letters.toml"),
     SUN: ("a picture by sunlight (20 mrad)", SCENES / "sun_picture.toml"),
 }
 

@@ -1,6 +1,8 @@
 """The independent judge of domes: its reader and B-splines beside other programs, and its pictures beside bstcad's."""
 
 import math
+import re
+from pathlib import Path
 
 import cadquery as cq
 import numpy as np
@@ -23,11 +25,15 @@ from bstcad.optics.point import Point
 from bstcad.optics.radial import RadialSurface
 from bstcad.optics.sphere_light import SphereLight
 from bstcad.optics.surfaces import Sphere
-from tests.benchmarks import independent_dome
+from tests.benchmarks import independent_dome, judged_dome
+from tests.benchmarks.cold import generate
+from tests.benchmarks.independent import Conic
+from tests.benchmarks.test_independent import FLUX, SIGMAS, judged
 
 R, INNER, N, Z, HALF = 15.0, 8.0, 1.4936, 3.0, math.radians(80.0)
 CHART = SphereChart(R)
 RIM = CHART.length(HALF)
+DOCS = Path(__file__).parents[2] / "docs"
 MISFIT = 0.8  # largest RMS difference in units of the noise of random rays; Sobol points have less
 PIXELS, RAYS = 24, 1 << 16
 
@@ -103,3 +109,46 @@ def test_a_wavy_dome_makes_the_picture_of_the_independent_judge(profile, place, 
     assert many.sum() > 100 and np.sqrt((misfit**2).mean()) < MISFIT
     turned = (found.picture[:, ::-1] - picture)[many] * math.sqrt(RAYS) / np.sqrt(picture[many])
     assert np.sqrt((turned**2).mean()) > 2 * MISFIT  # the mirror image is told apart
+
+
+def test_the_judge_of_folders_meets_the_dome_where_the_plain_judge_does():
+    """Newton's method by numba from a table of starts, beside that of numpy from a tree, from a lamp off the centre."""
+    dome = independent_dome.dome_of(wavy_dome(65, 0.6, 1.5).control_points(), (0, 0, Z))
+    net, random = judged_dome.net_of(dome), np.random.default_rng(3)
+    d = independent_dome.light(random.random((400, 2)), math.radians(75.0), True)
+    p = np.array([0.5, -0.3, Z + 0.2]) + random.uniform(-0.2, 0.2, (400, 3))
+    expected, work = independent_dome.meet(dome, p, d), np.empty((7, 3))
+    for k in range(len(d)):
+        arrives, s, place, normal = judged_dome.met(net, p[k], d[k], work)
+        assert arrives == expected.found[k]
+        if arrives:
+            assert s == pytest.approx(expected.path[k], abs=1e-9)
+            np.testing.assert_allclose(place, expected.point[k], rtol=0, atol=1e-9)
+            np.testing.assert_allclose(normal, expected.normal[k], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("conic", [(8.0, -1 / 8.0, 0.0), (6.0, -0.1, -0.4), (1.0, 0.0, 0.0)])
+def test_the_judge_of_folders_meets_a_front_where_its_equation_holds(conic):
+    """c r² - 2 h + (1 + k) c h² = 0 ahead of the lamp; the normal is along the gradient."""
+    z, c, k = conic
+    front, random = Conic(z, c, c * (1 + k)), np.random.default_rng(5)
+    for d in independent_dome.light(random.random((50, 2)), math.radians(70.0), False):
+        meets, p, n = judged_dome.on_conic(front, (0.1, -0.2, 0.05), tuple(d))
+        h = p[2] - z
+        assert meets and abs(c * (p[0] ** 2 + p[1] ** 2) - 2 * h + front.q * h * h) < 1e-10
+        along = np.array([-c * p[0], -c * p[1], 1 - front.q * h])
+        np.testing.assert_allclose(n, along / np.linalg.norm(along), atol=1e-12)
+        assert np.abs(np.cross(np.subtract(p, (0.1, -0.2, 0.05)), d)).max() < 1e-10
+
+
+@pytest.mark.bench
+@pytest.mark.parametrize("changes", [(), ("source.width=0.6", "source.height=0.4", "effects=[{kind='fresnel'}]")])
+def test_a_folder_of_a_dome_is_judged_independently(changes, tmp_path):
+    """The scene of the how-to, as a point without losses and as a small chip with Fresnel's reflections."""
+    text = re.search(r"```toml\n(.*?)```", (DOCS / "how-to" / "domes.md").read_text(), re.DOTALL).group(1)
+    (tmp_path / "dome.toml").write_text(text)
+    done = generate(tmp_path / "dome.toml", tmp_path / "out", *changes, "tailoring.quality=draft")
+    assert done.code in (0, 1), done.said
+    report, found = judged(tmp_path / "out", SIGMAS)
+    for line in ("on target", "off target", "missed the lens"):
+        assert found.flux[line] == pytest.approx(report["flux"][line], abs=FLUX)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.cad import mesh, mounting, solid, solid_properties, step_reading, step_writing
+from bstcad.analysis.shape import survey
+from bstcad.cad import dome_mesh, mesh, mounting, solid, solid_properties, step_reading, step_writing
 from bstcad.cad.radial_nets import radial_surface
 from bstcad.cad.walls import Draft
 from bstcad.optics import domes, quadrature
@@ -17,7 +18,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.radial import RadialSurface
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.scene.mount import Flange, Round
+from bstcad.scene.mount import Flange, Mount, Part, Round
 from bstcad.step_text import part21
 from bstcad.verify import step_checks
 from tests.cad.test_trimming import uses, worst_gap
@@ -175,3 +176,56 @@ def test_a_dome_that_is_none_is_one_sentence(lens, words):
 def test_a_dome_keeps_its_own_rim():
     with pytest.raises(ValueError, match="trim or holes: a dome keeps its own rim"):
         solid.lens_solid(dome(), holes=[(0.0, 0.0, 1.0)])
+
+
+def test_a_part_is_read_back_in_the_chart_of_its_design(tmp_path):
+    """A flange in the base plane, and one whose lower face lies below it: apertures, net and a closed solid."""
+    lens = domes.on_base(dome(half=80.0, m=25), 0.5)
+    lens = replace(lens, clear=(lens.front.outline, lens.outline))
+    for z in (0.5, -0.4):
+        plate = Flange(outline=Round(shape="circle", diameter=40.0), z=z, thickness=1.2 if z < 0 else 0.9)
+        mount = Mount(datum="flange", flange=plate)
+        mounting.write_if_it_fits(lens, mount, tmp_path / "part.step", "dome", Part())
+        found = step_checks.lens_of_part(tmp_path, lens, mount)
+        assert found.back.radius == lens.back.radius and found.apertures[0].radius == pytest.approx(
+            lens.front.outline.radius, abs=1e-8
+        )
+        assert found.apertures[1].radius == pytest.approx(lens.outline.radius, abs=1e-8)
+        assert np.abs(found.back.control_points() - lens.back.control_points()).max() < 1e-11
+        assert [c.name for c in step_checks.check_part(tmp_path, lens, mount, Part()) if not c.passed] == []
+        assert domes.opening(found).radius == pytest.approx(domes.opening(lens).radius, abs=1e-9)
+
+
+def offset_sphere(radius, height, half, m=97):
+    """Return a dome about the origin whose back is the sphere of a radius (mm) about (0, 0, height)."""
+    chart, half = SphereChart(radius), math.radians(half)
+    rim = chart.length(half)
+    net = RadialSurface.sphere(0.0, radius, (1.1 * rim, 1.1 * rim), (m, m))
+    _, _, cos = net.directions
+    rho = height * cos + torch.sqrt(radius**2 - height**2 * (1 - cos**2))
+    net = replace(net, heights=rho - radius)
+    return Lens(Plane(-2.0), net, Circle(rim), 1.49)
+
+
+@pytest.mark.parametrize("height", [0.0, 3.0, -3.0])
+def test_the_curvature_and_the_overhang_of_a_sphere_are_known(height):
+    """A sphere of 12 mm has ridges of 12 mm and no valley; about a higher centre it overhangs at the rim."""
+    lens, half = offset_sphere(12.0, height, 85.0), math.radians(85.0)
+    found, pitch = survey(lens), max(lens.back.pitch)
+    # the curvature of a spline of degree 2 jumps at the knots, by the pitch in units of the radius
+    assert found.convex.largest == pytest.approx(12.0, rel=pitch / 12.0) and found.concave.largest > 1e6
+    z = math.cos(half) * (height * math.cos(half) + math.sqrt(144.0 - (height * math.sin(half)) ** 2))
+    slope = math.degrees(math.acos((z - height) / 12.0))
+    assert found.slope.largest == pytest.approx(slope, abs=0.1) and (slope > 90.0) == (height > 0)
+
+
+@pytest.mark.parametrize("upright", [False, True])
+def test_a_section_lies_on_the_dome_and_ends_on_its_rim(upright):
+    lens = CASES["below the horizon"]
+    u, z = domes.section(lens, upright, 201)
+    points = np.stack([0 * u, u, z] if upright else [u, 0 * u, z], axis=1)
+    assert dome_mesh.distance_from_dome(lens.back, points).max() < 1e-10
+    rim = domes.rim_of(lens)
+    assert max(np.linalg.norm(rim - point, axis=1).min() for point in points[[0, -1]]) < 0.1
+    edge, reach = domes.silhouette(lens), np.hypot(*mesh.lens_mesh(lens, 64).vertices[:, :2].T).max()
+    assert np.hypot(*edge.T).max() == pytest.approx(reach, rel=1e-3) and (edge[0] == pytest.approx(edge[-1]))

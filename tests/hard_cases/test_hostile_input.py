@@ -127,7 +127,7 @@ def is_one_sentence(error):
     return ours and text.isprintable() and 20 < len(text) <= LONGEST
 
 
-@pytest.mark.parametrize("count", [300, pytest.param(5_000, marks=pytest.mark.bench)])
+@pytest.mark.parametrize("count", [120, pytest.param(5_000, marks=pytest.mark.bench)])
 @pytest.mark.parametrize("reader", READERS)
 @pytest.mark.filterwarnings("error")
 def test_wrong_input_is_one_sentence(reader, count, small_step, tmp_path, seen, bounded, capfd, holds):

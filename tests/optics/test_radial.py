@@ -374,7 +374,7 @@ def test_rays_lead_from_the_lamp_through_their_points_of_the_sphere():
     x, y = chart_points(largest=84.0)
     rays = light.rays_through(x, y, 0.0, 2.0)
     q = CHART.point(x, y, torch.tensor(0.0))
-    start = torch.tensor([1.5, -0.7, 0.4]).double()[:, None]
+    start = torch.tensor([1.5, -0.7, 0.4], dtype=torch.float64)[:, None]
     torch.testing.assert_close(rays.position + Z * 0, start.expand_as(q))
     torch.testing.assert_close(rays.direction, (q - start) / (q - start).norm(dim=0), rtol=0, atol=1e-14)
     torch.testing.assert_close(rays.flux, 2.0 * light.irradiance(x, y, 0.0))

@@ -5,11 +5,12 @@ from functools import cache
 
 import pytest
 
+from bstcad.analysis.steepness import Steepness
 from bstcad.runs.cluster import THIS_MACHINE, Answer
 from bstcad.scene.scene import load
 from bstcad.sweep import tradeoff
 from bstcad.sweep.cold_run import DONE, FAILED, ColdRun, run_and_judge
-from bstcad.sweep.prediction import typical_seconds
+from bstcad.sweep.prediction import Pilot, pilot_scene, typical_seconds, with_quality
 from tests.conftest import DISK
 
 TINY = {
@@ -19,6 +20,12 @@ TINY = {
 REFUSED = ("target.pixels", 96)  # a setting that comes to no lens
 KERNEL = 0.2  # seconds of the calibration kernel
 FAR = "tcp://10.0.0.1:1"  # a worker
+
+
+def typical_pilot(scene, quality, tick=lambda: None):
+    """Return the small scene of `run_pilot` and its typical time, without its design."""
+    small, factor = pilot_scene(with_quality(scene, quality))
+    return Pilot(small, typical_seconds(small), 0.1, factor=factor, detail=0.0, blur=0.0, steep=Steepness(0.0, 0.0))
 
 
 class Synthetic:

@@ -20,6 +20,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.tailoring.grazing import Grazing
 from bstcad.tailoring.run import Edge
+from tests.conftest import draws_nothing, quick_effort, verify_with
 
 SCENE = """
 name = "wide"
@@ -163,7 +164,10 @@ def designed(tmp_path_factory):
     """(folder, code) of the draft of the scene, as generate writes it."""
     folder = tmp_path_factory.mktemp("reach")
     (folder / "wide.toml").write_text(SCENE + "[accept]\nrrmsd = 0.4\n")  # so few points and evaluations end at 0.32
-    return folder / "out", cli.run(["generate", str(folder / "wide.toml"), "-o", str(folder / "out")])
+    with pytest.MonkeyPatch.context() as patch:
+        draws_nothing(patch)
+        verify_with(patch, quick_effort())
+        yield folder / "out", cli.run(["generate", str(folder / "wide.toml"), "-o", str(folder / "out")])
 
 
 def test_a_design_lights_its_part_without_total_reflection(designed):

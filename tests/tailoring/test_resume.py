@@ -14,7 +14,7 @@ from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring.minimise import AdamState, Best, LbfgsState, adam, lbfgs, minimise
 from bstcad.tailoring.run import Hooks
-from tests import two_faces
+from tests import domes, two_faces
 from tests.conftest import DISK, SMALL
 
 TINY = SMALL | {"tailoring.rays": 64, "target.pixels": 32, "tailoring.transport_grid": 32, "tailoring.rounds": 3}
@@ -24,6 +24,7 @@ SCENES = {
     "free front": TINY | {"lens.front": {"kind": "sphere", "z": 15.0, "curvature": 0.002, "optimise": True}},
     "extended source": TINY | {"source.diameter": 1.0, "tailoring.source_points": 4, "tailoring.stage2_iterations": 12},
     "two faces, two pictures": two_faces.SMALL,
+    "dome": domes.SMALL,
     "front alone": two_faces.SMALL | {"target": two_faces.CHANGES["target"][:1], "lens.back.optimise": False},
     "two faces, picture and wave": two_faces.SMALL | two_faces.WITH_WAVE,
     "paper": TINY
@@ -38,6 +39,7 @@ SCENES = {
 
 
 QUICK = (
+    "dome",
     "least squares, within bounds",
     "short rounds",
     "two faces, picture and wave",

@@ -294,6 +294,7 @@ function noEstimates(sentence) {
   status.textContent = `No preview: ${sentence}`;
   status.className = "error";
   for (const part of ["figures", "remarks"]) (element(part).tBodies?.[0] ?? element(part)).replaceChildren();
+  showOffer(null);
   element("solid-figure").classList.remove("drawn");
   noPlan("");
 }
@@ -330,6 +331,7 @@ function showLight(reply) {
     item.textContent = sentence;
     return item;
   }));
+  showOffer(reply.offer);
   if (!reply.solid) return;
   if (viewer === null) {
     viewer = solidView.begin(element("solid-figure"), reply.solid);
@@ -338,6 +340,15 @@ function showLight(reply) {
     element("solid-figure").classList.add("drawn");
     viewer.update(reply.solid);
   }
+}
+
+// Show the offer of another kind of lens with its sentence; the button exists if the change is possible.
+function showOffer(offer) {
+  const place = element("offer"), button = place.querySelector("button");
+  place.hidden = !offer;
+  place.querySelector("p").textContent = offer?.sentence ?? "";
+  button.hidden = !offer?.value;
+  button.onclick = () => change({ key: offer.key, value: offer.value });
 }
 
 function figure(source, alt, caption, kind = "") {

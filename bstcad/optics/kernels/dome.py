@@ -1,4 +1,6 @@
-"""Fused CPU kernels (numba) behind `trace.through` and `trace.behind` for radial surfaces, and the adjoint.
+"""Fused CPU kernels (numba) for radial surfaces: behind `trace.through` and `trace.behind`, and the whole path.
+
+The whole path leads from a lamp through the front (dome_light.py) and the dome to the receiver, as in forward.py.
 
 Rays are processed in blocks as in crossing.py, whose steps behind the face serve here too.  With the ray o + t i, the
 point S(x, y) of the surface, f = S - o and the normal n = S_x × S_y, one step of Newton's method is
@@ -28,8 +30,9 @@ from numba import njit
 from torch import Tensor
 
 from bstcad.optics import radial
+from bstcad.optics.emitters import Emitter
 from bstcad.optics.interfaces import Interface
-from bstcad.optics.kernels import crossing, kernel_arguments
+from bstcad.optics.kernels import crossing, dome_light, forward, kernel_arguments
 from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.crossing import (
     ADJOINT_WORK,
@@ -48,11 +51,30 @@ from bstcad.optics.kernels.crossing import (
     NORM,
     SHIFT,
 )  # fmt: skip
-from bstcad.optics.kernels.forward import BLOCK, COS_BACK, DX, DY, DZ, FATE, PATH, SAG, U, V, X, Y, Z
-from bstcad.optics.kernels.records import Faces, floats
-from bstcad.optics.kernels.spline import basis, bend, beyond2, curved_piece, piece, scatter
+from bstcad.optics.kernels.dome_light import cross_front, launch_from_sphere
+from bstcad.optics.kernels.forward import (
+    BLOCK,
+    COS_BACK,
+    DX,
+    DY,
+    DZ,
+    FATE,
+    FLUX,
+    PATH,
+    SAG,
+    U,
+    V,
+    X,
+    Y,
+    Z,
+    to_screen,
+)  # fmt: skip
+from bstcad.optics.kernels.records import DomeFront, Faces, floats
+from bstcad.optics.kernels.spline import basis, bend, beyond2, curved_piece, net_of, piece, scatter
+from bstcad.optics.lens import Lens
 from bstcad.optics.radial import RadialSurface
 from bstcad.optics.rays import Rays
+from bstcad.optics.receivers import Receiver
 
 # Further offsets in `work`: unit normal N; for the adjoint ∂S/∂x, ∂S/∂y and the second derivatives, three components
 # each, and ∂L/∂(S, ∂S/∂u, ∂S/∂v), L the merit.
@@ -374,14 +396,91 @@ def _cross_adjoint(net, face, screens, position, direction, status, hits, g, mor
 
 def prepare(rays: Rays, interface: Interface) -> tuple[Rays, Tensor, RadialFace]:
     """Return (the rays, components (3, m, n) of the control points relative to the centre (mm), face as numbers)."""
+    points, face = _as_numbers(interface)
+    faces, _ = kernel_arguments.faces(interface, None, rays.sense, rays.z)
+    return rays, points, face._replace(faces=faces)
+
+
+def _as_numbers(interface: Interface) -> tuple[Tensor, RadialFace]:
+    """Return components (3, m, n) of the control points relative to the centre (mm), and the face as numbers."""
     surface = interface.surface
     assert isinstance(surface, RadialSurface)
-    faces, _ = kernel_arguments.faces(interface, None, rays.sense, rays.z)
+    faces, _ = kernel_arguments.faces(interface, None, 1, surface.z)
     tolerance = radial.ROOT_TOLERANCE * torch.finfo(torch.float64).eps * surface.radius
     search = surface.radius, tolerance, radial.MAX_STEP * surface.radius, radial.MIN_COSINE, radial.NEWTON_STEPS
     points = torch.stack([(surface.radius + surface.heights.double()) * d for d in surface.directions])
-    return rays, points, RadialFace._make([faces, *floats(search)])
+    return points, RadialFace._make([faces, *floats(search)])
 
 
+# --- the whole path ---------------------------------------------------------------------------------------------------
+
+
+class DomeFaces(NamedTuple):
+    """Front and dome as numbers."""
+
+    dome: RadialFace
+    front: DomeFront
+
+
+@njit
+def _trace(net, light, both, tilted, losses, count, work, active):
+    """Trace rays through points of the chart to the screen as `forward._trace` does."""
+    face = both.dome
+    launch_from_sphere(light, count, work)
+    cross_front(both.front, count, work)
+    searching = 0
+    for r in range(count):
+        work[U + r] = work[V + r] = work[PATH + r] = 0.0
+        if (work[FATE + r] == 0.0) & (work[FLUX + r] > 0.0):
+            _start_on_sphere(face, r, work)
+            active[searching] = r
+            searching += 1
+    _at_dome(net, face, searching, count, work, active)
+    _deflect(face.faces, count, work)
+    to_screen(face.faces, face.faces.throw, tilted, count, work)
+
+
+@compiled()
+def _rows(net, light, both, tilted, losses, cells, pixels, first, step, box, tent, lines):
+    """Simulate a part of the light as `forward._rows` does."""
+    work, active, part = np.zeros(CROSSING_WORK), np.empty(BLOCK, np.uint32), np.empty(forward.LINES)
+    for i in range(first, cells.n, step):
+        for j in range(0, cells.n, BLOCK):
+            count = min(BLOCK, cells.n - j)
+            forward.points(cells, i, j, count, work)
+            _trace(net, light, both, tilted, losses, count, work, active)
+            part[:] = 0.0
+            if losses.present:
+                forward.dim(both.dome.faces, losses, count, work, part)
+            forward.count_rays(pixels, count, work, box, tent, part)
+            for k in range(forward.LINES):
+                lines[k] += part[k]
+
+
+@compiled()
+def _rays(net, light, both, tilted, losses, x, y, landing, flux, fate):
+    """Store landing (2, n), flux and fate of the rays through given points (n,) of the chart."""
+    work, active = np.zeros(CROSSING_WORK), np.empty(BLOCK, np.uint32)
+    for first in range(0, x.size, BLOCK):
+        count = min(BLOCK, x.size - first)
+        for r in range(count):
+            work[X + r], work[Y + r] = x[first + r], y[first + r]
+        _trace(net, light, both, tilted, losses, count, work, active)
+        for r in range(count):
+            landing[0, first + r], landing[1, first + r] = work[X + r], work[Y + r]
+            flux[first + r], fate[first + r] = work[FLUX + r], np.uint8(work[FATE + r])
+
+
+def _scene(source: Emitter, lens: Lens, plane: Receiver) -> forward.Scene:
+    """Return net, light, faces and tilted screen for the kernels."""
+    *front, last = lens.interfaces
+    net, face = _as_numbers(last)
+    faces, tilted = kernel_arguments.faces(last, plane, 1, last.surface.z)
+    both = DomeFaces(face._replace(faces=faces), dome_light.front_of(front, last.surface.z))
+    return net_of(net), kernel_arguments.beam(source, lens), both, tilted
+
+
+PATHS = forward.Form(_rows, _rays, _scene)
+simulate, land = partial(forward.simulate, form=PATHS), partial(forward.land, form=PATHS)
 RADIAL = crossing.Form(_cross, _cross_adjoint, 3, prepare)
 landed, behind = partial(crossing.landed, form=RADIAL), partial(crossing.behind, form=RADIAL)

@@ -10,8 +10,8 @@ Arithmetic is float64 for every precision of the net; memory is a pair of pictur
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -308,7 +308,7 @@ RAY_PARTS = 8  # number of partial sums of the rays; each has its own pictures, 
 
 
 @njit(error_model="numpy")
-def _points(cells, i, j, count, work):
+def points(cells, i, j, count, work):
     """Store the points of cells (i, j), …, (i, j + count - 1), as `sampling.stratified_strips` does."""
     for r in range(count):
         z = cells.key + np.uint64(i * cells.n + j + r) * cells.stride
@@ -450,7 +450,7 @@ def meet_front(faces, axial, count, work):
 def _trace(net, beam, faces, tilted, losses, count, work, active):
     """Trace rays through points on the plane of the first vertex to the screen; store landing, flux density and fate.
 
-    losses: if there are any, the cosines of incidence and the path in the glass are stored for `_dim`.
+    losses: if there are any, the cosines of incidence and the path in the glass are stored for `dim`.
     """
     if beam.table.m > 0:
         _look_up(beam.peak, beam.table, count, work)
@@ -494,7 +494,7 @@ def _trace(net, beam, faces, tilted, losses, count, work, active):
 
 
 @njit(error_model="numpy")
-def _count(pixels, count, work, box, tent, lines):
+def count_rays(pixels, count, work, box, tent, lines):
     """Add rays to box picture, tent picture and ledger, as `irradiance.box`, `tent` and `ledger` do."""
     rows, columns = box.shape
     for r in range(count):
@@ -541,7 +541,7 @@ def _share(table, cosine):
 
 
 @njit(error_model="numpy")
-def _dim(faces, losses, count, work, lines):
+def dim(faces, losses, count, work, lines):
     """Reduce the flux of each ray by its losses, and add these to the ledger, as `interfaces.apply_losses` does."""
     for r in range(count):
         flux, fate = work[FLUX + r], work[FATE + r]
@@ -570,12 +570,12 @@ def _rows(net, beam, faces, tilted, losses, cells, pixels, first, step, box, ten
     for i in range(first, cells.n, step):
         for j in range(0, cells.n, BLOCK):
             count = min(BLOCK, cells.n - j)
-            _points(cells, i, j, count, work)
+            points(cells, i, j, count, work)
             _trace(net, beam, faces, tilted, losses, count, work, active)
             part[:] = 0.0  # partial sums by blocks: in one long sum of equal numbers rounding errors add up
             if losses.present:
-                _dim(faces, losses, count, work, part)
-            _count(pixels, count, work, box, tent, part)
+                dim(faces, losses, count, work, part)
+            count_rays(pixels, count, work, box, tent, part)
             for k in range(LINES):
                 lines[k] += part[k]
 
@@ -594,14 +594,28 @@ def _rays(net, beam, faces, tilted, losses, x, y, landing, flux, fate):
             flux[first + r], fate[first + r] = work[FLUX + r], np.uint8(work[FATE + r])
 
 
+Scene = tuple[Any, ...]  # net, light, faces and tilted screen (None for a level screen) as arguments of the kernels
+
+
+class Form(NamedTuple):
+    """Kernels of one form of the last face, and the conversion of (source, lens, receiver) to their arguments."""
+
+    rows: Callable[..., None]
+    rays: Callable[..., None]
+    scene: Callable[..., Scene]
+
+
 SeededLight = tuple[float, Emitter, Lens, int, Rectangle]  # weight, source, lens, seed, window (mm) at the first vertex
 
 
-def simulate(lights: Sequence[SeededLight], screen: Screen, n: int) -> tuple[Tensor, Tensor, dict[str, float], int]:
+def simulate(
+    lights: Sequence[SeededLight], screen: Screen, n: int, form: Form | None = None
+) -> tuple[Tensor, Tensor, dict[str, float], int]:
     """Return (box picture, tent picture, ledger, number of rays) from n x n stratified rays of each light.
 
-    Flux is a fraction of the flux of all sources, whose weights sum to 1.
+    Flux is a fraction of the flux of all sources, whose weights sum to 1.  form: None for heights.
     """
+    form = form or HEIGHTS
     count = RAY_PARTS
     box, tent, lines = (np.zeros((count, *shape)) for shape in (screen.shape, screen.shape, (LINES,)))
     pixels = kernel_arguments.pixels(screen)
@@ -609,9 +623,9 @@ def simulate(lights: Sequence[SeededLight], screen: Screen, n: int) -> tuple[Ten
 
     def part(c: int) -> None:
         for arguments in scenes[c::count] if many else scenes:
-            _rows(*arguments, pixels, *((0, 1) if many else (c, count)), box[c], tent[c], lines[c])
+            form.rows(*arguments, pixels, *((0, 1) if many else (c, count)), box[c], tent[c], lines[c])
 
-    scenes = list(_scenes(lights, screen.plane, n))
+    scenes = list(_scenes(lights, screen.plane, n, form.scene))
     reductions.on_threads(part, [(c,) for c in range(count)])
     rays = int(lines[:, COUNT].sum())
     box, tent, lines = (total.sum(0) for total in (box, tent, lines))
@@ -627,12 +641,14 @@ def _taken(lens: Lens) -> dict[str, int]:
     return {loss.line: BY_GLASS if loss.in_glass else BY_FACES for loss in losses}
 
 
-def _scenes(lights: Sequence[SeededLight], plane: Receiver, n: int) -> Iterator[tuple[Any, ...]]:
+def _scenes(
+    lights: Sequence[SeededLight], plane: Receiver, n: int, scene: Callable[..., Scene]
+) -> Iterator[tuple[Any, ...]]:
     """Yield the first six arguments of `_rows` for each light; successive equal lenses are converted once."""
     last: tuple[Lens, tuple[Any, ...]] | None = None
     for weight, source, lens, seed, window in lights:
         if last is None or not _is_same(lens, last[0]):
-            last = lens, (_scene(source, lens, plane), kernel_arguments.losses(lens))
+            last = lens, (scene(source, lens, plane), kernel_arguments.losses(lens))
         (net, _, faces, tilted), losses = last[1]
         cells, beam = kernel_arguments.cells(window, n, seed), kernel_arguments.beam(source, lens)
         assert beam is not None  # else the plain form traces the light
@@ -648,23 +664,29 @@ def _is_same(one: Lens, other: Lens) -> bool:
     )
 
 
-def land(source: Emitter, lens: Lens, plane: Receiver, x: Tensor, y: Tensor) -> Landed:
+def land(source: Emitter, lens: Lens, plane: Receiver, x: Tensor, y: Tensor, form: Form | None = None) -> Landed:
     """Trace rays through (x, y) of the first vertex's plane, each (n,) float64, to `plane`; flux: density at (x, y).
 
     Equal to `trace.trace` of these `source.rays_through` without losses, except for the status of rays without flux.
     """
-    scene = *_scene(source, lens, plane), NO_LOSS_TABLES
+    form = form or HEIGHTS
+    scene = *form.scene(source, lens, plane), NO_LOSS_TABLES
     landing, flux, fate = np.empty((2, x.numel())), np.empty(x.numel()), np.empty(x.numel(), np.uint8)
     reductions.on_threads(
-        lambda first, last: _rays(*scene, *(a[..., first:last] for a in (x.numpy(), y.numpy(), landing, flux, fate))),
+        lambda first, last: form.rays(
+            *scene, *(a[..., first:last] for a in (x.numpy(), y.numpy(), landing, flux, fate))
+        ),
         reductions.shares(x.numel(), BLOCK),
     )
     return Landed(torch.from_numpy(landing), torch.from_numpy(flux), torch.from_numpy(fate))
 
 
-def _scene(source: Emitter, lens: Lens, plane: Receiver) -> tuple[Any, ...]:
+def _scene(source: Emitter, lens: Lens, plane: Receiver) -> Scene:
     """Return net, beam, faces and tilted screen for the kernels; light along -z is reflected by z -> -z."""
     (*front, last), z = lens.interfaces, lens.entrance.z
     heights = last.net.heights
     faces = kernel_arguments.faces(last, plane, lens.passes.sense, z, *front)
     return net_of(-heights if lens.passes.sense < 0 else heights), kernel_arguments.beam(source, lens), *faces
+
+
+HEIGHTS = Form(_rows, _rays, _scene)

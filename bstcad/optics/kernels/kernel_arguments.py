@@ -117,14 +117,14 @@ def _table(interface: Interface) -> np.ndarray:
     return share.contiguous().numpy()
 
 
-def beam(source: Emitter, lens: Lens, tables: bool = True) -> Beam | None:
+def beam(source: Emitter, lens: Lens, tables: bool = True) -> Beam | records.SphereBeam | None:
     """Return the light of a source on the plane of the first vertex of a lens; None: plain torch traces it.
 
-    tables: allow a table of the light if no formula is known.
+    tables: allow a table of the light if no formula is known; there is none by the points of a sphere.
     """
     first, aperture = lens.entrance, lens.interfaces[0].outline
     formula = source.beam(first.z)
-    if formula is None and tables:
+    if formula is None and tables and source.kind != "sphere":
         return _table_of_light(source, source.window(aperture, first.z, first.sags(aperture)), first.z)
     return formula
 

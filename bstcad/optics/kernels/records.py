@@ -109,6 +109,17 @@ class Beam(NamedTuple):
     pattern: Pattern = NO_PATTERN  # irradiance by a profile of its own, inside the limits
 
 
+class SphereBeam(NamedTuple):
+    """Light of a lamp by the points of a sphere, as `sphere_light.SphereLight`."""
+
+    beam: Beam  # irradiance of the lamp on the plane at the distance R from it
+    radius: float  # R (mm)
+    lamp: Frame3  # position of the lamp
+    limit_r2: float  # square of the radius of the disc of the chart in which light is launched (mm²)
+    least: float  # sphere_light.MIN_AXIAL_COSINE
+    peak: float = 1.0  # factor of the flux density
+
+
 class Rules(NamedTuple):
     """Constants of the plain torch form; all are floats, so that a parallel kernel accepts them as one tuple."""
 
@@ -197,6 +208,14 @@ class FrontFace(NamedTuple):
     eta: float  # relative index η = n_in / n_out at the face
     rules: Rules
     fates: Fates
+
+
+class DomeFront(NamedTuple):
+    """Front of a dome as numbers."""
+
+    face: FrontFace
+    z: float  # z of its vertex
+    level: int  # 1: it is a plane
 
 
 class RayCells(NamedTuple):

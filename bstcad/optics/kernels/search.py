@@ -2,6 +2,9 @@
 
 Blocks of rays go through the steps of forward.py (launch, front face) and on to their heights.  Broyden's method takes
 steps for all rays of a block until their largest error is below the tolerance.  The plain form does so for all rays.
+
+Behind the front of a dome (`dome` is given) the rays are launched from a sphere about its centre.  P, Q and the points
+are those of its chart, and a height is the distance from the centre.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from torch import Tensor
 from bstcad.optics import surfaces, tubes
 from bstcad.optics.kernels import kernel_arguments, reductions
 from bstcad.optics.kernels.compiling import compiled
+from bstcad.optics.kernels.dome_light import arrive_on_sphere, cross_front, front_of, launch_from_sphere
 from bstcad.optics.kernels.forward import (
     BLOCK,
     DX,
@@ -33,6 +37,8 @@ from bstcad.optics.kernels.forward import (
     shape,
     tilt,
 )  # fmt: skip
+from bstcad.optics.kernels.records import DomeFront, SphereBeam
+from bstcad.optics.radial import RadialSurface
 from bstcad.optics.rays import Rays
 
 if TYPE_CHECKING:
@@ -41,6 +47,15 @@ if TYPE_CHECKING:
 # Rows of `state`: hit, point, inverse Jacobian, last step, and distance left before it, of each ray of a block.
 HIT_X, HIT_Y, P, Q, XX, XY, YX, YY, STEP_X, STEP_Y, OFF_X, OFF_Y = range(12)
 ROWS = 12
+NEWTON_INVERSIONS = 5  # first steps on a dome, each with difference quotients: light is bent too much for one Jacobian
+
+
+class DomeStart(NamedTuple):
+    """Light and front of a dome as numbers."""
+
+    light: SphereBeam
+    front: DomeFront
+    radius: float  # R of the chart of the points (mm); the chart of the light may have another one
 
 
 class Limits(NamedTuple):
@@ -54,29 +69,35 @@ class Limits(NamedTuple):
 
 
 @njit(error_model="numpy")
-def _arrive(beam, front, cosine, rise, state, shift_x, shift_y, count, work):
+def _arrive(beam, front, dome, cosine, rise, state, shift_x, shift_y, count, work):
     """Store where the rays through the points P and Q, shifted, have risen by `rise` (mm), in HIT_X and HIT_Y."""
     for r in range(count):
         work[X + r], work[Y + r], work[Z + r], work[FATE + r] = state[P, r] + shift_x, state[Q, r] + shift_y, 0.0, 0.0
-    launch(beam, count, work)
-    if beam.pattern.present:
-        shape(beam, count, work)
-    elif beam.tilted == 1 and beam.distance > 0.0:
-        tilt(beam, count, work)
-    if front.present:
-        meet_front(front, beam.distance == 0.0 and beam.tilted == 0, count, work)
-        refract(front.eta, front.fates.reflected, count, work)
-    for r in range(count):
-        s = (rise[r] - work[Z + r]) / max(work[DZ + r], cosine)
-        state[HIT_X, r], state[HIT_Y, r] = work[X + r] + s * work[DX + r], work[Y + r] + s * work[DY + r]
+    if dome is None:
+        launch(beam, count, work)
+        if beam.pattern.present:
+            shape(beam, count, work)
+        elif beam.tilted == 1 and beam.distance > 0.0:
+            tilt(beam, count, work)
+        if front.present:
+            meet_front(front, beam.distance == 0.0 and beam.tilted == 0, count, work)
+            refract(front.eta, front.fates.reflected, count, work)
+        for r in range(count):
+            s = (rise[r] - work[Z + r]) / max(work[DZ + r], cosine)
+            state[HIT_X, r], state[HIT_Y, r] = work[X + r] + s * work[DX + r], work[Y + r] + s * work[DY + r]
+    else:
+        launch_from_sphere(dome.light, count, work)
+        cross_front(dome.front, count, work)
+        for r in range(count):
+            state[HIT_X, r], state[HIT_Y, r] = arrive_on_sphere(dome.radius, rise[r], r, work)
 
 
 @njit(error_model="numpy")
-def _invert(beam, front, limits, rise, state, count, work):
+def _invert(beam, front, dome, limits, rise, state, count, work):
     """Store the inverse of ∂(hit) / ∂(P, Q) by difference quotients, as `tubes._inverse_jacobian` does."""
     at_x, at_y = state[HIT_X].copy(), state[HIT_Y].copy()
     for k in range(2):
-        _arrive(beam, front, limits.cosine, rise, state, limits.step * (1 - k), limits.step * k, count, work)
+        _arrive(beam, front, dome, limits.cosine, rise, state, limits.step * (1 - k), limits.step * k, count, work)
         for r in range(count):
             state[XX + k, r] = (state[HIT_X, r] - at_x[r]) / limits.step
             state[YX + k, r] = (state[HIT_Y, r] - at_y[r]) / limits.step
@@ -108,25 +129,32 @@ def _update(divisor, state, off_x, off_y, r):
 
 
 @njit(error_model="numpy")
-def _straight(beam, x, y, rise):
-    """Return where the line from a point source, or along parallel light, to (x, y) at `rise` crosses the plane 0."""
-    if beam.distance > 0.0:
-        part = beam.distance / (beam.distance + rise)
-        return beam.x + part * (x - beam.x), beam.y + part * (y - beam.y)
-    return x - rise * beam.n_x / beam.n_z, y - rise * beam.n_y / beam.n_z
+def _straight(beam, dome, x, y, rise):
+    """Return where the line from a point source, or along parallel light, to (x, y) at `rise` crosses the plane 0.
+
+    On a dome the search starts at (x, y).
+    """
+    if dome is None:
+        if beam.distance > 0.0:
+            part = beam.distance / (beam.distance + rise)
+            return beam.x + part * (x - beam.x), beam.y + part * (y - beam.y)
+        return x - rise * beam.n_x / beam.n_z, y - rise * beam.n_y / beam.n_z
+    scale = dome.light.radius / dome.radius
+    return scale * x, scale * y
 
 
 @compiled()
-def _search(beam, front, limits, x, y, rise, p, q, direction, flux, fate, error):
+def _search(beam, front, dome, limits, x, y, rise, p, q, direction, flux, fate, error):
     """Store the points P and Q of the rays that meet (x, y) at `rise`, and these rays."""
     work, state = np.zeros(WORK), np.zeros((ROWS, BLOCK))
+    inversions = 1 if dome is None else NEWTON_INVERSIONS
     for first in range(0, x.size, BLOCK):
         count = min(BLOCK, x.size - first)
         here = slice(first, first + count)
         for r in range(count):
-            state[P, r], state[Q, r] = _straight(beam, x[first + r], y[first + r], rise[first + r])
+            state[P, r], state[Q, r] = _straight(beam, dome, x[first + r], y[first + r], rise[first + r])
         for number in range(int(limits.steps)):
-            _arrive(beam, front, limits.cosine, rise[here], state, 0.0, 0.0, count, work)
+            _arrive(beam, front, dome, limits.cosine, rise[here], state, 0.0, 0.0, count, work)
             largest = 0.0
             for r in range(count):
                 off = max(abs(x[first + r] - state[HIT_X, r]), abs(y[first + r] - state[HIT_Y, r]))
@@ -137,10 +165,10 @@ def _search(beam, front, limits, x, y, rise, p, q, direction, flux, fate, error)
                 fate[first + r] = np.uint8(work[FATE + r])
             if largest == 0.0:
                 break
-            if number == 0:
+            if number < inversions:
                 for r in range(count):
                     state[OFF_X, r], state[OFF_Y, r] = x[first + r] - state[HIT_X, r], y[first + r] - state[HIT_Y, r]
-                _invert(beam, front, limits, rise[here], state, count, work)
+                _invert(beam, front, dome, limits, rise[here], state, count, work)
             else:
                 for r in range(count):
                     off_x, off_y = x[first + r] - state[HIT_X, r], y[first + r] - state[HIT_Y, r]
@@ -162,15 +190,24 @@ def search(path: Path, x: Tensor, y: Tensor, height: Tensor) -> Found:
     shape, count = x.shape, len(path.sources)
     rays, (flux, error) = torch.empty((3, *shape), dtype=torch.float64), torch.empty((2, *shape), dtype=torch.float64)
     points, fate = torch.empty((2, *shape), dtype=torch.float64), torch.empty(shape, dtype=torch.uint8)
-    given = [x, y, path.sense * (height + (path.face.z - path.start)), *points, rays, flux, fate, error]
+    face = path.face
+    rise = path.sense * (height + (face.z - path.start))
+    if isinstance(face, RadialSurface):
+        rise = height + face.radius
+    given = [x, y, rise, *points, rays, flux, fate, error]
     arrays = [t.reshape(*t.shape[: t.ndim - len(shape)], count, -1).numpy() for t in given]
     beams = [source.beam(path.start) for source in path.sources]
+    domes: list[DomeStart | None] = [None] * count
+    if isinstance(face, RadialSurface):
+        front_face = front_of(path.before, face.z)
+        domes = [DomeStart(beam, front_face, face.radius) for beam in beams if isinstance(beam, SphereBeam)]
     front = kernel_arguments.front_face(path.before, path.sense)
     numbers = path.step, path.tolerance, tubes.MAX_BROYDEN_STEPS, tubes.MIN_BROYDEN_DIVISOR, surfaces.MIN_ARRIVAL_COSINE
     limits = Limits(*map(float, numbers))
 
     def some(k: int, first: int, last: int) -> None:
-        _search(beams[k], front, limits, *(a[..., k, first:last] for a in arrays))
+        beam, dome = beams[k], domes[k]
+        _search(dome.light.beam if dome else beam, front, dome, limits, *(a[..., k, first:last] for a in arrays))
 
     parts = reductions.shares(x.numel() // count, BLOCK)
     reductions.on_threads(some, [(k, *part) for k in range(count) for part in parts])

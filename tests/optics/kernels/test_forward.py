@@ -246,7 +246,7 @@ def test_light_on_the_border_of_the_screen_and_of_pixels():
         at = getattr(forward, place)
         work[at : at + count] = values
     box, tent, lines = np.zeros((8, 4)), np.zeros((8, 4)), np.zeros(forward.LINES)
-    forward._count(forward.kernel_arguments.pixels(screen), count, work, box, tent, lines)
+    forward.count_rays(forward.kernel_arguments.pixels(screen), count, work, box, tent, lines)
     rays = Landed(*(torch.from_numpy(a) for a in (np.stack([x, y]), flux, fate.astype(np.uint8))))
     assert np.array_equal(box, irradiance.box(rays, screen).numpy())
     plain = irradiance.collect_plain(torch.nan_to_num(rays.position, 99.0), irradiance.landed_flux(rays), screen)[0]
@@ -277,7 +277,9 @@ def test_what_the_kernel_takes(monkeypatch):
     window = replace(lens.interfaces[0], surface=Plane(1.0))
     for unknown in (freeform, replace(lens, before=(window,))):
         assert not ops.whole_kernel("trace.simulate", unknown.interfaces)
-    monkeypatch.setitem(ops.KERNELS["trace.simulate"], "cpu", lambda *given: pytest.fail("the kernel is called"))
+    monkeypatch.setitem(
+        ops.KERNELS["trace.simulate bspline"], "cpu", lambda *given: pytest.fail("the kernel is called")
+    )
     assert simulated(source, freeform, SCREEN, 50, 0).rays == 2500  # by the plain form
 
 
