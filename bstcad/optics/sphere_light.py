@@ -64,7 +64,7 @@ class SphereLight(Emitter):
     @classmethod
     def of(cls, source: Emitter, z: float, chart: SphereChart, half_angle: float) -> SphereLight:
         """Return the light of a source, for a file of rays the light of its model, with all spectral lines."""
-        lines = source.lines  # of a file of rays: their wavelengths, in place of source.wavelength
+        lines = source.lines  # wavelengths of the rays of a file, in place of source.wavelength
         wavelength = lines if len(lines) > 1 else lines[0][0]
         return cls(source, z, chart, half_angle=half_angle, wavelength=wavelength)
 
