@@ -14,7 +14,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from bstcad.app.kinds import alternatives, choices, matching_records, new_table, records_at, value_at, without_numbers
+from bstcad.app.kinds import (
+    alternatives,
+    choices,
+    matching_records,
+    new_table,
+    records_at,
+    required_keys,
+    value_at,
+    without_numbers,
+)
 from bstcad.app.words import as_words, number
 from bstcad.scene.schema import TAGS, Node, records, rows, schema, tags
 
@@ -212,7 +221,7 @@ def _group(key: str, node: Node, table: Table, data: Table, removable: bool = Fa
     tag, nodes = tags(union[0]), kinds[0]["properties"]
     order = sorted(nodes, key=lambda name: name not in tag) if len(kinds) == 1 else [*tag]
     has_default = any("default" in record["properties"][name] for record in union for name in tag)
-    required = {*kinds[0].get("required", ()), *(tag if len(union) > 1 and not has_default else ())}
+    required = {*required_keys(kinds[0], table), *(tag if len(union) > 1 and not has_default else ())}
     fields, groups, additions = [], [], []
     for name in order:
         at, value, inner = f"{key}.{name}".lstrip("."), table.get(name), nodes[name]

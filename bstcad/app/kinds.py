@@ -205,9 +205,17 @@ def new_table(key: str, data: Table) -> dict[str, Any]:
     return _completed(key, union[shapes.index(kind)], {}, data)
 
 
+def required_keys(record: Node, table: Table) -> set[str]:
+    """Return the keys that a table of a record needs; those of "else" only without the kinds that "if" states."""
+    condition = record.get("if", {}).get("properties", {})
+    kinds = {f"{name}.kind": node["properties"]["kind"] for name, node in condition.items()}
+    is_met = all(value_at(key, table) == kind["const"] for key, kind in kinds.items())
+    return {*record.get("required", ()), *(() if is_met else record["else"]["required"])}
+
+
 def _completed(key: str, record: Node, common: Table, data: Table) -> dict[str, Any]:
     """Return a table of a record, in the schema's order: keys of its kind, keys in `common`, and required keys."""
-    needed = {*record.get("required", ())}
+    needed = required_keys(record, common)
     options = [option["required"] for option in record.get("oneOf", ())]  # for a circle: radius, or diameter
     if options and not any(name in common for option in options for name in option):
         needed.update(options[-1])

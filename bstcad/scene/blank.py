@@ -523,9 +523,11 @@ class Bounds:
     edge: float | None = None  # minimum thickness along the rim, mm
 
 
-def _without_outline(node: dict[str, Any]) -> None:
-    """Let the JSON schema of a lens not require the outline, which a dome must not state."""
+def _outline_unless_dome(node: dict[str, Any]) -> None:
+    """Let the JSON schema of a lens require the outline only if the back is no dome, which ends at its half angle."""
     node["required"].remove("outline")
+    dome = {"properties": {"kind": {"const": "radial"}}, "required": ["kind"]}
+    node.update({"if": {"properties": {"back": dome}, "required": ["back"]}, "else": {"required": ["outline"]}})
 
 
 class LensBlank(Record):
@@ -535,7 +537,7 @@ class LensBlank(Record):
     reflects, light crosses the back before and after the front.
     """
 
-    model_config = ConfigDict(json_schema_extra=_without_outline)
+    model_config = ConfigDict(json_schema_extra=_outline_unless_dome)
 
     material: Annotated[str | None, Key("Name of the material on refractiveindex.info; or give the index.")] = None
     index: Annotated[float | None, Key("Refractive index, in place of material.", "", *INDICES, example=1.49)] = None
