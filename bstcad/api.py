@@ -38,8 +38,8 @@ from bstcad.report.record import BY_HAND, DesignCourse, Report, rrmsds
 from bstcad.report.units import number, quantity
 from bstcad.runs import files, processes
 from bstcad.runs import progress as progresses
-from bstcad.scene.blank import MIN_ROUND_POINTS
 from bstcad.scene.errors import SceneError
+from bstcad.scene.fronts import MIN_ROUND_POINTS
 from bstcad.scene.scene import Scene, load
 from bstcad.tailoring.merit import PictureError
 from bstcad.tailoring.run import Hooks

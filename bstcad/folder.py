@@ -39,7 +39,7 @@ from bstcad.runs import files
 from bstcad.runs.files import MachineError, SceneError
 from bstcad.runs.processes import Submit, is_alive, run_here
 from bstcad.scene import scene as scenes
-from bstcad.scene.blank import NET_FILE
+from bstcad.scene.fronts import NET_FILE
 from bstcad.scene.target import numbered
 from bstcad.transport.mapping import TransportMap, nodes
 from bstcad.verify import jobs

@@ -33,8 +33,8 @@ from bstcad.photometry import tm25
 from bstcad.photometry.intensity import Luminaire
 from bstcad.photometry.ray_set import RaySet
 from bstcad.report.figure_jobs import NoPictures
-from bstcad.scene.blank import as_front, net_extent
 from bstcad.scene.errors import SceneError
+from bstcad.scene.fronts import as_front, net_extent
 from bstcad.scene.lamp import IntensityFile, RayFile
 from bstcad.sweep.plan import plan
 from bstcad.sweep.prediction import run_pilot

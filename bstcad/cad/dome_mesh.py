@@ -2,7 +2,7 @@
 
 The nodes of the dome lie on a grid in its chart, those of its inner face on a grid in the projection (u, v) of a conic
 from its far vertex (patches.conic_net), so that both are even up to the rim.  The distance of a point from the dome is
-that from its projection along the normal, which Newton's method finds from the point's direction.
+that from its foot on the dome (dome_distance.py).
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import torch
 
 from bstcad.cad.grids import cell_corners, inward_diagonals, nodes, on_diagonals, rim, triangles_over, wall_triangles
 from bstcad.optics import domes
+from bstcad.optics.kernels import dome_distance
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
 from bstcad.optics.radial import RadialSurface
 from bstcad.optics.surfaces import Surface
 
-PROJECTION_STEPS = 3  # Newton steps of a projection onto the dome or its rim, from a point near it
+PROJECTION_STEPS = 3  # Newton steps of a projection onto the rim, from a point near it
 BASE_TOLERANCE = 1e-5  # largest |z - base| (mm) of the corners of a facet on the base plane, rounded to float32
 FACETS_AT_A_TIME = 1 << 16  # number of facets compared with the faces at a time
-MAX_PARTS = 8  # largest number of parts of a facet's edge between which its points are sampled
 
 Faces = tuple[np.ndarray, np.ndarray]  # vertices (n, 3) in mm, and indices of the vertices of each triangle, (k, 3)
 
@@ -86,10 +86,10 @@ def chordal_error(vertices: np.ndarray, faces: np.ndarray, lens: Lens, enough: f
         outer = (normals * (corners.mean(axis=1) - (0.0, 0.0, dome.z))).sum(axis=1) > 0
         middles = (corners[wall] + np.roll(corners[wall], -1, axis=1)) / 2
         parts = [_from_rim(lens, dome, middles.reshape(-1, 3))]
-        parts.append(distance_from_dome(dome, _samples(corners[outer & ~wall & ~flat], dome)))
         if lens.front.outline is not None:
-            parts.append(distance_from_conic(lens.front, _samples(corners[~outer & ~wall & ~flat], None)))
-        error = max(error, *(float(part.max(initial=0.0)) for part in parts))
+            parts.append(distance_from_conic(lens.front, _samples(corners[~outer & ~wall & ~flat])))
+        on_dome = dome_distance.distance_of_facets(dome, corners[outer & ~wall & ~flat] - (0.0, 0.0, dome.z))
+        error = max(error, on_dome, *(float(part.max(initial=0.0)) for part in parts))
         if error >= enough:
             break
     return error
@@ -105,16 +105,10 @@ def vertex_error(vertices: np.ndarray, lens: Lens) -> float:
     return float(distance.max())
 
 
-def _samples(corners: np.ndarray, dome: RadialSurface | None) -> np.ndarray:
-    """Return points (k, 3) of facets (n, 3, 3): centres and points of edges; on a dome, two per span of its net."""
-    parts = 1
-    if dome is not None and len(corners):
-        chart = np.stack(_in_chart(dome, corners.reshape(-1, 3)), axis=1).reshape(-1, 3, 2)
-        parts = max(1, min(MAX_PARTS, math.ceil(np.ptp(chart, axis=1).max() / min(dome.pitch))))
-    n = 2 * parts
-    shares = [(i / n, j / n, (n - i - j) / n) for i in range(n) for j in range(n - i + 1)]
-    weights = np.array([(1 / 3, 1 / 3, 1 / 3), *(each for each in shares if max(each) < 1)])
-    return np.einsum("sk,nki->nsi", weights, corners).reshape(-1, 3)
+def _samples(corners: np.ndarray) -> np.ndarray:
+    """Return the centres of facets (n, 3, 3) and the middles of their edges, (4 n, 3)."""
+    middles = (corners + np.roll(corners, -1, axis=1)) / 2
+    return np.concatenate([corners.mean(axis=1), middles.reshape(-1, 3)])
 
 
 def distance_from_conic(face: Surface, points: np.ndarray) -> np.ndarray:
@@ -127,38 +121,12 @@ def distance_from_conic(face: Surface, points: np.ndarray) -> np.ndarray:
 
 def distance_from_dome(dome: RadialSurface, points: np.ndarray) -> np.ndarray:
     """Return the distance (mm) of points (n, 3) near a dome from it."""
-    return np.abs(_project(dome, points)[0])
+    return np.abs(dome_distance.heights(dome, points - (0.0, 0.0, dome.z))[0])
 
 
 def normals_on(dome: RadialSurface, points: np.ndarray) -> np.ndarray:
     """Return the unit normals (n, 3), outwards, of a dome at points (n, 3) (mm) near it."""
-    return _project(dome, points)[1]
-
-
-def _project(dome: RadialSurface, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the height (mm) of points over a dome along its normal, and the unit normals (n, 3)."""
-    x, y = _in_chart(dome, points)
-    wanted = points - (0.0, 0.0, dome.z)
-    for step in range(PROJECTION_STEPS):
-        patch = dome.at(torch.from_numpy(x), torch.from_numpy(y))
-        place, along_x, along_y = (part.numpy().T for part in patch)
-        off = wanted - place
-        if step == PROJECTION_STEPS - 1:
-            break
-        xx, xy, yy = ((p * q).sum(1) for p, q in ((along_x, along_x), (along_x, along_y), (along_y, along_y)))
-        a, b = (off * along_x).sum(1), (off * along_y).sum(1)
-        det = xx * yy - xy * xy
-        x = np.clip(x + (yy * a - xy * b) / det, *dome.x)
-        y = np.clip(y + (xx * b - xy * a) / det, *dome.y)
-    normal = np.cross(along_x, along_y)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    return (off * normal).sum(1), normal
-
-
-def _in_chart(dome: RadialSurface, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return x and y (mm) in the chart of the directions of points (n, 3) from the centre, inside the net."""
-    x, y, _ = dome.chart.coordinates(torch.from_numpy(np.ascontiguousarray((points - (0.0, 0.0, dome.z)).T)))
-    return np.clip(x.numpy(), *dome.x), np.clip(y.numpy(), *dome.y)
+    return dome_distance.heights(dome, points - (0.0, 0.0, dome.z))[1]
 
 
 def _from_rim(lens: Lens, dome: RadialSurface, points: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
 from bstcad.optics.surfaces import Surface, sag
 from bstcad.report.units import Rows, paragraphs, tables
-from bstcad.scene.blank import FIT_TOLERANCE
+from bstcad.scene.fronts import FIT_TOLERANCE
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 from bstcad.scene.schema import FileContent

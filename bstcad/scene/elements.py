@@ -20,8 +20,9 @@ from bstcad.optics.rays import Status, Vector, axes
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.optics.tilted import TiltedSurface
 from bstcad.optics.unfolding import Image, image
-from bstcad.scene.blank import CURVATURES, INDICES, LensBlank, Outlined, stated_index
+from bstcad.scene.blank import INDICES, LensBlank, Outlined, stated_index
 from bstcad.scene.errors import with_target_key
+from bstcad.scene.fronts import CURVATURES
 from bstcad.scene.schema import COORDINATES, LENGTHS, Record, leaving_out
 from bstcad.scene.target import DIRECTIONS, Target, is_faced
 

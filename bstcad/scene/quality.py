@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 
 from bstcad.optics.key import Key
 from bstcad.optics.sides import MIN_SIDE, Sides, as_pair, coarser, side
-from bstcad.scene.blank import NET_SIZES, LensBlank
-from bstcad.scene.schema import OneOrTwo, Record
+from bstcad.scene.blank import LensBlank
+from bstcad.scene.schema import NET_SIZES, OneOrTwo, Record
 
 COMMON_PRESET = {"method": "least-squares", "transport_iterations": 40, "stage1_iterations": 1000, "rounds": 10}
 OWN_PRESET = COMMON_PRESET | {"overshoot": 0.03, "precision": "float64"}  # settings of bstcad's own qualities

@@ -34,12 +34,13 @@ from bstcad.runs import files
 from bstcad.scene import effects, elements, lighting, mount, picture, quality, scene_file
 from bstcad.scene.accept import Accept
 from bstcad.scene.beam import Collimated, of_beam
-from bstcad.scene.blank import LensBlank, as_front, net_extent
+from bstcad.scene.blank import LensBlank
 from bstcad.scene.dome_back import RadialBack, complete, export_complaints, forget_outlines
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
 from bstcad.scene.effects import Effects
 from bstcad.scene.elements import Around, Elements, LightPath
 from bstcad.scene.errors import SceneError, explain, line_of, toml_positions, with_target_key
+from bstcad.scene.fronts import as_front, net_extent
 from bstcad.scene.lamp import Point
 from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture

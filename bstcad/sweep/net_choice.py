@@ -28,8 +28,8 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.sides import Sides, as_pair, coarser, size_text, spread
 from bstcad.optics.tubes import area_of, collect, launch_tubes
 from bstcad.report.units import about, two_digits
-from bstcad.scene.blank import MAX_CONTROL_POINTS
 from bstcad.scene.scene import Scene
+from bstcad.scene.schema import MAX_CONTROL_POINTS
 from bstcad.sweep.estimates import coarse_lens
 from bstcad.sweep.prediction import REMAINING_BLUR, blur_rrmsd, memory_gb, typical_seconds
 

@@ -20,9 +20,9 @@ from bstcad.pipeline import reachable_part
 from bstcad.report.record import simulated, too_steep
 from bstcad.report.units import paragraphs
 from bstcad.runs.processes import Tick
-from bstcad.scene.blank import MAX_CONTROL_POINTS
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.scene import Scene
+from bstcad.scene.schema import MAX_CONTROL_POINTS
 from bstcad.sweep.cold_run import round_numbers
 from bstcad.sweep.estimates import coarse_lens, left_out
 from bstcad.sweep.net_choice import rrmsd_ratio

@@ -30,7 +30,7 @@ from bstcad.optics.rays import Rays
 from bstcad.optics.reach import MAX_EXIT_ANGLE
 from bstcad.optics.sides import as_pair, coarser
 from bstcad.optics.trace import clear_window, trace
-from bstcad.scene.blank import CONIC_CONSTANTS
+from bstcad.scene.fronts import CONIC_CONSTANTS
 from bstcad.scene.quality import COARSEST_GRID
 from bstcad.scene.scene import SEARCH_RANGE
 from bstcad.tailoring import slope_map

@@ -51,7 +51,9 @@ CASES = {  # name: (title, scene)
     "L2-letters": ("L2: letters, 6 mm behind the lens", SCENES / "L2_letters.toml"),
     "L2-portrait": ("L2: portrait, 6 mm behind the lens", SCENES / "L2_portrait.toml"),
     "L3-letters": ("L3: letters from a half space", SCENES / "L3_letters.toml"),
+    "L3-portrait": ("L3: portrait from a half space", SCENES / "L3_portrait.toml"),
     "L4-letters": ("L4: letters, 4 mm behind a lamp of 60 degrees", SCENES / "L4_letters.toml"),
+    "L4-portrait": ("L4: portrait, 4 mm behind a lamp of 60 degrees", SCENES / "L4_portrait.toml"),
     SUN: ("a picture by sunlight (20 mrad)", SCENES / "sun_picture.toml"),
 }
 
@@ -123,7 +125,7 @@ def write() -> None:
 
 
 def main() -> None:
-    """Record, and write after each scene, so that nothing is lost on the way."""
+    """Record after each scene, so that nothing is lost on the way, and write the page at the end."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="*", choices=CASES, help="names of scenes; without a name: write alone")
     parser.add_argument("--sun-picture", type=Path, help="diffinytrace's examples/img1.jpg; without it its scene stays")
@@ -137,7 +139,6 @@ def main() -> None:
         recorded = known() | {name: designed(name, asked.sun_picture)}
         recorded = {key: recorded[key] for key in CASES if key in recorded}
         files.put(RECORDED, (json.dumps(round_numbers(recorded, DIGITS), ensure_ascii=False, indent=1) + "\n").encode())
-        write()
     if known():
         write()
 

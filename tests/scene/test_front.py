@@ -17,8 +17,8 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Conic, Plane, Sphere, Toroid, sag
-from bstcad.scene.blank import FRONTS, NET_FILE, ConicFront, Front, NetFront, SphereFront, net_extent
 from bstcad.scene.errors import SceneError
+from bstcad.scene.fronts import FRONTS, NET_FILE, ConicFront, Front, NetFront, SphereFront, net_extent
 from bstcad.scene.scene import load
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"

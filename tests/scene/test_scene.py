@@ -18,8 +18,9 @@ from bstcad.optics.trace import ghost_light
 from bstcad.report.record import simulated
 from bstcad.scene.accept import Accept
 from bstcad.scene.beam import Collimated
-from bstcad.scene.blank import Back, LensBlank, PlaneFront, SphereFront
+from bstcad.scene.blank import Back, LensBlank
 from bstcad.scene.errors import SceneError, line_of, toml_positions
+from bstcad.scene.fronts import PlaneFront, SphereFront
 from bstcad.scene.lamp import Point
 from bstcad.scene.mount import LENS_COLOUR, MIRROR_COLOUR, Box, Part, Round
 from bstcad.scene.picture import Picture

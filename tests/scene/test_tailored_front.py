@@ -13,8 +13,8 @@ from bstcad import folder as folders
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.sides import in_proportion
 from bstcad.pipeline import purpose, resolved
-from bstcad.scene.blank import NetFront, net_extent
 from bstcad.scene.errors import SceneError
+from bstcad.scene.fronts import NetFront, net_extent
 from bstcad.scene.scene import load
 
 DISK, MIRROR = "templates/disk.toml", "templates/mirror.toml"  # a square lens, its front at 15, its back at 20

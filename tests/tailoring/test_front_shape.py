@@ -10,7 +10,7 @@ import torch
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.scene.blank import as_front
+from bstcad.scene.fronts import as_front
 from bstcad.tailoring.stage1 import best_front
 from tests.lenses import SQUARE, net
 

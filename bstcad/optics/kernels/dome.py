@@ -95,13 +95,13 @@ class RadialFace(NamedTuple):
 
 
 @njit(inline="always")
-def _times(p, q):
+def times(p, q):
     """Return the cross product of two vectors."""
     return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
 
 
 @njit(inline="always")
-def _dot(p, q):
+def dot(p, q):
     """Return the dot product of two vectors."""
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
@@ -119,7 +119,7 @@ def _set(work, offset, r, vector):
 
 
 @njit(inline="always")
-def _patch(net, faces, u, v):
+def patch(net, faces, u, v):
     """Return S, ∂S/∂x and ∂S/∂y (mm), relative to the centre, at (u, v)."""
     m, n, scale_x, scale_y = faces.m, faces.n, faces.per_x, faces.per_y
     i, a0, a2, p0, p2 = basis(u, m)
@@ -137,16 +137,16 @@ def _start_on_sphere(face, r, work):
     """Start the search of ray r where it leaves the sphere of radius R."""
     faces = face.faces
     o, d = (work[X + r], work[Y + r], work[Z + r]), (work[DX + r], work[DY + r], work[DZ + r])
-    middle = _dot(o, d)
-    path = math.sqrt(max(middle * middle - _dot(o, o) + face.radius * face.radius, 0.0)) - middle
+    middle = dot(o, d)
+    path = math.sqrt(max(middle * middle - dot(o, o) + face.radius * face.radius, 0.0)) - middle
     x, y, z = o[0] + path * d[0], o[1] + path * d[1], o[2] + path * d[2]
     scale = 2.0 * face.radius / max(math.sqrt(x * x + y * y + z * z) + z, 1e-300)
     u, v = (scale * x - faces.x) * faces.per_x, (scale * y - faces.y) * faces.per_y
-    work[U + r], work[V + r] = _clamped(u, faces.m - 1.0), _clamped(v, faces.n - 1.0)
+    work[U + r], work[V + r] = clamped(u, faces.m - 1.0), clamped(v, faces.n - 1.0)
 
 
 @njit(inline="always")
-def _clamped(u, last):
+def clamped(u, last):
     """Return u in [0, last]; 0 for a u that is not a number."""
     return min(u if u > 0.0 else 0.0, last)
 
@@ -167,8 +167,8 @@ def _start(face, width, first, begin, count, status, hits, work, active):
         if work[FATE + r] != 0.0:
             continue
         if width >= BLOCK and two >= first and status[0, one] == 0 and status[0, two] == 0:
-            work[U + r] = _clamped(2.0 * u[one] - u[two], faces.m - 1.0)
-            work[V + r] = _clamped(2.0 * v[one] - v[two], faces.n - 1.0)
+            work[U + r] = clamped(2.0 * u[one] - u[two], faces.m - 1.0)
+            work[V + r] = clamped(2.0 * v[one] - v[two], faces.n - 1.0)
             work[PATH + r] = 1.0
         else:
             _start_on_sphere(face, r, work)
@@ -192,17 +192,17 @@ def _search(net, face, searching, work, active):
         for a in range(searching):
             r = active[a]
             o, d = (work[X + r], work[Y + r], work[Z + r]), (work[DX + r], work[DY + r], work[DZ + r])
-            s, s_x, s_y = _patch(net, faces, work[U + r], work[V + r])
+            s, s_x, s_y = patch(net, faces, work[U + r], work[V + r])
             f = (s[0] - o[0], s[1] - o[1], s[2] - o[2])
-            c, n, ahead = _times(f, d), _times(s_x, s_y), _dot(f, d)
-            outward, norm2 = _dot(n, d), _dot(n, n)
+            c, n, ahead = times(f, d), times(s_x, s_y), dot(f, d)
+            outward, norm2 = dot(n, d), dot(n, n)
             steep = outward > face.min_cosine * math.sqrt(norm2)
             by = 1.0 / (outward if abs(outward) > floor else floor)
-            x, y = _dot(s_y, c) * by, -_dot(s_x, c) * by
+            x, y = dot(s_y, c) * by, -dot(s_x, c) * by
             u, v = work[U + r] + x * faces.per_x, work[V + r] + y * faces.per_y
-            if (_dot(c, c) <= tolerance2) & (ahead >= -face.tolerance) & steep:
+            if (dot(c, c) <= tolerance2) & (ahead >= -face.tolerance) & steep:
                 norm = 1.0 / math.sqrt(norm2)
-                work[U + r], work[V + r] = _clamped(u, last_u), _clamped(v, last_v)
+                work[U + r], work[V + r] = clamped(u, last_u), clamped(v, last_v)
                 _set(work, N_X, r, (n[0] * norm, n[1] * norm, n[2] * norm))
                 work[COS_BACK + r], work[PATH + r] = outward * norm, ahead
                 work[X + r] = s[0] + x * s_x[0] + y * s_y[0]
@@ -213,7 +213,7 @@ def _search(net, face, searching, work, active):
             if length > face.max_step:
                 x, y = x * (face.max_step / length), y * (face.max_step / length)
                 u, v = work[U + r] + x * faces.per_x, work[V + r] + y * faces.per_y
-            work[U + r], work[V + r] = _clamped(u, last_u), _clamped(v, last_v)
+            work[U + r], work[V + r] = clamped(u, last_u), clamped(v, last_v)
             active[remaining] = r
             remaining += 1
         searching = remaining
@@ -316,10 +316,10 @@ def _leave(faces, count, work):
     eta = faces.eta
     for r in range(count):
         d = (work[DX + r], work[DY + r], work[DZ + r])
-        n = _times(_get(work, S_X, r), _get(work, S_Y, r))
-        norm = 1.0 / math.sqrt(_dot(n, n))
+        n = times(_get(work, S_X, r), _get(work, S_Y, r))
+        norm = 1.0 / math.sqrt(dot(n, n))
         n = (n[0] * norm, n[1] * norm, n[2] * norm)
-        cos_in = _dot(n, d)
+        cos_in = dot(n, d)
         cos_out = crossing.cosine_behind(eta, cos_in)
         b = -2.0 * cos_in if faces.reflects else cos_out - eta * cos_in
         _set(work, N_X, r, n)
@@ -344,18 +344,18 @@ def _chain(faces, count, work, path, d_rays, first):
         g_e = (work[G_DX + r], work[G_DY + r], work[G_DZ + r])
         norm, cos_in, b = work[NORM + r], work[COS_BACK + r], work[SHIFT + r]
         by_cosine = -2.0 if faces.reflects else eta * eta * cos_in / max(work[COS_OUT + r], min_cos) - eta  # db/dcos θ
-        g_cos = _dot(g_e, n) * by_cosine + work[G_COSINE + r]
+        g_cos = dot(g_e, n) * by_cosine + work[G_COSINE + r]
         # ∂L/∂(S_x × S_y) from g = ∂L/∂N, which counts across N only
         g = (b * g_e[0] + g_cos * d[0], b * g_e[1] + g_cos * d[1], b * g_e[2] + g_cos * d[2])
-        along = _dot(g, n)
+        along = dot(g, n)
         g = ((g[0] - along * n[0]) * norm, (g[1] - along * n[1]) * norm, (g[2] - along * n[2]) * norm)
-        beta, gamma = _times(s_y, g), _times(g, s_x)
-        g_x = _dot(beta, s_xx) + _dot(gamma, s_xy)
-        g_y = _dot(beta, s_xy) + _dot(gamma, s_yy)
-        g_t = _dot(g_s, d) + work[G_PATH + r]
+        beta, gamma = times(s_y, g), times(g, s_x)
+        g_x = dot(beta, s_xx) + dot(gamma, s_xy)
+        g_y = dot(beta, s_xy) + dot(gamma, s_yy)
+        g_t = dot(g_s, d) + work[G_PATH + r]
         # α = -J^-T (g_x, g_y, g_t), the columns of J^-T: S_y × i, i × S_x and -n, divided by n · i
         by, out = norm / cos_in, 1.0 / cos_in
-        p, q = _times(d, s_y), _times(s_x, d)
+        p, q = times(d, s_y), times(s_x, d)
         alpha = (
             (g_x * p[0] + g_y * q[0]) * by + g_t * n[0] * out,
             (g_x * p[1] + g_y * q[1]) * by + g_t * n[1] * out,
