@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import ConfigDict, Field
@@ -37,9 +37,6 @@ from bstcad.scene.schema import (
     Record,
     leaving_out,
 )
-
-if TYPE_CHECKING:  # importing this module loads numba
-    pass
 
 INDICES = (1.01, 5.0)  # range of the refractive index
 BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # optional keys of lens that bound its faces
