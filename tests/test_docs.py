@@ -28,7 +28,7 @@ from bstcad.sweep import batch
 from bstcad.sweep import tradeoff as sweeping
 from bstcad.tolerance import tolerancing
 from tests.conftest import draws_nothing, quick_effort, verify_with
-from tests.sweep.conftest import Synthetic
+from tests.sweep.conftest import Synthetic, typical_pilot
 
 ROOT = Path(__file__).parent.parent
 sys.path.append(str(ROOT / "docs" / "_ext"))
@@ -61,6 +61,7 @@ def make_small(scene, path):
     text = re.sub(r"pixels = \d+", "pixels = 48", text)
     text = re.sub(r"source_points = \d+", "source_points = 4", text)
     text = re.sub(r"rrmsd = [\d.]+", "rrmsd = 0.4", text)
+    text = re.sub(r"light_on_target = [\d.]+", "light_on_target = 0.7", text)
     text = re.sub(r"wavefront = [\d.]+", "wavefront = 1.0", text)
     few = "" if scene.name == "thu.toml" else "\nrays = 192"  # `bstcad plan` knows no scenes with knobs of their own
     if "quality = " in text:
@@ -72,18 +73,14 @@ def make_small(scene, path):
 
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory):
-    """A folder with small templates, a photograph, two finished designs and measured points of the first."""
+    """A folder with small templates, a photograph, a finished design and measured points of it."""
     place = tmp_path_factory.mktemp("pages")
     (place / "templates").mkdir()
     for path in (ROOT / "templates").iterdir():
         if path.suffix in (".toml", ".py"):
             make_small(path, place / "templates" / path.name)
     skimage.io.imsave(place / "photo.jpg", skimage.data.astronaut()[::4, 32:480:4])  # upright: 112 x 128 pixels
-    with pytest.MonkeyPatch.context() as patch:
-        draws_nothing(patch)
-        for name in ("disk", "thu"):
-            scene = load(place / "templates" / f"{name}.toml")
-            commands.generate(scene, place / "outputs" / name, device="cpu", options=ProofOptions(quick_effort()))
+    make_design(place, "disk")
     back = bstcad.open(place / "outputs/disk").lens.back
     x, y = np.meshgrid(np.linspace(-7.9, 7.9, 120), np.linspace(-7.9, 7.9, 120))
     cloud = np.stack([x, y, sag(back, x, y)], axis=-1).reshape(-1, 3)
@@ -91,9 +88,29 @@ def prepared(tmp_path_factory):
     return place
 
 
+def make_design(place, name):
+    """Design a small template into the outputs of a folder, without pictures."""
+    with pytest.MonkeyPatch.context() as patch:
+        draws_nothing(patch)
+        scene = load(place / "templates" / f"{name}.toml")
+        commands.generate(scene, place / "outputs" / name, device="cpu", options=ProofOptions(quick_effort()))
+
+
+@pytest.fixture(scope="module")
+def second_design(prepared):
+    """The design of templates/thu.toml, which only pages of LONG need."""
+    make_design(prepared, "thu")
+
+
 @pytest.fixture
-def workplace(prepared, tmp_path, monkeypatch):
-    """A copy of it to work in: few tubes and rays, no pictures, and runs of a sweep by formulas, which take no time."""
+def workplace(prepared, tmp_path, monkeypatch, request):
+    """A copy of it to work in: few tubes and rays, no pictures, and runs of a sweep by formulas, which take no time.
+
+    Predictions have no pilots, which tests/sweep designs.
+    """
+    if request.node.callspec.params["page"].stem in LONG:
+        request.getfixturevalue("second_design")
+    monkeypatch.setattr("bstcad.sweep.plan.run_pilot", typical_pilot)
     place = shutil.copytree(prepared, tmp_path / "work")
     monkeypatch.chdir(place)
     draws_nothing(monkeypatch)

@@ -92,16 +92,19 @@ class LightSets:
         whole = math.fsum(self.sizes[pixels])
         return tuple(math.fsum(flux[pixels]) / whole for flux in self.flux)
 
-    def mean(self, at: tuple[float, float], radius: float | None = None, relative: bool = False) -> Estimate:
+    def mean(self, at: tuple[float, float], radius: float | None = None, relative: bool = False) -> Estimate | None:
         """Return the mean over a disc: a fraction of the source's flux per mm² or sr, or relative to the lit pixels.
 
-        at: its centre, in the unit of the receiver; radius: one pixel if None.  The part beside the screen is left out.
+        None: no light falls on the lit pixels, so that no relative mean exists.  at: centre of the disc, in the unit of
+        the receiver; radius: one pixel if None.  The part beside the screen is left out.
         """
         part = self.part_of_disc(at, radius)
         inside = part > 0
         whole = math.fsum((part * self.sizes)[inside])
         means = [math.fsum((part * flux)[inside]) / whole for flux in self.flux]
         if relative:
+            if not all(self.lit_means):
+                return None
             means = [value / mean for value, mean in zip(means, self.lit_means, strict=True)]
         return Estimate.of(means)
 
@@ -133,6 +136,8 @@ class LightSets:
         if discs is None:
             return None
         means = np.asarray(self._means(self.even))
+        if not means.all():
+            return None
 
         def ends(seek: list[int]) -> tuple[int, int]:
             sought = discs[seek].mean(0)

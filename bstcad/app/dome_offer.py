@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 
-from bstcad.app.kinds import are_numbers, extent, is_mirror, table_at, value_at
+from bstcad.app.kinds import are_numbers, extent, is_mirror, lamp_z, table_at, value_at
 from bstcad.app.preview import Preview
 from bstcad.optics.charts import SphereChart
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.reach import largest_deflection
 from bstcad.optics.sphere_light import SphereLight
+from bstcad.runs.files import SentenceError
 from bstcad.scene.blank import stated_index
 from bstcad.scene.dome_back import DOME_HALF_ANGLE, MIN_DOME_POINTS
+from bstcad.scene.picture import letters
 
 BACK_KIND, DOME, HEIGHTS = "lens.back.kind", "radial", "bspline"  # key of the kind of the back, and its two kinds
 FRONT_RATIO = 0.4  # largest radius of the front / radius of a new dome, which leaves room for off-axis targets
@@ -25,6 +28,9 @@ SMALLEST_HALF_ANGLE = 5.0  # degrees, smallest lens.back.half_angle
 HEIGHTS_LIMIT = 55.0  # angle from the axis (degrees) beyond which a back of heights can take hardly any light
 MIN_GAIN = 0.02  # smallest fraction of the lamp's light that an offered dome gains
 POINTS = 256  # points per side of the grid over directions, for the light within a cone
+LETTER_PIXELS = 256  # pixels on the longer side of a target on which letters are drawn to measure them
+MIN_LETTER_PIXELS = 16  # fewest pixels on its shorter side
+MAX_LETTERS = 100  # most letters that a scene may have
 
 Table = Mapping[str, Any]
 
@@ -48,16 +54,14 @@ def changes_of_kind(data: Table, kind: Any) -> dict[str, Any]:
 
 def _to_dome(data: Table) -> dict[str, Any]:
     """Return the changes to a dome with the same vertex about the lamp, and a front that is a sphere about the lamp."""
-    lamp, front, back = value_at("source.position", data), value_at("lens.front.z", data), value_at("lens.back.z", data)
-    lamp = [0.0, 0.0, 0.0] if lamp is None else lamp
-    is_lamp = value_at("source.kind", data) == "point" and isinstance(lamp, list) and len(lamp) == 3
-    if not is_lamp or is_mirror(data) or not are_numbers(*lamp, front, back) or not lamp[2] < front < back:
+    lamp, front, back = lamp_z(data), value_at("lens.front.z", data), value_at("lens.back.z", data)
+    if is_mirror(data) or not (are_numbers(lamp, front, back) and lamp < front < back):
         return {}
-    radius, net = back - lamp[2], value_at("lens.back.control_points", data)
-    inner = _rounded(min(front - lamp[2], FRONT_RATIO * radius))
-    sphere = {"kind": "sphere", "z": _rounded(lamp[2] + inner), "curvature": -1 / inner}
+    radius, net = back - lamp, value_at("lens.back.control_points", data)
+    inner = _rounded(min(front - lamp, FRONT_RATIO * radius))
+    sphere = {"kind": "sphere", "z": _rounded(lamp + inner), "curvature": -1 / inner}
     return {
-        "lens.back.centre": [0.0, 0.0, float(lamp[2])] if lamp[2] else None,
+        "lens.back.centre": [0.0, 0.0, float(lamp)] if lamp else None,
         "lens.back.radius": _rounded(radius),
         "lens.back.half_angle": half_angle(data),
         "lens.back.control_points": net if type(net) is int and net >= MIN_DOME_POINTS else None,
@@ -85,8 +89,9 @@ def _to_heights(data: Table) -> dict[str, Any]:
 def half_angle(data: Table) -> float:
     """Return the half angle (degrees) of a new dome: DOME_HALF_ANGLE, or less for a narrow target.
 
-    Light from the rim of the dome goes to the edge of the target, and one face bends it by `largest_deflection`.  The
-    half angle is at most the sum of this deflection and the smallest angle of an edge from the axis.
+    Light from the rim of the dome goes to the edge of the lit part, and one face bends it by `largest_deflection`.  The
+    half angle is at most the sum of this deflection and the smallest angle of an edge from the axis.  The lit part of
+    letters, a profile or an outline is smaller than the target; a photograph is taken as lit to the target's edges.
     """
     angles = [_edge_angle(target, value_at("source.position", data)) for target in _targets(data)]
     reach = min(angles, default=90.0) + math.degrees(largest_deflection(_index(data)))
@@ -99,7 +104,7 @@ def _targets(data: Table) -> list[Table]:
 
 
 def _edge_angle(target: Table, lamp: Any) -> float:
-    """Return the smallest angle (degrees) of a target's edge from the axis of a lamp, negative beside the axis.
+    """Return the smallest angle (degrees) of an edge of the lit part from the axis of a lamp, negative beside the axis.
 
     The target's tilt is not considered.
     """
@@ -108,7 +113,8 @@ def _edge_angle(target: Table, lamp: Any) -> float:
         return 90.0
     start = lamp if isinstance(lamp, list) and len(lamp) == 3 and are_numbers(*lamp) else [0.0, 0.0, 0.0]
     angular = target.get("kind") == "intensity"
-    limits = [size for name in ("outline", "profile") if (size := extent(table_at(name, target))) is not None]
+    sizes = *(extent(table_at(name, target)) for name in ("outline", "profile")), _letters_size(target, ends)
+    limits = [size for size in sizes if size is not None]
     edges = []
     for k, (low, high) in enumerate(ends):
         middle = (low + high) / 2 - (0.0 if angular else start[k])
@@ -116,6 +122,26 @@ def _edge_angle(target: Table, lamp: Any) -> float:
     if angular:
         return min(edges)
     return math.degrees(math.atan2(min(edges), z - start[2])) if are_numbers(z) and z > start[2] else 90.0
+
+
+def _letters_size(target: Table, ends: Sequence[Sequence[float]]) -> tuple[float, float] | None:
+    """Return width and height of the letters of a target with these ends along x and y; None if it has no letters."""
+    text, sides = target.get("text"), [high - low for low, high in ends]
+    is_text = isinstance(text, str) and 0 < len(text.strip()) <= MAX_LETTERS
+    if not (is_text and min(sides) > 0) or target.get("invert") is True:
+        return None
+    is_turned = target.get("rotate") in (90, 270)  # the letters run along y
+    sides = sides[::-1] if is_turned else sides
+    pixels = [max(round(LETTER_PIXELS * side / max(sides)), MIN_LETTER_PIXELS) for side in sides]
+    try:
+        ink = np.asarray(letters(text, *pixels))
+    except SentenceError:
+        return None
+    width, height = (
+        side * float(np.ptp(np.flatnonzero(ink.any(axis=axis))) + 1) / n
+        for side, n, axis in zip(sides, pixels, (0, 1), strict=True)
+    )
+    return (height, width) if is_turned else (width, height)
 
 
 def _index(data: Table) -> float:

@@ -2,7 +2,7 @@
 
 A beam that fills the lens keeps filling it.  A lens that is moved or made thicker keeps its distance from the wall.
 A beam with another profile gets the width that it needs.  With a closed lock, width and height keep their ratio.
-A back that becomes a dome gets a front about the lamp.
+A back that becomes a dome gets a front about the lamp, and a sphere about the lamp stays one.
 No key follows an invalid value.  In the text of a scene, each key can still be set alone.
 
 `impossible_choices` tries the choices of a form and returns those that the scene cannot have, with the reasons.
@@ -17,13 +17,15 @@ from typing import Any
 
 from bstcad.app.dome_offer import BACK_KIND, changes_of_kind
 from bstcad.app.form import LOCKED_SIDES, form
-from bstcad.app.kinds import are_numbers, extent, table_at, value_at
+from bstcad.app.kinds import are_numbers, extent, lamp_z, table_at, value_at
 from bstcad.app.scene_text import changed, is_same, tables
 from bstcad.app.words import typed
 from bstcad.runs.files import SentenceError
 
 SHAPES = {"lens.outline": "source.aperture"}  # table of an outline: table that follows it while the two are equal
 BACK_PLANE = "lens.back.z"  # key of the plane from which targets keep their distance
+FRONT_Z, FRONT_CURVATURE = "lens.front.z", "lens.front.curvature"  # keys that a sphere about the lamp changes together
+CENTRE_TOLERANCE = 1e-6  # largest distance of the lamp from the centre of a sphere about it / radius of the sphere
 WIDTHS = {  # keys that a profile needs, by (kind of the source, profile)
     ("collimated", "gaussian"): ("radius_1e2",),
     ("collimated", "super_gaussian"): ("radius_1e2", "order"),
@@ -58,6 +60,8 @@ def take_change(
         try:
             together = alone
             for other, own in others.items():
+                if isinstance(own, dict) and table_at(other, now):  # a comment on the old table must not stay
+                    together = changed(together, other, None)
                 together = changed(together, other, own)
         except SentenceError:
             continue
@@ -83,9 +87,25 @@ def with_followers(data: Mapping[str, Any], key: str, value: Any, locked: bool =
         targets = data.get("target")
         names = [f"target[{k}].z" for k in range(len(targets))] if isinstance(targets, list) else ["target.z"]
         changes |= {name: _rounded(z + value - before) for name in names if are_numbers(z := value_at(name, data))}
+    if key in (FRONT_Z, FRONT_CURVATURE):
+        return changes | _sphere_about_lamp(data, key, value)
     if key == BACK_KIND:
         return changes | changes_of_kind(data, value)
     return changes | (_profile_widths(data, value) if key == "source.profile" else {})
+
+
+def _sphere_about_lamp(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
+    """Return the change that keeps the lamp in the centre of a front: z + 1 / c = z of the lamp; {} for other fronts.
+
+    key: FRONT_Z or FRONT_CURVATURE, of which the other one changes.
+    """
+    lamp, z, curvature = lamp_z(data), value_at(FRONT_Z, data), value_at(FRONT_CURVATURE, data)
+    is_sphere = value_at("lens.front.kind", data) == "sphere" and are_numbers(lamp, z, curvature, value)
+    if not (is_sphere and abs(1 + curvature * (z - lamp)) < CENTRE_TOLERANCE):
+        return {}
+    if key == FRONT_Z:
+        return {FRONT_CURVATURE: -1 / (value - lamp)} if value > lamp else {}
+    return {FRONT_Z: _rounded(lamp - 1 / value)} if value < 0 else {}
 
 
 def _other_side(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:

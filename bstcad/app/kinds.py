@@ -314,6 +314,14 @@ def is_mirror(data: Table) -> bool:
     return any(table_at(f"lens.{face}", data).get("reflect") is True for face in ("front", "back"))
 
 
+def lamp_z(data: Table) -> float | None:
+    """Return z (mm) of a lamp, a source of kind point; None for other sources, or if its position is invalid."""
+    position = value_at("source.position", data)
+    position = [0.0, 0.0, 0.0] if position is None else position
+    is_lamp = value_at("source.kind", data) == "point" and isinstance(position, list) and len(position) == 3
+    return position[2] if is_lamp and are_numbers(*position) else None
+
+
 SOURCE_ORIGINS: Mapping[str, Callable[[Table], Any]] = {  # functions that return a new source's position, by key
     "source.position": lambda data: _on_axis(_source_z(data)),
     "source.z": lambda data: _source_z(data) if is_mirror(data) else None,

@@ -79,10 +79,11 @@ def _place_tilted(surface: TiltedSurface) -> PlacedSurface:
     return PlacedSurface(None, shape, _frame(surface.vertex, np.column_stack([e_x, np.cross(n, e_x), n])))
 
 
-def vector(rays: Rays) -> Any:
-    """Convert rays in air to batoid's rays; their velocity (c = 1) is then the unit vector of the direction."""
+def vector(rays: Rays, index: float = 1.0) -> Any:
+    """Convert rays in a medium of this index to batoid's rays, whose velocity (c = 1) is the direction / index."""
     x, y, _ = rays.position
-    return batoid.RayVector(*(np.ascontiguousarray(p.numpy()) for p in (x, y, rays.above(0.0), *rays.direction)))
+    velocity = (d / index for d in rays.direction)
+    return batoid.RayVector(*(np.ascontiguousarray(p.numpy()) for p in (x, y, rays.above(0.0), *velocity)))
 
 
 def land(rays: Any, screen: Screen, sense: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -95,7 +96,7 @@ def land(rays: Any, screen: Screen, sense: int = 1) -> tuple[np.ndarray, np.ndar
 
 def through(lens: Lens, known: Sequence[PlacedSurface], rays: Rays) -> Any:
     """Trace rays from the source through the lens; return rays of batoid.  known: surfaces of the lens in batoid."""
-    theirs = vector(rays)
+    theirs = vector(rays, lens.passes.index_before)
     for interface, at in zip(lens.interfaces, known, strict=True):
         if isinstance(interface.law, Reflect):
             batoid.reflect(at.surface, theirs, coordSys=at.frame)

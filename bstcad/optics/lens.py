@@ -29,7 +29,7 @@ class LensLosses(Protocol):
 
 @dataclass(frozen=True)
 class Lens:
-    """A solid in air between two surfaces, its sides parallel to the axis, with interfaces before and behind it.
+    """A solid between two surfaces, its sides parallel to the axis, with interfaces before and behind it.
 
     A lens refracts: light travels along +z, enters through the front and leaves through the back.  A mirror reflects
     at its back: light comes from above, along -z, and leaves along +z; its front, the rear of the plate, gets no light.

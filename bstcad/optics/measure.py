@@ -561,11 +561,15 @@ def spectral_lines(lens: Lens, channels: Sequence[Channel], goal: Goal, n: int) 
 
 
 def simulated(
-    lens: Lens, channels: Sequence[Channel], screens: Sequence[Screen], n: int, seed: int
+    lens: Lens, channels: Sequence[Channel], screens: Sequence[Screen], n: int, seed: int, splits_missed: bool = True
 ) -> tuple[Simulation, ...]:
-    """Simulate pictures and ledgers by n x n stratified rays per channel, with another seed for each source point."""
+    """Simulate pictures and ledgers by n x n stratified rays per channel, with another seed for each source point.
+
+    splits_missed: see `simulate`.
+    """
     pairs = zip(channels, source_numbers(channels), strict=True)
-    return simulate([(c.weight, c.source, c.through(lens), seed + SETS * k) for c, k in pairs], screens, n)
+    lights = [(c.weight, c.source, c.through(lens), seed + SETS * k) for c, k in pairs]
+    return simulate(lights, screens, n, splits_missed=splits_missed)
 
 
 def side_factor(channels: Sequence[Channel]) -> float:

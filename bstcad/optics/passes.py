@@ -26,9 +26,10 @@ class Pass(NamedTuple):
 
 @dataclass(frozen=True)
 class Passes:
-    """Passes of light through a solid in air, in the order of the light."""
+    """Passes of light through a solid, in the order of the light; behind the solid is air."""
 
     steps: tuple[Pass, ...]  # passes in the order of the light
+    index_before: float = 1.0  # refractive index between the source and the solid; above 1: an LED in its encapsulant
 
     @property
     def faces(self) -> tuple[Face, ...]:
@@ -41,13 +42,15 @@ class Passes:
 
     def laws(self, index: float) -> Iterator[Law]:
         """Yield the law of each pass; index: refractive index of the solid."""
-        inside, outside = index, 1.0
+        before, inside = self.index_before, False
         for _, law in self.steps:
             if law is Reflect:
                 yield Reflect()
             else:
-                yield Refract(outside, inside)
-                inside, outside = outside, inside
+                inside = not inside
+                after = index if inside else 1.0
+                yield Refract(before, after)
+                before = after
 
     @property
     def enters(self) -> bool:
@@ -81,7 +84,8 @@ class Passes:
 
     def deflection(self, face: Face, index: float) -> float:
         """Return the deflection of a ray by all its passes at a face, divided by the face's (small) slope angle."""
-        by_law = {Reflect: 2.0 * (index if self.enters else 1.0), Refract: abs(index - 1)}
+        outside = self.index_before if face == "front" else 1.0
+        by_law = {Reflect: 2.0 * (index if self.enters else 1.0), Refract: abs(index - outside)}
         return sum(by_law[self.steps[k].law] for k in self.numbers_of(face))
 
     def largest_deflection(self, index: float) -> float | None:

@@ -204,8 +204,13 @@ Lights = Sequence[tuple[float, Emitter, Lens, int]]  # (weight, source, lens at 
 
 
 @torch.no_grad()
-def simulate(lights: Lights, screens: Sequence[Screen], n: int) -> tuple[Simulation, ...]:
+def simulate(
+    lights: Lights, screens: Sequence[Screen], n: int, *, splits_missed: bool = True
+) -> tuple[Simulation, ...]:
     """Simulate the weighted sum of lights on each screen by n x n stratified rays each, the same rays for all screens.
+
+    splits_missed: True: light on the underside has a line of its own; False: it stays in the line "missed the lens",
+    which saves a search per source point.
 
     The fused kernel is used if it supports all lights; it and the plain form trace the same rays and agree to rounding.
     """
@@ -217,12 +222,15 @@ def simulate(lights: Lights, screens: Sequence[Screen], n: int) -> tuple[Simulat
     ]
     if all(kernels) and (fast := kernels[0]):
         whole = [(*light, window(light[1], light[2])) for light in lights]
-        return tuple(_as_fractions(lights, *fast(whole, screen, n)) for screen in screens)
-    return simulate_plain(lights, screens, n)
+        given = (fast(whole, screen, n) for screen in screens)
+        return tuple(_as_fractions(lights, *sums, splits_missed=splits_missed) for sums in given)
+    return simulate_plain(lights, screens, n, splits_missed=splits_missed)
 
 
 @torch.no_grad()
-def simulate_plain(lights: Lights, screens: Sequence[Screen], n: int) -> tuple[Simulation, ...]:
+def simulate_plain(
+    lights: Lights, screens: Sequence[Screen], n: int, *, splits_missed: bool = True
+) -> tuple[Simulation, ...]:
     """Simulate as `simulate` does, but in plain torch, with one strip of rays (`launch_strips`) at a time."""
     like, count = lights[0][2].like, 0
     pictures = [torch.zeros((2, *screen.shape), dtype=torch.float64, device=like.device) for screen in screens]
@@ -240,12 +248,14 @@ def simulate_plain(lights: Lights, screens: Sequence[Screen], n: int) -> tuple[S
                     flux[line] = flux.get(line, 0.0) + weight * value
             count += rays.flux.numel()
     return tuple(
-        _as_fractions(lights, box, tent, flux=flux, count=count)
+        _as_fractions(lights, box, tent, flux=flux, count=count, splits_missed=splits_missed)
         for (box, tent), flux in zip(pictures, ledgers, strict=True)
     )
 
 
-def _as_fractions(lights: Lights, box: Tensor, tent: Tensor, flux: dict[str, float], count: int) -> Simulation:
+def _as_fractions(
+    lights: Lights, box: Tensor, tent: Tensor, flux: dict[str, float], count: int, *, splits_missed: bool
+) -> Simulation:
     """Return the sums as fractions of the source's light; light not launched missed the lens or met its underside."""
     launched = sum(flux.values())
     whole = max(launched, 1.0)  # the sum may exceed 1 slightly: a cell at the rim of a beam counts whole
@@ -254,7 +264,8 @@ def _as_fractions(lights: Lights, box: Tensor, tent: Tensor, flux: dict[str, flo
     first = lights[0][2]
     if any(source.is_given for _, source, _, _ in lights):  # its rays are counted by where they start
         return Simulation(box / whole, tent / whole, flux, count)
-    if first.front.outline is not None and first.passes.sense > 0 and not first.before:  # the underside is lit
+    underside_lit = first.front.outline is not None and first.passes.sense > 0 and not first.before
+    if underside_lit and splits_missed:
         stopped = sum(part * on_underside(source, lens.front.plain(), lens.outline) for part, source, lens, _ in lights)
         flux[UNDERSIDE] = max(min(stopped, flux["missed the lens"]), 0.0)
         flux["missed the lens"] -= flux[UNDERSIDE]
@@ -303,7 +314,7 @@ def ghost(lens: Lens) -> tuple[Interface, ...]:
     assert lens.losses is not None  # without losses no face reflects
     number = lens.number_of("front")
     front, back = lens.interfaces[number : number + 2]
-    outwards = replace(front, law=Refract(lens.index, 1.0), status_if_missed=Status.VIGNETTED)
+    outwards = replace(front, law=Refract(lens.index, lens.passes.index_before), status_if_missed=Status.VIGNETTED)
     _, outwards = lens.losses.on((front, outwards))  # losses of `outwards` for light from inside the glass
     return front, _from_inside(back), _from_inside(outwards), back
 

@@ -31,7 +31,7 @@ from bstcad.photometry.intensity import Intensity, Luminaire
 from bstcad.report.grid_sag import MAX_POINTS, MIN_POINTS, GridLight, GridSag, axes, table_note
 from bstcad.report.units import environment, paragraphs
 from bstcad.runs import files
-from bstcad.scene.dome_back import export_complaints
+from bstcad.scene.blank import export_complaints
 from bstcad.scene.mount import Mount
 
 SIDECAR = ".txt"  # suffix of a text file that states how far interpolation of a table moves the light
@@ -94,9 +94,8 @@ def export(
     if points is not None and not MIN_POINTS <= points <= MAX_POINTS:
         raise ValueError(f"points = {points} is not possible; give a number from {MIN_POINTS} to {MAX_POINTS}")
     lens, paths, notes, intensity = lens.plain(), [], [], None
-    if domes.is_dome(lens):
-        for complaint in export_complaints(kinds):
-            raise ValueError(complaint)
+    for complaint in export_complaints(kinds, domes.is_dome(lens), lens.passes.index_before):
+        raise ValueError(complaint)
     for kind in dict.fromkeys(kinds):
         if kind in (*INTENSITIES, RAYS) and far is None:
             raise ValueError(f"'{kind}' needs the light of a scene; export it from the folder of a design")

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.shape import MAX_RADIUS, describe, heights, survey_front, thickness_range
-from bstcad.optics import passes, quadrature
+from bstcad.optics import domes, passes, quadrature
 from bstcad.optics.bspline import DEGREE, BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.media import density
@@ -75,6 +75,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "wavelength": scene.source.main_wavelength,  # main line of a spectrum
         "material": material,  # None: only the index is known, or the optic is a mirror
         "index": lens.index,
+        **({"encapsulant": scene.lens.encapsulant} if scene.lens.encapsulant else {}),  # index before the front
         "outline": asdict(lens.plan),
         "clear": lens.clear and tuple(map(asdict, lens.clear)),  # clear apertures, front and back; None: whole outline
         "front": _own_outline(front) | _face(scene.lens.front.kind, lens.front_vertex, numbers) | fitted,
@@ -83,6 +84,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "net": _net(lens.back_net),
         **({"front_net": _net(lens.front_net), "front_asked": scene.lens.front.z} if lens.shapes("front") else {}),
         "back_asked": scene.lens.back.z,  # position of the back's vertex in the scene
+        **({"back_key": _vertex_key(scene)} if scene.lens.dome else {}),  # key of this position, if not lens.back.z
         "centre_thickness": shape["centre_thickness"],
         "edge_thickness": (shape["edge_thickness_min"], shape["edge_thickness_max"]),
         "volume": shape["volume"],  # mm³
@@ -134,13 +136,18 @@ def vertex(lens: Lens) -> float:
     return float(sag(lens.back, 0.0, 0.0))
 
 
+def _vertex_key(scene: Scene) -> str:
+    """Return the key that determines the position of the back's vertex; a dome has no lens.back.z."""
+    return "lens.back.radius" if scene.lens.dome else "lens.back.z"
+
+
 def scene_text(scene: Scene, lens: Lens) -> str:
     """Return the text of scene.toml in a design's folder, with a note if the back was moved."""
     drawn = scene.lens.back.z - scene.lens.front.z
     if not abs(vertex(lens) - scene.lens.back.z) > MIN_NOTED_SHIFT * drawn:
         return scene.toml()
-    note = f"as designed, the vertex of the back is at z = {vertex(lens)!r} mm; it started at lens.back.z below"
-    return f"# {note}\n{scene.toml()}"
+    note = f"the vertex of the back is at z = {vertex(lens)!r} mm; it started at {_vertex_key(scene)} below"
+    return f"# as designed, {note}\n{scene.toml()}"
 
 
 def _passes(record: Mapping[str, Any]) -> passes.Passes:
@@ -272,7 +279,8 @@ def part(
 def _corners(lens: Lens, whole: WholePart | None) -> tuple[Point, Point]:
     """Return the smallest and the largest x, y and z (mm) of a part."""
     half = np.array(lens.plan.half_extent)
-    edge = np.array([-half, half]) if whole is None else whole.edge
+    bare = domes.silhouette(lens) if domes.is_dome(lens) else np.array([-half, half])
+    edge = bare if whole is None else whole.edge
     faces = np.concatenate(heights(lens, None if whole is None else edge))
     low, high = np.array([*edge.min(0), faces.min()]), np.array([*edge.max(0), faces.max()])
     if whole is not None:

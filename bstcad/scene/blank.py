@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import torch
@@ -16,6 +16,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.passes import LENS, MIRROR, SECOND_SURFACE, Face, Passes
 from bstcad.optics.sides import Sides, as_pair, coarser, in_proportion, simplified
 from bstcad.optics.surfaces import Surface
+from bstcad.runs.files import HEIGHT_EXPORTS
 from bstcad.scene.dome_back import RadialBack
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import (
@@ -74,6 +75,16 @@ class Back(Record):
         return simplified(self.control_points)
 
 
+def export_complaints(kinds: Iterable[str], dome: bool, index_before: float) -> Iterator[str]:
+    """Yield a sentence for each kind of export that cannot hold a lens; index_before: of the medium at its front."""
+    for kind in kinds:
+        if dome and kind in HEIGHT_EXPORTS:
+            heights = f'"{kind}" is a table of heights z(x, y), and the back of a dome is none'
+            yield f'{heights}; use lens.step or lens.stl, or write "sag" (polar distances), "points" or "preview"'
+        elif index_before != 1 and kind == "zemax":
+            yield '"zemax" starts its light in air, and lens.encapsulant is not air; use lens.step in its place'
+
+
 AnyBack = Annotated[Back | RadialBack, Field(discriminator="kind")]
 
 
@@ -110,6 +121,10 @@ class LensBlank(Record):
 
     material: Annotated[str | None, Key("Name of the material on refractiveindex.info; or give the index.")] = None
     index: Annotated[float | None, Key("Refractive index, in place of material.", "", *INDICES, example=1.49)] = None
+    encapsulant: Annotated[
+        float | None,
+        Key("Index of the encapsulant between lamp and front, in place of air.", "", *INDICES, example=1.41),
+    ] = None
     outline: Annotated[Outlined, Key("Rim of the lens.", example={"shape": "rectangle", "width": 24.0, "height": 24.0})]
     front: Annotated[Front, Key("Face at smaller z, where light enters a lens.", example={"kind": "plane", "z": 8.0})]
     back: Annotated[
@@ -138,6 +153,8 @@ class LensBlank(Record):
     @property
     def passes(self) -> Passes:
         """Sequence of the faces that light meets, and whether each refracts or reflects."""
+        if self.encapsulant is not None:
+            return replace(LENS, index_before=self.encapsulant)
         return MIRROR if self.back.reflect else SECOND_SURFACE if self.front.reflect else LENS
 
     @property
@@ -248,6 +265,9 @@ class LensBlank(Record):
             yield "lens.front.reflect: no light reaches the front, as lens.back.reflect is true; remove one of them"
         if not self.passes.enters and given:
             yield f"lens.{given[0]}: light does not enter a mirror (lens.back.reflect); remove this key"
+        if self.encapsulant is not None and (self.front.reflect or self.back.reflect):
+            mirror = "front" if self.front.reflect else "back"
+            yield f"lens.encapsulant: light goes to a mirror through air; remove this key or lens.{mirror}.reflect"
         if self.passes.enters and len(given) != 1:
             yield 'lens: needs exactly one of material and index; give for example material = "PMMA"'
         of_back = net_complaints(self.outline, self.back.control_points)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, ClassVar, Literal
 
 from bstcad.optics.charts import SphereChart
@@ -13,7 +12,6 @@ from bstcad.optics.outlines import Circle
 from bstcad.optics.sides import Sides
 from bstcad.optics.sphere_light import SphereLight, light_angle
 from bstcad.optics.surfaces import Surface
-from bstcad.runs.files import HEIGHT_EXPORTS
 from bstcad.scene.errors import SceneError
 from bstcad.scene.schema import COORDINATES, LENGTHS, NET_SIZES, Record
 
@@ -119,13 +117,6 @@ def complete(lens: Any, mount: Any = None) -> None:
                 front["outline"] = {"shape": "circle", "radius": radius}
     except (KeyError, TypeError, ValueError, IndexError):
         return  # refused with its key, when the tables are read
-
-
-def export_complaints(kinds: Iterable[str]) -> Iterator[str]:
-    """Yield a sentence for each kind of export that needs heights z(x, y), which the back of a dome is not."""
-    for kind in (kind for kind in kinds if kind in HEIGHT_EXPORTS):
-        heights = f'"{kind}" is a table of heights z(x, y), and the back of a dome is none'
-        yield f'{heights}; use lens.step or lens.stl, or write "sag" (polar distances), "points" or "preview"'
 
 
 def _radius_at(front: dict[str, Any], z: float, angle: float) -> float | None:

@@ -110,6 +110,16 @@ def doubts(source: Emitter, rim: Outline, key: str) -> Iterator[str]:
         )
 
 
+def encapsulant_complaints(source: Emitter, lens: LensBlank, given: Mapping[str, bool]) -> Iterator[str]:
+    """Yield what does not go with an encapsulant; given: as for `dome_complaints`."""
+    if lens.encapsulant is None:
+        return
+    if source.parallel:
+        yield 'lens.encapsulant: parallel light comes through air; remove this key, or write source.kind = "point"'
+    for key in (key for key in ("before", "wavefront") if given[key]):
+        yield f"{key}: is not possible with lens.encapsulant yet; remove one of them"
+
+
 def dome_complaints(source: Emitter, lens: LensBlank, given: Mapping[str, bool]) -> Iterator[str]:
     """Yield what does not go with a dome; given: True for each further key that the scene has and a dome excludes."""
     dome, instead = lens.dome, 'or give the lens a back of kind "bspline"'

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
@@ -217,13 +217,22 @@ class Mount(Record):
         def front_at(inwards: np.ndarray) -> np.ndarray:
             return sag(front, x + inwards * m_x, y + inwards * m_y)
 
-        depth, lower = np.zeros_like(x), np.full_like(x, self.bevel)
-        for _ in range(ITERATIONS):
-            depth = np.clip(top - front_at(tangent * depth), 0.0, largest / tangent if tangent else math.inf)
-        upper = tangent * (depth - self.bevel)
-        for _ in range(ITERATIONS if self.bevel else 0):
-            lower = np.clip(top - (depth - self.bevel) - front_at(upper + lower), 0.0, largest)
+        deepest = largest / tangent if tangent else math.inf
+        depth = _fixed_point(lambda depth: np.clip(top - front_at(tangent * depth), 0.0, deepest), np.zeros_like(x))
+        upper, lower = tangent * (depth - self.bevel), np.full_like(x, self.bevel)
+        if self.bevel:
+            start = top - (depth - self.bevel)
+            lower = _fixed_point(lambda lower: np.clip(start - front_at(upper + lower), 0.0, largest), lower)
         return float(np.clip(upper + lower, 0.0, largest).max())
+
+
+def _fixed_point(step: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> np.ndarray:
+    """Return the values after ITERATIONS steps; steps that would change no bit are omitted."""
+    for _ in range(ITERATIONS):
+        if np.array_equal(following := step(values), values):
+            break
+        values = following
+    return values
 
 
 def as_cut(lens: Lens, mount: Mount | None) -> Lens:

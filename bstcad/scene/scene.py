@@ -34,8 +34,8 @@ from bstcad.runs import files
 from bstcad.scene import effects, elements, lighting, mount, picture, quality, scene_file
 from bstcad.scene.accept import Accept
 from bstcad.scene.beam import Collimated, of_beam
-from bstcad.scene.blank import LensBlank
-from bstcad.scene.dome_back import RadialBack, complete, export_complaints, forget_outlines
+from bstcad.scene.blank import LensBlank, export_complaints
+from bstcad.scene.dome_back import RadialBack, complete, forget_outlines
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
 from bstcad.scene.effects import Effects
 from bstcad.scene.elements import Around, Elements, LightPath
@@ -111,8 +111,9 @@ class Scene(Record):
             yield "title: must be one line of up to 200 printable characters; shorten it"
         yield from self._of_targets(lambda target: target.complaints())
         yield from lighting.dome_complaints(source, lens, self._of_dome)
-        if lens.dome is not None:
-            yield from (f"output.export: {complaint}" for complaint in export_complaints(self.output.export))
+        yield from lighting.encapsulant_complaints(source, lens, self._of_dome)
+        of_export = export_complaints(self.output.export, lens.dome is not None, lens.passes.index_before)
+        yield from (f"output.export: {complaint}" for complaint in of_export)
         yield from lens.complaints()
         yield from lighting.complaints(source, lens)
         yield from effects.complaints(self.effects, lens)
@@ -300,8 +301,9 @@ class Scene(Record):
         from bstcad.optics.radial import RadialSurface
 
         back = RadialSurface.sphere(dome.centre[2], dome.radius, net_extent(dome.lit, as_wide_as), as_pair(net))
-        front = self.lens.flat_front(net, as_wide_as)
-        return Lens(front, back, dome.lit, self.index, clear=(front.outline or self.lens.outline, dome.lit))
+        front, passes = self.lens.flat_front(net, as_wide_as), self.lens.passes
+        clear = (front.outline or self.lens.outline, dome.lit)
+        return Lens(front, back, dome.lit, self.index, clear=clear, own_passes=passes)
 
     def assembled(self, lens: Lens) -> Lens:
         """Return the lens with the scene's windows, mirrors and mount, and with its tailored faces marked."""

@@ -94,7 +94,7 @@ def along_light(source: Emitter, lens: Lens, goals: Sequence[Goal]) -> tuple[csr
     within = behind(across(coming, interfaces[:number]), interfaces[number])
     out = behind(within, interfaces[number + 1])
     glass = lens.index * within.direction[2]
-    factor = _array((glass - coming.direction[2]) / (glass - out.direction[2]))
+    factor = _array((glass - lens.passes.index_before * coming.direction[2]) / (glass - out.direction[2]))
     x, y, _ = coming.position
     lit = (_array(source.irradiance(x, y, lens.entrance.z)) > 0) & (_array(out.alive) > 0)
     if any(np.unique(at[lit]).size < 2 for at in q):  # a narrow beam and few control points

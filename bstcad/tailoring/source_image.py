@@ -224,7 +224,8 @@ def blur_error(by_images: Tensor, draw: Draw, lens: Lens, screen: Screen, *, bor
     for k in range(2):
         points = draw(ERROR_POINTS, seed + ERROR_SEED_OFFSET + k)
         n = max(1, round(side_factor(points) * ERROR_RAYS))
-        [rays] = simulated(lens, points, [screen], n=n, seed=seed + ERROR_SEED_OFFSET + k)
+        seed_of_set = seed + ERROR_SEED_OFFSET + k
+        [rays] = simulated(lens, points, [screen], n=n, seed=seed_of_set, splits_missed=False)
         left = sum(rays.flux[line] for line in ("on target", "off target", "total internal reflection"))
         error = (rays.box / left - picture).numpy() if left > 0 else np.zeros(picture.shape)
         errors.append(gaussian_filter(error, ERROR_SMOOTHING * (border - 2)))

@@ -108,6 +108,7 @@ def _point_value(scene: Scene, point: PointLimit, number: str, on: LightSets, of
     estimate = on.mean(point.at, radius, relative=point.unit == "relative")
     unit = ""
     if point.unit != "relative":
+        assert estimate is not None  # only relative means may not exist
         assert scene.source.luminous_flux is not None  # otherwise the scene was refused
         scale, unit = scene.source.luminous_flux * (PER_LX if point.unit == "lx" else 1.0), point.unit
         estimate = Estimate(scale * estimate.value, scale * estimate.standard_error)

@@ -2,8 +2,8 @@
 A street light
 ==============
 
-An LED at a height of 8 m lights 30 m x 8 m of a road, and nothing behind the kerb. Its chip of 1 mm is simulated with
-its size: its image on the road is more than a metre wide.
+An LED at a height of 8 m lights 30 m x 8 m of road. The lens is a dome, which takes the light of the LED up to 89° from
+its axis. The chip of 1 mm x 1 mm is simulated with its size: its image on the road is more than a metre wide.
 The scene file is :download:`lens_19_street_light.toml`:
 
 .. literalinclude:: lens_19_street_light.toml

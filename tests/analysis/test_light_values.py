@@ -190,6 +190,15 @@ def test_no_disc_fits_into_a_narrow_light():
     assert sets_of(np.ones(screen.shape), screen).ratios(6.0) is None
 
 
+def test_without_light_on_the_lit_pixels_there_are_no_relative_values():
+    """Light beside a picture, as by a poor lens and few rays, has a mean, but none relative to the lit pixels."""
+    screen, light = Screen(0.0, (0.0, 10.0), (0.0, 10.0), 20), np.zeros((20, 20))
+    light[0, 0] = 1.0
+    found = LightSets.of(screen, [light, light], 0.5, target=np.fliplr(light))
+    assert found.mean((5.0, 5.0), 1.0, relative=True) is None and found.ratios(1.0) is None
+    assert found.mean((5.0, 5.0), 1.0).value == 0.0
+
+
 def test_glare_of_a_lambertian_lamp():
     """I = cos γ / π of the flux."""
     gamma = np.arange(0.0, 91.0)

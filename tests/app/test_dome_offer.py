@@ -81,6 +81,44 @@ def test_the_half_angle_is_what_one_face_can_turn_to_the_edge_of_the_target(half
     assert dome_offer.half_angle(data) == expected == min(math.floor(edge + turned), 85)
 
 
+@pytest.mark.parametrize(("text", "rotate"), [("THU", 0), ("THU", 90), ("I", 0)])
+def test_letters_need_the_half_angle_of_their_own_edges(text, rotate):
+    """The lit part of the traced target, not the target's edges: letters have a dark margin."""
+    letters = changed(changed(changed(LAMP, "target.uniform", None), "target.text", text), "target.rotate", rotate)
+    letters = changed(letters, "target.pixels", 128)
+    data = tomllib.loads(letters)
+    lit = of_text(letters, data, Path("lamp.toml")).targets[0].irradiance() > 0.0
+    half = min(400.0 / 128 * lit.any(axis=axis).sum() / 2 for axis in (0, 1))
+    turned = 85.0 - math.degrees(math.asin(math.sin(math.radians(85.0)) / 1.4914))
+    expected = math.degrees(math.atan(half / 200.0)) + turned
+    assert dome_offer.half_angle(data) == pytest.approx(expected - 0.5, abs=1.0)  # rounded down; pixels of 3 mm
+    assert dome_offer.half_angle(data) < 80.0
+    dark = changed(letters, "target.invert", True)  # light around the letters
+    assert dome_offer.half_angle(tomllib.loads(dark)) == 85.0
+
+
+def test_a_front_that_is_replaced_takes_its_comment_along():
+    line = 'front = { kind = "plane", z = 15.0 }  '
+    noted = LAMP.replace(line.strip(), f"{line}# flat, to be glued\n{' ' * len(line)}# to the window")
+    noted = noted.replace("control_points = 33 }", "control_points = 33 }  # as many as needed")
+    dome, _ = take(noted, "radial")
+    assert "glued" in noted and "glued" not in dome and "window" not in dome
+    assert "# as many as needed" in dome and "the comment stays" in dome
+
+
+@pytest.mark.parametrize("lamp", [0.0, -5.0])
+def test_a_front_about_the_lamp_stays_about_the_lamp(lamp):
+    """z + 1 / c is the position of the lamp, whichever of the two a person changes; other fronts do not follow."""
+    dome, _ = take(changed(LAMP, "source.position", [0.0, 0.0, lamp]), "radial")
+    for key, value in (("lens.front.z", 6.0), ("lens.front.curvature", -0.16)):
+        text, followed = take_change(dome, key, value, is_valid=lambda each: fault(each) is None)
+        front = tomllib.loads(text)["lens"]["front"]
+        assert front["z"] + 1 / front["curvature"] == pytest.approx(lamp, abs=1e-8) and value in front.values()
+        assert {key, *followed} == {"lens.front.z", "lens.front.curvature"}
+    flat = changed(dome, "lens.front.curvature", -0.05)
+    assert take_change(flat, "lens.front.z", 6.0, is_valid=lambda each: fault(each) is None)[1] == ()
+
+
 def test_the_light_in_a_cone_is_the_integral_of_the_lamp_s_intensity():
     """Lambertian: sin² of the angle, for a lamp beside the axis the flux through the tilted disc of the same rim."""
     lamp = Point()

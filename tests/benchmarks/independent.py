@@ -169,6 +169,7 @@ class Glass(NamedTuple):
     fresnel: bool
     polarisation: np.ndarray  # (2,) shares of s and p
     coating: np.ndarray  # (2,) index and thickness (nm); zeros: none
+    outside: float  # index between the source and the lens
 
 
 # --- what the folder holds -------------------------------------------------------------------------------------------
@@ -405,7 +406,8 @@ def glass_of(scene):
     polarisation = {"none": (0.5, 0.5), "s": (1.0, 0.0), "p": (0.0, 1.0)}[(fresnel or {}).get("polarisation", "none")]
     coating = (fresnel or {}).get("coating")
     layer = (coating["index"], coating["thickness"]) if coating else (0.0, 0.0)
-    return Glass(mirror, np.array(rows, float), bool(fresnel), np.array(polarisation), np.array(layer, float))
+    outside = float(lens.get("encapsulant") or 1.0)
+    return Glass(mirror, np.array(rows, float), bool(fresnel), np.array(polarisation), np.array(layer, float), outside)
 
 
 def indices(material, nm, extinction=True):
@@ -685,9 +687,13 @@ def trace(points, area, light, first, back, glass, screen, before, behind, pictu
                     ledger[6] += rest - kept
                     rest = kept
             else:
-                eta = 1 / index
-                cos_out = math.sqrt(1 - eta * eta * (1 - cos * cos))
-                kept = rest * transmitted(1.0, index, cos, cos_out, nm, glass)
+                eta = glass.outside / index
+                cos2 = 1 - eta * eta * (1 - cos * cos)
+                if cos2 <= 0:
+                    ledger[3] += rest
+                    continue
+                cos_out = math.sqrt(cos2)
+                kept = rest * transmitted(glass.outside, index, cos, cos_out, nm, glass)
                 ledger[4] += rest - kept
                 rest = kept
                 inner = refracted(d, n, eta, cos, cos_out)

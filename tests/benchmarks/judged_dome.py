@@ -245,11 +245,16 @@ def trace(points, light, lens, glass, screen, picture, ledger):
         cos = d[0] * n[0] + d[1] * n[1] + d[2] * n[2]
         for line in glass.lines:
             rest, nm, index, absorbed = line[0], line[1], line[2], line[4]
-            cos_out = math.sqrt(1 - (1 - cos * cos) / index**2)
-            kept = rest * transmitted(1.0, index, cos, cos_out, nm, glass)
+            eta = glass.outside / index
+            cos2 = 1 - eta * eta * (1 - cos * cos)
+            if cos2 <= 0:
+                ledger[3] += rest
+                continue
+            cos_out = math.sqrt(cos2)
+            kept = rest * transmitted(glass.outside, index, cos, cos_out, nm, glass)
             ledger[4] += rest - kept
             rest = kept
-            inner = refracted(d, n, 1 / index, cos, cos_out)
+            inner = refracted(d, n, eta, cos, cos_out)
             arrives, s, p, m = met(lens.net, place, inner, work)
             if arrives:
                 x, y, z = p[0] - lens.net.centre[0], p[1] - lens.net.centre[1], p[2] - lens.net.centre[2]

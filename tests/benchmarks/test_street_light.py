@@ -11,6 +11,7 @@ from tests.benchmarks.independent import SETS, judge
 
 pytestmark = pytest.mark.bench
 
+TEMPLATE = Path(__file__).parents[2] / "templates" / "street_light.toml"
 RAYS = 5_242_880
 SIDE = 4  # pixels of 250 mm in a square of 1 m
 AT_LEAST = 0.82  # fraction of the light of the LED on the road, with the losses by reflection
@@ -18,7 +19,7 @@ UNIFORM = 0.5  # smallest / mean illuminance over squares of 1 m
 
 
 def test_the_road_is_even_and_receives_most_of_the_light(tmp_path):
-    run = generate(Path(__file__).with_name("street_light.toml"), tmp_path / "design")
+    run = generate(TEMPLATE, tmp_path / "design")
     report, judged = run.report(), judge(run.folder, points=RAYS // SETS, most=RAYS // SETS)
     rows, columns = judged.picture.shape
     means = judged.picture.reshape(rows // SIDE, SIDE, columns // SIDE, SIDE).mean((1, 3))

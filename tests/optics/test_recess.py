@@ -76,6 +76,9 @@ def test_the_light_beside_the_dome_is_a_line_of_the_ledger(rays, half_angle):
     assert light.flux["missed the lens"] == pytest.approx(1 - within(RIM), abs=1e-3)
     enters = 1 - light.flux["missed the lens"] - light.flux[UNDERSIDE]
     assert enters == pytest.approx(within(EDGE), abs=1e-3)
+    [unsplit] = through([(1.0, Point(half_angle=half_angle), lens(), 1)], [SCREEN], 400, splits_missed=False)
+    assert torch.equal(unsplit.box, light.box) and UNDERSIDE not in unsplit.flux
+    assert unsplit.flux["missed the lens"] == pytest.approx(light.flux["missed the lens"] + light.flux[UNDERSIDE])
 
 
 def test_a_source_in_the_dome_lights_no_underside():

@@ -10,7 +10,7 @@ import torch
 
 from bstcad.cad import dome_mesh, mesh
 from bstcad.optics import domes
-from bstcad.report import dome_figures, exports, rendering
+from bstcad.report import dome_figures, exports, prescription, rendering
 from tests.cad.test_dome import CASES, dome, offset_sphere
 
 
@@ -76,3 +76,16 @@ def test_the_model_of_the_report_has_the_extent_of_the_solid(name):
     vertices = mesh.lens_mesh(domes.on_base(lens), 64).vertices
     np.testing.assert_allclose(model["low"], vertices.min(0), atol=1e-3)
     np.testing.assert_allclose(model["size"], np.ptp(vertices, axis=0), atol=2e-3)
+
+
+@pytest.mark.parametrize("name", ["oblong", "below the horizon"])
+def test_the_outer_size_is_that_of_the_solid_which_may_be_oblong_and_wider_than_its_rim(name):
+    oblong = dome(half=78.0)
+    x, y = np.meshgrid(np.linspace(-1.0, 1.0, 25), np.linspace(-1.0, 1.0, 25), indexing="ij")
+    oblong = replace(oblong, back=replace(oblong.back, heights=torch.from_numpy(3.0 * x**2 - 5.0 * y**2)))
+    lens = domes.on_base({"oblong": oblong, **CASES}[name])
+    vertices = mesh.lens_mesh(lens, 96).vertices
+    low, high = prescription._corners(lens, None)
+    np.testing.assert_allclose(low, vertices.min(0), atol=5e-3)  # mm, the chords of the mesh
+    np.testing.assert_allclose(high, vertices.max(0), atol=5e-3)
+    assert name != "oblong" or high[0] - low[0] > 1.3 * (high[1] - low[1])

@@ -14,6 +14,7 @@ from bstcad.report.report import doubts
 from bstcad.report.units import remarks as written
 from bstcad.scene.scene import load
 from bstcad.verify.verdict import Check
+from tests import domes
 from tests.report.test_report import CONTENTS
 
 FACTS = {
@@ -121,6 +122,24 @@ def test_each_loss_is_one_sentence_with_its_figures(scene, changes, asked, expec
     assert [remark.id for remark in found] == list(expected)
     for id, sentence in found:
         assert [figure for figure in expected[id] if figure not in sentence] == [] and sentence.endswith(".")
+
+
+OF_A_DOME = [  # changes of the facts and of the scene of a dome, 7 mm thick; id and words of its remark
+    ({"shape.centre_thickness": 7.2, "shape.thickness_min": 0.6}, {}, "vertex-moved", ["0.2 mm", "lens.back.radius"]),
+    ({"shape.thickness_min": 0.25}, {}, "too-thin", ["Increase lens.back.radius"]),
+    ({"flux.missed the lens": 0.47}, {}, "misses", ["lens.back.half_angle"]),
+    ({"efficiency": 0.97}, {}, "outside", ["raise tailoring.overshoot"]),
+    ({"efficiency": 0.97}, {"source.diameter": 1.0}, "outside", ["larger dome", "overshoot makes the rest", "worse"]),
+]
+
+
+@pytest.mark.parametrize(("changes", "asked", "id", "words"), OF_A_DOME)
+def test_a_dome_is_advised_by_keys_that_it_has(changes, asked, id, words):
+    small = load("templates/disk.toml", domes.SMALL | asked)
+    [remark] = said(small, {"shape.centre_thickness": 7.0} | changes)
+    assert remark.id == id and [each for each in words if each not in remark.text] == []
+    absent = ("lens.back.z", "lens.outline", "lens.max_thickness")
+    assert [key for key in absent if key in remark.text] == []
 
 
 @pytest.mark.parametrize(("changes", "expected"), [

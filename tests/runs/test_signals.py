@@ -19,13 +19,14 @@ from tests.conftest import DISK, SMALL
 
 ROOT = Path(__file__).parent.parent.parent
 # First in a process that runs the command line: it verifies by as many tubes and rays as resolve the small design, and
-# draws all but the 3-D picture.
+# draws nothing.
 FEW_RAYS = """
+from bstcad import commands
 from bstcad.optics.measure import Effort
-from bstcad.report import rendering
+from bstcad.report.figure_jobs import NoPictures
 from bstcad.verify import checks
 checks.FULL = Effort(256)
-rendering.lens_picture = lambda mesh: None
+commands.Pictures = NoPictures
 """
 BOTH = pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
 

@@ -49,6 +49,7 @@ WRONG = {
         ({"target.outline": '{shape="circle",radius=201}'}, "target.outline: is larger than the target along x"),
         ({"name": "../.."}, "name: '../..' cannot be"),
         ({"lens.material": "PNMA"}, "lens.material: 'PNMA' is not a known material; did you mean 'PMMA'"),
+        ({"lens.encapsulant": "1.41"}, "lens.encapsulant: parallel light comes through air"),
         ({"source.wavelength": "2000"}, "lens.material: the index of PMMA is known from 404.7 to 1083 nm"),
         ({"lens.material": "main/Ag/Johnson"},
          "lens.material: the index of main/Ag/Johnson at source.wavelength is 0.052.* not between 1.01 and 5"),

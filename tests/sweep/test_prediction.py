@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numba.core.event import Event, EventStatus, broadcast
 
+from bstcad.optics.measure import Effort
 from bstcad.optics.sides import as_pair
 from bstcad.scene.scene import load
 from bstcad.scene.target import MIN_PIXELS
@@ -32,6 +33,7 @@ def tiny(monkeypatch):
     """Pilots that take a second or so."""
     for name, value in TINY.items():
         monkeypatch.setattr(prediction, name, value)
+    monkeypatch.setattr("bstcad.tailoring.run.FINE_EFFORT", Effort(128, accuracy=0.0, witness=False))
 
 
 def pilot(scene, *, slower=1.0, factor=4.0):

@@ -145,7 +145,7 @@ def by_rounds(profile, m, plan):
 
 
 @pytest.mark.parametrize(("profile", "finest", "at_rim"), [
-    ("uniform", 128, 1.2e-4), pytest.param("lambertian", 256, 2.5e-4, marks=pytest.mark.bench),
+    ("uniform", 128, 1e-4), pytest.param("lambertian", 256, 2e-4, marks=pytest.mark.bench),
 ])  # fmt: skip
 def test_rounds_of_stage_1_find_the_dome_of_the_equation(profile, finest, at_rim):
     """The distance from the centre within 1e-4 of R up to 70°; the light's edge on cells shows in the last degrees."""

@@ -41,6 +41,7 @@ pixels = 48
 uniform = true
 [tailoring]
 quality = "draft"
+rays = 192
 """
 POINT = {
     "source": {"kind": "point", "position": [0, 0, 0], "wavelength": 587.6, "profile": "uniform", "half_angle": 10.0},

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad.optics.measure import Effort
 from bstcad.pipeline import DesignState, design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
@@ -36,6 +37,12 @@ SCENES = {
         "lens.front": {"kind": "sphere", "z": 15.0, "curvature": 0.002, "optimise": True},
     },
 }
+
+
+@pytest.fixture(autouse=True)
+def _few_rays(monkeypatch):
+    """Scenes with bounds are rated by few rays; the law is one of bits, whatever the rays."""
+    monkeypatch.setattr("bstcad.tailoring.run.FINE_EFFORT", Effort(128, accuracy=0.0, witness=False))
 
 
 QUICK = (

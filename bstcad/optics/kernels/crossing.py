@@ -80,9 +80,9 @@ def _tilted_screen(tilted, k):
 def _cross(net, faces, screens, width, position, direction, status, outs, hits, cosine, first, last):
     """Trace rays first … last - 1 to the face and refract or reflect them.
 
-    screens: None, or `Screens` on which rays land.  outs: (2, n) for each screen, which receives the landing points;
-    or (3, n) and (3, n), which receive hit (mm) and direction behind the face.  hits: one array (n,), which receives
-    the path to the face (mm).  status (screens, n) is updated, and cosine (n,) receives the cosine of the angle of
+    screens: None, or `Screens` on which rays land.  outs: (screens, 2, n), which receives the landing points; or
+    (2, 3, n), which receives hit (mm) and direction behind the face.  hits: one array (n,), which receives the path to
+    the face (mm).  status (screens, n) is updated, and cosine (n,) receives the cosine of the angle of
     incidence, if not empty.
     """
     work, active, path = np.empty(CROSSING_WORK), np.empty(BLOCK, np.uint32), hits[0]
@@ -419,47 +419,53 @@ class Cross(torch.autograd.Function):
         ctx: Any, nets: Tensor, position: Tensor, direction: Tensor, status: Tensor, crossing: Crossing
     ) -> Any:
         n, (count, components) = status.numel(), crossing.shapes
-        outs = tuple(torch.empty((components, n), dtype=position.dtype) for _ in range(count))
+        outs = torch.empty((count, components, n), dtype=torch.float64)
         hits = [torch.empty(n, dtype=torch.float64) for _ in range(crossing.form.hits)]
         cosine = torch.ones(n if crossing.lossy else 0, dtype=torch.float64)
         fate = status.expand(count if crossing.screens else 1, n).clone()
-        inputs = [net_of(nets), *crossing[1:3], crossing.width, *(t.detach().numpy() for t in (position, direction))]
-        results = fate.numpy(), _arrays(outs), _arrays(hits), cosine.numpy()
+        inputs = [net_of(nets), *crossing[1:3], crossing.width, *_doubles([position, direction])]
+        results = fate.numpy(), outs.numpy(), _arrays(hits), cosine.numpy()
         cross = crossing.form.cross
         reductions.on_threads(lambda first, last: cross(*inputs, *results, first, last), reductions.shares(n, BLOCK))
         ctx.save_for_backward(nets, position, direction, fate, *hits)
         ctx.crossing = crossing
         ctx.mark_non_differentiable(fate, *(() if crossing.lossy else (hits[0], cosine)))
         ctx.set_materialize_grads(False)
-        return fate, hits[0], cosine, *outs
+        return fate, hits[0], cosine, *outs.to(position.dtype).unbind()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, _: None, g_path: Tensor | None, g_cosine: Tensor | None, *g: Tensor | None) -> Any:  # noqa: D102
         (nets, position, direction, fate, *hits), crossing = ctx.saved_tensors, ctx.crossing
         n = hits[0].numel()
-        shape = (crossing.shapes[1], n)
-        known = _arrays([position.new_zeros(shape) if each is None else each.contiguous() for each in g])
+        known = np.empty((*crossing.shapes, n))
+        for into, each in zip(known, g, strict=True):
+            into[:] = 0.0 if each is None else each.numpy()
         more = np.empty((2, 0))
         if g_path is not None or g_cosine is not None:
             more = np.zeros((2, n))
             for row, part in zip(more, (g_path, g_cosine), strict=True):
                 row[:] = 0.0 if part is None else part.numpy()
-        d_rays = torch.empty((6, n), dtype=position.dtype) if any(ctx.needs_input_grad[1:3]) else None
+        d_rays = torch.empty((6, n), dtype=torch.float64) if any(ctx.needs_input_grad[1:3]) else None
         shares = reductions.shares(n, BLOCK)
         buffers = [reductions.buffers(len(shares), *nets.shape[1:]) for _ in nets]
-        inputs = [net_of(nets), *crossing[1:3], *_arrays([position, direction, fate]), _arrays(hits)]
+        inputs = [net_of(nets), *crossing[1:3], *_doubles([position, direction]), fate.numpy(), _arrays(hits)]
         inputs += [known, more, None if d_rays is None else d_rays.numpy()]
         owns, ranges = (zip(*each, strict=True) for each in zip(*buffers, strict=True))
         tasks = [(*share, own, touched) for share, own, touched in zip(shares, owns, ranges, strict=True)]
         reductions.on_threads(lambda *task: crossing.form.adjoint(*inputs, *task), tasks)
         d_nets = torch.from_numpy(np.stack([reductions.merged(*each) for each in buffers])).to(nets.dtype)
-        d_position, d_direction = (None, None) if d_rays is None else (d_rays[:3], d_rays[3:])
+        d_position, d_direction = (None, None) if d_rays is None else d_rays.to(position.dtype).split(3)
         return d_nets, d_position, d_direction, None, None
 
 
 def _arrays(tensors: Sequence[Tensor]) -> tuple[np.ndarray, ...]:
     return tuple(t.detach().numpy() for t in tensors)
+
+
+def _doubles(tensors: Sequence[Tensor]) -> tuple[np.ndarray, ...]:
+    """Return the tensors as float64 arrays; the kernels are compiled for no other type of rays."""
+    return _arrays([t.double() for t in tensors])
 
 
 def prepare_heights(rays: Rays, interface: Interface) -> tuple[Rays, Tensor, Faces]:

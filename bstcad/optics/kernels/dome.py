@@ -423,8 +423,12 @@ class DomeFaces(NamedTuple):
 
 
 @njit
-def _trace(net, light, both, tilted, losses, count, work, active):
-    """Trace rays through points of the chart to the screen as `forward._trace` does."""
+def _trace(net, light, both, tilted, losses, count, work, active, rows):
+    """Trace rays through points of the chart to the screen as `forward._trace` does.
+
+    rows: (2, 3, count) u, v and 1 (0: no hit) of the same columns in the last row but one and in the last row of rays,
+    from which a hit is extrapolated; it receives the last row and this one.  None: there are no such rows.
+    """
     face = both.dome
     launch_from_sphere(light, count, work)
     cross_front(both.front, count, work)
@@ -432,10 +436,24 @@ def _trace(net, light, both, tilted, losses, count, work, active):
     for r in range(count):
         work[U + r] = work[V + r] = work[PATH + r] = 0.0
         if (work[FATE + r] == 0.0) & (work[FLUX + r] > 0.0):
-            _start_on_sphere(face, r, work)
+            known = False
+            if rows is not None:
+                known = rows[0, 2, r] * rows[1, 2, r] == 1.0
+                if known:
+                    work[U + r] = clamped(2.0 * rows[1, 0, r] - rows[0, 0, r], face.faces.m - 1.0)
+                    work[V + r] = clamped(2.0 * rows[1, 1, r] - rows[0, 1, r], face.faces.n - 1.0)
+                    work[PATH + r] = 1.0
+            if not known:
+                _start_on_sphere(face, r, work)
             active[searching] = r
             searching += 1
     _at_dome(net, face, searching, count, work, active)
+    if rows is not None:
+        for r in range(count):
+            met = (work[FATE + r] == 0.0) & (work[FLUX + r] > 0.0)
+            for k in range(3):
+                rows[0, k, r] = rows[1, k, r]
+            rows[1, 0, r], rows[1, 1, r], rows[1, 2, r] = work[U + r], work[V + r], 1.0 if met else 0.0
     _deflect(face.faces, count, work)
     to_screen(face.faces, face.faces.throw, tilted, count, work)
 
@@ -444,11 +462,12 @@ def _trace(net, light, both, tilted, losses, count, work, active):
 def _rows(net, light, both, tilted, losses, cells, pixels, first, step, box, tent, lines):
     """Simulate a part of the light as `forward._rows` does."""
     work, active, part = np.zeros(CROSSING_WORK), np.empty(BLOCK, np.uint32), np.empty(forward.LINES)
+    rows = np.zeros((2, 3, cells.n))
     for i in range(first, cells.n, step):
         for j in range(0, cells.n, BLOCK):
             count = min(BLOCK, cells.n - j)
             forward.points(cells, i, j, count, work)
-            _trace(net, light, both, tilted, losses, count, work, active)
+            _trace(net, light, both, tilted, losses, count, work, active, rows[:, :, j : j + count])
             part[:] = 0.0
             if losses.present:
                 forward.dim(both.dome.faces, losses, count, work, part)
@@ -465,7 +484,7 @@ def _rays(net, light, both, tilted, losses, x, y, landing, flux, fate):
         count = min(BLOCK, x.size - first)
         for r in range(count):
             work[X + r], work[Y + r] = x[first + r], y[first + r]
-        _trace(net, light, both, tilted, losses, count, work, active)
+        _trace(net, light, both, tilted, losses, count, work, active, None)
         for r in range(count):
             landing[0, first + r], landing[1, first + r] = work[X + r], work[Y + r]
             flux[first + r], fate[first + r] = work[FLUX + r], np.uint8(work[FATE + r])
@@ -476,7 +495,8 @@ def _scene(source: Emitter, lens: Lens, plane: Receiver) -> forward.Scene:
     *front, last = lens.interfaces
     net, face = _as_numbers(last)
     faces, tilted = kernel_arguments.faces(last, plane, 1, last.surface.z)
-    both = DomeFaces(face._replace(faces=faces), dome_light.front_of(front, last.surface.z))
+    first = dome_light.front_of(front, last.surface.z)
+    both = DomeFaces(face._replace(faces=faces._replace(front_eta=first.face.eta)), first)
     return net_of(net), kernel_arguments.beam(source, lens), both, tilted
 
 

@@ -45,6 +45,12 @@ def cosines(offset, count, work):
         work[offset + r] = along / math.sqrt(1.0 + p * p + q * q)
 
 
+@njit(inline="always")
+def cos2_behind(eta, cos2_in):
+    """Return cos² θ' of Snell's law; negative beyond the critical angle."""
+    return 1.0 - eta * eta * (1.0 - cos2_in)
+
+
 @njit(error_model="numpy")
 def refract(eta, reflected, count, work):
     """Refract rays at the slopes in `work` as `interfaces.Refract` does; reflected: status of blocked rays."""
@@ -53,7 +59,7 @@ def refract(eta, reflected, count, work):
         dx, dy, dz = work[DX + r], work[DY + r], work[DZ + r]
         norm2 = 1.0 / (1.0 + p * p + q * q)
         along = dz - p * dx - q * dy
-        cos2 = 1.0 - eta * eta * (1.0 - along * along * norm2)
+        cos2 = cos2_behind(eta, along * along * norm2)
         through = (cos2 > 0.0) & (along > 0.0)
         shift = math.sqrt((cos2 if through else 1.0) * norm2) - eta * along * norm2
         work[DX + r] = eta * dx - shift * p
@@ -473,7 +479,7 @@ def _trace(net, beam, faces, tilted, losses, count, work, active):
         meet_front(faces, beam.distance == 0.0 and beam.tilted == 0, count, work)
         if losses.present:
             cosines(COS_FRONT, count, work)
-        refract(1.0 / faces.eta, faces.fates.reflected, count, work)
+        refract(faces.front_eta, faces.fates.reflected, count, work)
     start_search(net, faces, count, work)
     if losses.present:
         for r in range(count):
@@ -540,6 +546,12 @@ def _share(table, cosine):
     return table[k] + (at - k) * (table[k + 1] - table[k])
 
 
+@njit(inline="always")
+def _tabled(eta, cos_in):
+    """Return the cosine by which a face's transmission is tabled (see `records.LossTables`); η = n_in / n_out."""
+    return cos_in if eta <= 1.0 else math.sqrt(max(cos2_behind(eta, cos_in * cos_in), 0.0))
+
+
 @njit(error_model="numpy")
 def dim(faces, losses, count, work, lines):
     """Reduce the flux of each ray by its losses, and add these to the ledger, as `interfaces.apply_losses` does."""
@@ -547,17 +559,17 @@ def dim(faces, losses, count, work, lines):
         flux, fate = work[FLUX + r], work[FATE + r]
         if not flux > 0.0:
             continue
-        if not faces.reflects and fate != faces.fates.missed_front and work[COS_FRONT + r] > 0.0:
-            left = flux * _share(losses.front, work[COS_FRONT + r])
+        at_front = not faces.reflects and fate != faces.fates.missed_front and work[COS_FRONT + r] > 0.0
+        cosine = _tabled(faces.front_eta, work[COS_FRONT + r]) if at_front else 0.0
+        if cosine > 0.0:  # not totally reflected
+            left = flux * _share(losses.front, cosine)
             lines[BY_FACES] += flux - left
             flux = left
         if fate == 0.0:
             left = flux * math.exp(-losses.coefficient * work[PATH + r])
             lines[BY_GLASS] += flux - left
             flux, cosine = left, work[COS_BACK + r]
-            if not faces.reflects:  # the table depends on the cosine of refraction (see `records.LossTables`)
-                cosine = math.sqrt(max(1.0 - faces.eta * faces.eta * (1.0 - cosine * cosine), 0.0))
-            left = flux * _share(losses.back, cosine)
+            left = flux * _share(losses.back, cosine if faces.reflects else _tabled(faces.eta, cosine))
             lines[BY_FACES] += flux - left
             flux = left
         work[FLUX + r] = flux

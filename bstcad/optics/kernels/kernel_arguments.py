@@ -66,7 +66,7 @@ def faces(
     limits = [limit for i in (front or interface, interface) for limit in i.outline.limits]
     corner, per_mm = (surface.x[0], surface.y[0]), (1 / pitch for pitch in surface.pitch)
     bounds, throw = interfaces.net_bounds(surface, torch.float64, sense), plane.middle[2] if plane is not None else 0.0
-    face = floats([*conic, law.eta, *limits, sense * (surface.z - start)])
+    face = floats([*conic, law.eta, front.law.eta if front else 1.0, *limits, sense * (surface.z - start)])
     net = floats([*corner, *per_mm, *bounds, sense * (throw - surface.z)])
     fates = [Status.MISSED_FRONT, interface.status_if_missed, law.status_if_blocked, Status.TURNED_BACK]
     numbers = Faces._make([int(law.reverses), *face, *surface.shape, *net, rules(), Fates(*floats(fates))])

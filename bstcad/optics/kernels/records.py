@@ -173,6 +173,7 @@ class Faces(NamedTuple):
     curvature: float  # curvature of the front (1/mm)
     conic_constant: float  # conic constant of the front
     eta: float  # relative index η = n_in / n_out at the net
+    front_eta: float  # relative index at the front; without a front 1
     front_x: float  # outlines.Limits of the front's clear aperture (mm, mm, mm²)
     front_y: float
     front_r2: float
