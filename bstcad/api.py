@@ -221,13 +221,15 @@ class Design:
         with commands.scene_errors():
             return mounting.part_of(self.lens, self.scene.mount).solid
 
-    def export(self, *kinds: str, points: int | None = None) -> list[Path]:
+    def export(self, *kinds: str, points: int | None = None, **cutting: float | str) -> list[Path]:
         """Write additional files, by names such as "zemax", into the folder of the design; return their paths.
 
         points: number of grid points along the wider side (default: number of control points; for "zemax", a grid
-        through the knots).  SceneError if a name is unknown or the design has not been written.
+        through the knots).  cutting: settings of "spiral" and "raster": tool_radius, cusp, pitch, tolerance, stock and
+        depth in mm, feed in mm/min, along ("x" or "y").  SceneError if a name is unknown or a value impossible, or if
+        the design has not been written.
         """
-        return commands.export(self._own_folder(), kinds, points).paths
+        return commands.export(self._own_folder(), kinds, points, cutting).paths
 
     def write(
         self, folder: AnyPath, *, progress: bool = True, effort: Effort | None = None,

@@ -246,6 +246,12 @@ Port = option(int, "N", "Port on this machine (0: any free port).", min=0, max=6
 Browser = option(bool, None, "Open the page in the browser.", "--browser/--no-browser")
 Written = argument(Path, "DIR|STEP", "Folder of a design, or a single STEP file.", parser=design_folder)
 Measured = path_option("CLOUD", "Measured points (CSV, PLY, STL) of a made part, which is also verified.")
+Clouds = option(
+    list[Path], "CLOUD", "Measured points (CSV, PLY, STL) of a part that was cut last; several are averaged.",
+    "--measured", parser=user_path,
+)  # fmt: skip
+Gain = option(float, "G", "Part of the measured deviation that is corrected.")
+Cutoff = option(float | None, "MM", "Cutoff of the low pass of the correction (default: four pitches of the net).")
 Report = path_option("DIR", "Write the report of the made part to this folder only.", "--output", "-o")
 Against = option(str | None, "NAMES", "Also trace the lens with other programs: batoid, mitsuba, or batoid,mitsuba.")
 Grade = option(str | None, "G", "Grade of errors without a [\\[tolerance]]: moulded, diamond-turned or precise.")
@@ -256,6 +262,18 @@ Kinds = option(str | None, "NAMES", f"Kinds of files, separated by commas: {EXPO
 Points = option(
     int | None, "N", "Points along the longer side (default: number of control points; zemax: through all knots)."
 )
+ToolRadius = option(
+    float | None, "MM", "Radius of the tool of a path (default: lens.tool_radius, or spiral 0.5, raster 1.5)."
+)
+Cusp = option(float | None, "MM", "Height of the cusps between passes (default: spiral 0.00005, raster 0.01).")
+Pitch = option(float | None, "MM", "Spacing of the passes, in place of the cusp height.")
+PathTolerance = option(
+    float | None, "MM", "Distance of straight moves from the exact path (default: spiral 0.000005, raster 0.0005)."
+)
+Stock = option(float | None, "MM", "Stock that the roughing of a raster leaves (default: 0.2; 0: no roughing).")
+Depth = option(float | None, "MM", "Depth of cut of roughing (default: 1).")
+Feed = option(float | None, "MM/MIN", "Feed of a raster (default: 800).")
+Along = option(str | None, "AXIS", "Axis along which the lines of a raster run: x (default) or y.")
 Png = path_option("FILE", "PNG file to write (default: a window is opened).", "--png", "-o")
 ReachPng = path_option("FILE", "PNG of the target and of the area that light can reach (target[1]: FILE_2).", "--png")
 Budget = option(
@@ -403,6 +421,21 @@ def verify(
     return conclude(getattr(found, "contents", found), output or path, verbose)
 
 
+@app.command(
+    epilog=examples("compensate outputs/thu --measured cloud.csv", "compensate outputs/thu --measured a.csv --gain 0.8")
+)
+def compensate(folder: Folder, measured: Clouds, gain: Gain = 1.0, cutoff: Cutoff = None) -> int:
+    """Write the back to cut next, from measured points of the parts that were cut last."""
+    from bstcad.measured.compensation import Settings as CompensationSettings
+
+    processes.begin()
+    commands = load_commands()
+    with progress.watch(Console(stderr=True)) as watched:
+        found = commands.compensate(folder, measured, CompensationSettings(gain, cutoff), progress=watched)
+    print(found.sentences, f"Files: {found.folder}", sep="\n")
+    return 0
+
+
 @app.command(epilog=examples("tolerance outputs/thu --yield 90", "tolerance outputs/thu --grade precise --trial 17"))
 def tolerance(
     folder: Folder, grade: Grade = None, wanted: Yield = None, seed: Seed = 0, trial: Trial = None,
@@ -429,12 +462,27 @@ def tolerance(
     return 0
 
 
-@app.command(epilog=examples("export outputs/thu --as zemax,dxf", "export outputs/thu --as points --points 1001"))
-def export(folder: Folder, kinds: Kinds = None, points: Points = None) -> int:
-    """Write files for a workshop: sag tables, points, Zemax grid sag, turning data, outlines, previews, data sheet."""
+@app.command(
+    epilog=examples(
+        "export outputs/thu --as zemax,dxf",
+        "export outputs/thu --as points --points 1001",
+        "export outputs/thu --as raster --tool-radius 1.5 --cusp 0.01",
+    )
+)
+def export(
+    folder: Folder, kinds: Kinds = None, points: Points = None, tool_radius: ToolRadius = None, cusp: Cusp = None,
+    pitch: Pitch = None, tolerance: PathTolerance = None, stock: Stock = None, depth: Depth = None, feed: Feed = None,
+    along: Along = None,
+) -> int:  # fmt: skip
+    """Write files for a workshop: tables, Zemax grid sag, tool paths, height maps, outlines, previews, data sheet."""
     if kinds is None:
         raise SceneError(f"--as: is missing; give one or more kinds of files: {EXPORT_NAMES}")
-    written = load_commands().export(folder, split_names(kinds), points)
+    settings = {
+        "tool_radius": tool_radius, "cusp": cusp, "pitch": pitch, "tolerance": tolerance, "stock": stock,
+        "depth": depth, "feed": feed, "along": along,
+    }  # fmt: skip
+    given = {name: value for name, value in settings.items() if value is not None}
+    written = load_commands().export(folder, split_names(kinds), points, given)
     print(*written.notes, "Files: " + ", ".join(map(str, written.paths)), sep="\n")
     return 0
 

@@ -15,9 +15,10 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,6 +31,8 @@ from bstcad.judges.comparison import Comparison
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.measured.cloud import Cloud
+from bstcad.measured.compensation import USUAL
+from bstcad.measured.compensation import Settings as CompensationSettings
 from bstcad.measured.form_error import map_files
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, Effort, Light, SpectralLine
@@ -53,10 +56,13 @@ from bstcad.runs.environment import circumstances
 from bstcad.runs.files import MachineError, SceneError
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
+from bstcad.shop import rounds
+from bstcad.shop.rounds import Compensated
 from bstcad.step_text import beginning
 from bstcad.sweep.estimates import diagnosis, left_out
 from bstcad.sweep.net_choice import with_net
 from bstcad.tailoring.run import NO_HOOKS, Hooks, Progress, no_progress
+from bstcad.toolpath.cutting import DEFAULTS, Cutting
 from bstcad.verify import checks
 from bstcad.verify.checks import Proof
 from bstcad.verify.verdict import Check, verdict
@@ -337,6 +343,17 @@ def verify(
     return Report(contents, tuple(light.picture for light in proof.lights), part)
 
 
+def compensate(
+    path: Path, measured: Sequence[Path], settings: CompensationSettings = USUAL, *,
+    progress: Progress = no_progress, effort: Effort = FULL,
+) -> Compensated:  # fmt: skip
+    """Write what to cut next to the folder `path` of a design, from measured points of the parts that were cut last."""
+    made = read(path)
+    made.scene.lens.require_heights("compensate")
+    with scene_errors():
+        return rounds.compensate(made, path, measured, settings, progress=progress, effort=effort)
+
+
 def examine(path: Path) -> Examined:
     """Examine a single STEP file: checks and dimensions of the solid, without a design."""
     beginning.check(path)
@@ -459,25 +476,45 @@ def tolerance(
         return tolerancing.tolerance(folder, settings if found is None else replace(settings, spread=found.spread))
 
 
-def export(folder: Path, kinds: Sequence[str], points: int | None = None) -> Exported:
-    """Write files for a shop to the design's folder `folder`; kinds and points as in bstcad.report.exports.export."""
+def export(
+    folder: Path, kinds: Sequence[str], points: int | None = None, cutting: Mapping[str, Any] = MappingProxyType({})
+) -> Exported:
+    """Write files for a shop to the design's folder `folder`; kinds and points as in bstcad.report.exports.export.
+
+    cutting: settings of tool paths, by the names of the fields of bstcad.toolpath.cutting.Cutting.
+    """
     with folders.amending(folder) as amended:
         made = read(folder)
         with scene_errors("export: "):
-            written = _export(made, kinds, amended, points)
+            written = _export(made, kinds, amended, points=points, cutting=_cutting(cutting))
         if exports.SHEET in kinds:
             written.paths.append(amended / SHEET)
             files.put(written.paths[-1], data_sheet.draw(_sheet_again(made, folder)))
     return replace(written, paths=[folder / path.name for path in written.paths])
 
 
-def _export(made: Made, kinds: Sequence[str], folder: Path, points: int | None = None) -> Exported:
+def _cutting(settings: Mapping[str, Any]) -> Cutting:
+    known = [field.name for field in fields(Cutting)]
+    for name, value in settings.items():
+        if name not in known:
+            raise ValueError(f"'{name}' is no setting of a tool path; give {', '.join(known)}")
+        if name != "along" and (isinstance(value, bool) or not isinstance(value, int | float)):
+            raise ValueError(f"{name} = {value!r} is not a number; give it in mm (feed: mm/min)")
+    return Cutting(**settings)
+
+
+def _export(
+    made: Made, kinds: Sequence[str], folder: Path, *, points: int | None = None, cutting: Cutting = DEFAULTS
+) -> Exported:
     scene, lens = made.scene, made.lens
     light = GridLight(scene.light.central, tuple(target.screen for target in scene.targets))
     far = far_field_of(scene)
+    if cutting.tool_radius is None and not scene.lens.mould:  # the tool for which the faces were designed
+        cutting = replace(cutting, tool_radius=scene.lens.tool_radius)
     return exports.export(
-        lens, kinds, folder, points=points, label=folders.label(scene), mount=scene.mount, light=light, far=far
-    )
+        lens, kinds, folder, points=points, label=folders.label(scene), mount=scene.mount, light=light, far=far,
+        cutting=cutting,
+    )  # fmt: skip
 
 
 def _sheet_again(made: Made, folder: Path) -> DataSheet:

@@ -26,7 +26,7 @@ AT_TOP = {
 }
 ENGINE = {
     "runs", "scene", "optics", "photometry", "step_text", "transport", "tailoring", "baselines", "cad", "analysis",
-    "verify", "judges", "measured", "report",
+    "toolpath", "verify", "judges", "measured", "report",
 }  # fmt: skip
 # A part of the package, and the parts it may import besides itself.
 MAY_IMPORT = {
@@ -43,12 +43,26 @@ MAY_IMPORT = {
     "verify": {"runs", "scene", "optics", "step_text", "cad", "analysis"},
     "judges": {"scene", "optics", "verify"},
     "measured": {"runs", "optics", "analysis", "verify"},
-    "report": {"runs", "scene", "optics", "photometry", "cad", "analysis", "verify", "judges", "measured"},
+    "toolpath": {"optics"},
+    "report": {
+        "runs",
+        "scene",
+        "optics",
+        "photometry",
+        "cad",
+        "analysis",
+        "verify",
+        "judges",
+        "measured",
+        "toolpath",
+    },
     "designs": {*ENGINE, "bstcad"} - {"judges", "measured"},
     # Designs come about in processes of their own; a sweep times and judges with the engine's tools.
     "sweep": {"runs", "scene", "optics", "tailoring", "analysis", "verify", "report", "designs", "bstcad"},
     "tolerance": {"runs", "scene", "optics", "cad", "verify", "report", "designs", "bstcad"},
-    "commands": {*ENGINE, "designs", "sweep", "tolerance", "app", "bstcad"},
+    # Rounds of cutting and measuring write the folders of designs.
+    "shop": {"runs", "scene", "optics", "measured", "report", "designs", "bstcad"},
+    "commands": {*ENGINE, "designs", "sweep", "tolerance", "shop", "app", "bstcad"},
     # The workbench's previews are designs made small, by the steps of tailoring.
     "app": {
         "runs",

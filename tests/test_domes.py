@@ -109,8 +109,8 @@ def test_a_dome_is_designed_written_and_proved_from_its_files(designed):
     assert far.table(again.lens, rays=128).lumens == pytest.approx(1000.0 * leaving, rel=5e-3)  # ies, ldt and csv
     behind = far.rays(again.lens, 1 << 14)
     assert behind.flux == pytest.approx(leaving, rel=1e-2)
-    for kind in ("zemax", "turning"):
-        with pytest.raises(SceneError, match=f'^export: "{kind}" is a table of heights .* write "sag"'):
+    for kind in ("zemax", "turning", "spiral", "raster", "heightmap"):
+        with pytest.raises(SceneError, match=f'^export: "{kind}" is a \\w+ (of|over) heights .* write "sag"'):
             again.export(kind)
     for change in (lambda: again.with_lens(again.lens),):
         with pytest.raises(SceneError, match="is not possible for a dome yet"):

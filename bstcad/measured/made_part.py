@@ -52,17 +52,14 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     """
     lens = replace(lens, outline=lens.apertures[1])  # if a mount cuts the rim, the face ends there
     face = BackFace.of(lens)
-    try:
-        alignment, axes = _align(face, cloud.points)
-    except ValueError as error:
-        raise ValueError(f"{cloud.path}: {error}") from None
+    alignment, of_cloud = aligned(cloud, face, nominal.scene.accept.decentre)
     form = fit_form_error(face, alignment)
     figures = deviation(lens, alignment, form)
     cheap = replace(nominal.effort(effort), witness=False)
     lights = [_light(lens, form, nominal, goal, effort=cheap) for goal in nominal.goals]
     scale = aligning.scale(face, alignment)
     checks = (
-        *_cloud_checks(cloud, face, alignment, axes, scale=scale, decentre=nominal.scene.accept.decentre),
+        *of_cloud,
         *_light_checks(nominal, lights),
         *_wavefront(replace(lens, back=form.add_to(lens.back_net)), nominal),
     )
@@ -75,6 +72,19 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     facts["goals"] = [{"key": goal.key} | of for goal, of in zip(nominal.goals, predicted, strict=True)]
     irradiances = tuple(light.picture for light, _ in lights)
     return MadePart(checks, facts, figures, irradiances=irradiances, outliers=alignment.outliers)
+
+
+def aligned(cloud: Cloud, face: BackFace, decentre: float | None) -> tuple[Alignment, tuple[Check, ...]]:
+    """Return the cloud aligned with a face, and the checks of the cloud; ValueError if it cannot be aligned.
+
+    decentre: accept.decentre (mm).
+    """
+    try:
+        alignment, axes = _align(face, cloud.points)
+    except ValueError as error:
+        raise ValueError(f"{cloud.path}: {error}") from None
+    scale = aligning.scale(face, alignment)
+    return alignment, tuple(_cloud_checks(cloud, face, alignment, axes, scale=scale, decentre=decentre))
 
 
 def _cloud_checks(

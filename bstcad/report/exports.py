@@ -1,4 +1,4 @@
-"""Files of `bstcad export` and `[output] export`, by kind: tables, drawings of the outline, preview meshes.
+"""Files of `bstcad export` and `[output] export`, by kind: tables, tool paths, drawings, preview meshes.
 
 Tables are text: the first line names the columns, lengths in mm.  Drawings show the outline of a bare lens, or the part
 with its [mount], seen from the back: x to the right, y up, mm.  Each kind of edge is a set of closed curves on its own
@@ -29,10 +29,13 @@ from bstcad.optics.surfaces import Surface, sag
 from bstcad.photometry import eulumdat, ies, intensity_files, tm25
 from bstcad.photometry.intensity import Intensity, Luminaire
 from bstcad.report.grid_sag import MAX_POINTS, MIN_POINTS, GridLight, GridSag, axes, table_note
+from bstcad.report.heightmap import HeightMap, default_pixels
+from bstcad.report.toolpath_files import toolpath_files
 from bstcad.report.units import environment, paragraphs
 from bstcad.runs import files
 from bstcad.scene.blank import export_complaints
 from bstcad.scene.mount import Mount
+from bstcad.toolpath.cutting import DEFAULTS, Cutting
 
 SIDECAR = ".txt"  # suffix of a text file that states how far interpolation of a table moves the light
 INTENSITIES = ("ies", "ldt", "csv")  # kinds of intensity files
@@ -79,14 +82,15 @@ class Exported:
 def export(
     lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = None, label: Label = DEFAULT_LABEL,
     mount: Mount | None = None, light: GridLight | None = None, far: FarField | None = None,
+    cutting: Cutting = DEFAULTS,
 ) -> Exported:  # fmt: skip
     """Write the files of `kinds` (files.EXPORTS; nothing for SHEET) to the folder, each completely or not at all.
 
     points: number of points along the wider side of a grid; None: as many as the back has control points along its
     longer side (OpticStudio: at the knots).  label: name of a mesh or part.  mount: mount in drawings; None: drawings
     show the outline of the lens.  light: light that is traced to compute the error of grids and tables; None: the error
-    is not computed.  far: light for intensity files; None: they cannot be exported.  ValueError: a kind is unknown, or
-    points is out of range.
+    is not computed.  far: light for intensity files; None: they cannot be exported.  cutting: settings of tool paths.
+    ValueError: a kind is unknown, points is out of range, or a tool path is not possible.
     """
     for kind in kinds:
         if kind not in files.EXPORTS:
@@ -105,7 +109,9 @@ def export(
             continue
         if kind in INTENSITIES and far is not None and intensity is None:  # traced once for all files
             intensity = Stated(far.table(lens), far.lumens)
-        for name, data in _files(kind, lens, points, label=label, mount=mount, light=light, intensity=intensity):
+        for name, data in _files(
+            kind, lens, points, label=label, mount=mount, light=light, intensity=intensity, cutting=cutting
+        ):
             files.put(folder / name, data.encode("utf-8") if isinstance(data, str) else data)
             paths.append(folder / name)
             if name.endswith(SIDECAR):
@@ -122,6 +128,7 @@ def _files(
     mount: Mount | None,
     light: GridLight | None,
     intensity: Stated | None,
+    cutting: Cutting,
 ) -> Iterator[tuple[str, str | bytes]]:
     count = min(max(lens.back_net.shape), MAX_POINTS) if points is None else points
     match kind:
@@ -147,6 +154,13 @@ def _files(
             yield "turning.csv", turning_cloud(lens, (count + 1) // 2)
             if lens.front.is_net:
                 yield "turning-front.csv", turning_cloud(lens, (count + 1) // 2, lens.front)
+        case "spiral" | "raster":
+            yield from toolpath_files(kind, lens, cutting, label.title or label.name)
+        case "heightmap":
+            picture = HeightMap.of(lens.back, lens.plan, default_pixels(count) if points is None else points)
+            yield "heightmap.png", picture.png()
+            yield "heightmap.tif", picture.tiff()
+            yield f"heightmap{SIDECAR}", picture.words() + "\n"
         case "dxf":
             yield "outline.dxf", dxf(lens.plan, mount, label)
         case "svg":

@@ -24,9 +24,15 @@ MAX_SENTENCE = 600  # largest length of a text from `one_line` (characters)
 MADE_PART_FILES = ("deviation.npz",)  # file by which the folder of a made part is recognised
 DESIGN_FILES = ("report.json", "lens.step", "scene.toml")  # files, any of which marks a design's folder
 # Kinds of files for a shop, as in `bstcad export --as` and the scene's output.export.
-Export = Literal["sag", "points", "zemax", "turning", "dxf", "svg", "preview", "datasheet", "ies", "ldt", "csv", "tm25"]
+Export = Literal[
+    "sag", "points", "zemax", "turning", "spiral", "raster", "heightmap",
+    "dxf", "svg", "preview", "datasheet", "ies", "ldt", "csv", "tm25",
+]  # fmt: skip
 EXPORTS: tuple[str, ...] = get_args(Export)
-HEIGHT_EXPORTS = ("zemax", "turning")  # kinds that need a back of heights z(x, y), which a dome is not
+HEIGHT_EXPORTS = {  # kinds that need a back of heights z(x, y), which a dome is not, and what they are
+    "zemax": "a table of", "turning": "a table of", "spiral": "a path over", "raster": "a path over",
+    "heightmap": "a picture of",
+}  # fmt: skip
 MAX_ARCHIVE_SIZE = 600_000_000  # largest .npz (bytes), enough for a net of 2049 x 2049 and pictures of 4096 x 4096
 MAX_ARRAY_HEADER = 4096  # largest header of an array in an .npz archive (bytes), with a margin
 NO_MEMORY = re.compile(  # words of Python, torch, the system and the dynamic loader for a lack of memory

@@ -79,7 +79,7 @@ def export_complaints(kinds: Iterable[str], dome: bool, index_before: float) -> 
     """Yield a sentence for each kind of export that cannot hold a lens; index_before: of the medium at its front."""
     for kind in kinds:
         if dome and kind in HEIGHT_EXPORTS:
-            heights = f'"{kind}" is a table of heights z(x, y), and the back of a dome is none'
+            heights = f'"{kind}" is {HEIGHT_EXPORTS[kind]} heights z(x, y), and the back of a dome is none'
             yield f'{heights}; use lens.step or lens.stl, or write "sag" (polar distances), "points" or "preview"'
         elif index_before != 1 and kind == "zemax":
             yield '"zemax" starts its light in air, and lens.encapsulant is not air; use lens.step in its place'

@@ -1,0 +1,103 @@
+"""Height map of a back: a grey picture whose grey is the height, for the software of routers and printers.
+
+A pixel of the row r and the column c shows the face at the middle of its square, seen from the back:
+
+    x = (c + 1/2) p - w / 2,   y = h / 2 - (r + 1/2) p,
+
+p: mm per pixel, w and h: width and height of the picture (mm).
+
+The PNG has 16 bits, z = z_low + g · (z_high - z_low) / 65535 for the grey g.  The TIFF has heights z - z_low in mm as
+32-bit floats.  Pixels outside the outline have the grey 0.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+from bstcad.optics.outlines import Outline
+from bstcad.optics.surfaces import Surface, sag
+
+WHITE = 65535  # largest grey of 16 bits
+PIXELS_PER_POINT = 4  # pixels per control point along the longer side, by default
+MAX_PIXELS = 2048  # largest number of pixels along the longer side, by default
+DESCRIPTION, RESOLUTION_X, RESOLUTION_Y, UNIT = 270, 282, 283, 296  # tags of TIFF
+CENTIMETRE = 3  # unit of the resolution in a TIFF
+
+
+@dataclass(frozen=True)
+class HeightMap:
+    """Heights of a face at the middles of square pixels; the row 0 is that of the largest y."""
+
+    z: np.ndarray  # (rows, columns) mm; NaN outside the outline
+    pixel: float  # side of a pixel, mm
+
+    @classmethod
+    def of(cls, face: Surface, outline: Outline, pixels: int) -> HeightMap:
+        """Return the heights inside an outline with `pixels` pixels along its longer side."""
+        half_x, half_y = outline.half_extent
+        p = 2 * max(half_x, half_y) / pixels
+        columns, rows = (max(round(2 * half / p), 1) for half in (half_x, half_y))
+        x = (np.arange(columns) + 0.5 - columns / 2) * p
+        y = (rows / 2 - np.arange(rows) - 0.5) * p
+        x, y = (at.copy() for at in np.broadcast_arrays(x[None, :], y[:, None]))
+        inside = outline.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
+        return cls(np.where(inside, sag(face, x, y), np.nan), p)
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Lowest and highest z (mm)."""
+        return float(np.nanmin(self.z)), float(np.nanmax(self.z))
+
+    @property
+    def per_grey(self) -> float:
+        """Height per grey of the PNG, mm."""
+        low, high = self.range
+        return (high - low) / WHITE
+
+    def png(self) -> bytes:
+        """Return a PNG of 16-bit greys; its text states the scale, and pHYs the size of a pixel."""
+        grey = np.round((self.z - self.range[0]) / (self.per_grey or 1.0))
+        text = PngInfo()
+        text.add_text("Description", self.words())
+        dots = 25.4 / self.pixel
+        picture = Image.fromarray(np.nan_to_num(grey).astype(np.uint16))
+        return _saved(picture, "PNG", pnginfo=text, dpi=(dots, dots))
+
+    def tiff(self) -> bytes:
+        """Return a TIFF of 32-bit floats: the height (mm) above the lowest point."""
+        tags = ImageFileDirectory_v2()
+        tags[DESCRIPTION] = self.words().encode("ascii", "replace").decode()
+        tags[RESOLUTION_X] = tags[RESOLUTION_Y] = 10 / self.pixel
+        tags[UNIT] = CENTIMETRE
+        heights = np.nan_to_num(self.z - self.range[0]).astype(np.float32)
+        return _saved(Image.fromarray(heights), "TIFF", tiffinfo=tags, compression="tiff_adobe_deflate")
+
+    def words(self) -> str:
+        """Return the scale of the pictures in one sentence each."""
+        rows, columns = self.z.shape
+        low, high = self.range
+        return (
+            f"heightmap: {columns} x {rows} pixels of {self.pixel:.9g} mm, {columns * self.pixel:.9g} mm x "
+            f"{rows * self.pixel:.9g} mm, seen from the back with x to the right and y up. "
+            f"heightmap.png: grey 0 is z = {low:.9g} mm, grey {WHITE} is z = {high:.9g} mm, {self.per_grey:.9g} mm "
+            "per grey. heightmap.tif: height in mm above the lowest point, as 32-bit floats. Both are 0 outside the "
+            "outline."
+        )
+
+
+def default_pixels(points: int) -> int:
+    """Return the pixels along the longer side for a net with this many control points along it."""
+    return min(PIXELS_PER_POINT * points, MAX_PIXELS)
+
+
+def _saved(picture: Image.Image, kind: str, **options: object) -> bytes:
+    data = io.BytesIO()
+    picture.save(data, format=kind, **options)
+    return data.getvalue()

@@ -1,0 +1,157 @@
+"""Files of tool paths: the table of a spiral, the G-code and the table of a raster, and the sentences about them.
+
+Tables are in mm and degrees, with as many decimals as the tolerance of the path requires.  The text beside each path
+states tool, zero point, pitch, and what the check of the written moves against the exact face found
+(toolpath/swept_volume.py).
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from bstcad.optics.bspline import require_net
+from bstcad.optics.lens import Lens
+from bstcad.report.units import quantity
+from bstcad.toolpath import gcode
+from bstcad.toolpath.chords import digits
+from bstcad.toolpath.cutting import Cutting
+from bstcad.toolpath.machined_face import MachinedFace, RoundTool
+from bstcad.toolpath.raster import RAPID_FEED, SAFE_HEIGHT, Raster, raster
+from bstcad.toolpath.spiral import Spiral, spiral
+from bstcad.toolpath.swept_volume import Swept, check_raster, check_spiral
+
+ANGLE_DIGITS = 7  # decimals of C (degrees): a tenth of a nanometre at 50 mm from the axis
+ROWS_AT_A_TIME = 100_000  # rows of a table that are formatted at a time
+
+
+def toolpath_files(kind: str, lens: Lens, cutting: Cutting, name: str) -> Iterator[tuple[str, str]]:
+    """Yield (name, text) of the files of a path, "spiral" or "raster", over each face of a lens that is a net.
+
+    name: of the lens, for the heading.  ValueError if a face is too steep for the tool, or the path too long.
+    """
+    for side, face in machined_faces(lens):
+        file = f"toolpath-{kind}" + ("" if side == "back" else f"-{side}")
+        if kind == "spiral":
+            turned = spiral(face, cutting)
+            sentences = [*_of_part(name, side), *spiral_words(turned), *_of_check(check_spiral(turned), turned.tool)]
+            yield f"{file}.csv", _table("c_deg,x_mm,z_mm", _formats(turned), *_columns(turned, face))
+        else:
+            milled = raster(face, cutting)
+            sentences = [
+                *_of_part(name, side),
+                *raster_words(milled, lens),
+                *_of_check(check_raster(milled), milled.tool),
+            ]
+            yield f"{file}.nc", gcode.gcode(milled, sentences)
+            yield f"{file}.csv", raster_table(milled)
+        yield f"{file}.txt", " ".join(sentences) + "\n"
+
+
+def machined_faces(lens: Lens) -> Iterator[tuple[str, MachinedFace]]:
+    """Yield name and face of the back, and of the front if it is a net."""
+    yield "back", MachinedFace.back(lens.back_net, lens.plan)
+    if lens.front.is_net:
+        yield "front", MachinedFace.front(require_net(lens.front), lens.plan)
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+def _columns(path: Spiral, face: MachinedFace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return C (degrees), X and Z (mm) of the nose's lowest point; Z = 0 is the vertex of the face."""
+    return path.angle, path.x, path.z - face.vertex_z
+
+
+def _formats(path: Spiral) -> tuple[str, str, str]:
+    places = digits(path.cutting.finish[1])
+    return f"%.{ANGLE_DIGITS}f", f"%.{places}f", f"%.{places}f"
+
+
+def raster_table(path: Raster) -> str:
+    """Return a CSV table of the points of a raster: X, Y and Z of the ball's lowest point, and the kind of its pass.
+
+    Columns: pass (number), roughing (1 or 0), x_mm, y_mm, z_mm.  Between passes the tool goes up and across.
+    """
+    counts = [len(each.points) for each in path.passes]
+    number, rough = np.repeat(np.arange(len(counts)), counts), np.repeat([each.rough for each in path.passes], counts)
+    points = np.concatenate([each.points for each in path.passes])
+    places = digits(path.cutting.finish[1])
+    return _table("pass,roughing,x_mm,y_mm,z_mm", ("%d", "%d", *[f"%.{places}f"] * 3), number, rough, *points.T)
+
+
+def _table(heading: str, formats: tuple[str, ...], *columns: np.ndarray) -> str:
+    """Return a CSV table; formats of thousands of rows at a time are several times faster than row by row."""
+    row, rows, text = ",".join(formats) + "\n", np.column_stack(columns), io.StringIO()
+    text.write(heading + "\n")
+    for start in range(0, len(rows), ROWS_AT_A_TIME):
+        part = rows[start : start + ROWS_AT_A_TIME]
+        text.write(row * len(part) % tuple(part.ravel().tolist()))
+    return text.getvalue()
+
+
+# --- sentences --------------------------------------------------------------------------------------------------------
+
+
+def _of_part(name: str, side: str) -> Iterator[str]:
+    turned = ", turned over about the y axis: X and Z are those of the lens times -1" if side == "front" else ""
+    yield f"{name}, {side}{turned}."
+
+
+def spiral_words(path: Spiral) -> Iterator[str]:
+    """Yield sentences on the tool, the frame and the size of a spiral."""
+    yield f"Nose of radius {path.tool.radius:g} mm, round in X-Z only and compensated in this plane."
+    yield (
+        "C is the angle of the part under the tool, from +x towards +y, X the distance of the nose from the axis, and "
+        "Z the height of its lowest point above the vertex of the face."
+    )
+    pitch, count = quantity(path.passes.pitch, "mm"), f"{len(path.x):,}".replace(",", " ")
+    yield f"{path.turns:.0f} turns of {pitch}, {count} points, straight moves within {_tolerance(path.cutting)}."
+    clearance = math.degrees(math.atan(path.slope_along_cut))
+    yield f"The face falls by at most {clearance:.3g} degrees along the cut: the tool needs a larger clearance angle."
+    if (beyond := path.tool.radius * math.sin(math.atan(path.slope_at_axis))) > path.passes.pitch:
+        yield f"The face is tilted on the axis, where the nose touches it up to {quantity(beyond, 'mm')} beyond."
+
+
+def raster_words(path: Raster, lens: Lens) -> Iterator[str]:
+    """Yield sentences on the tool, the blank, the zero point and the time of a raster."""
+    stock, depth = path.cutting.roughing
+    yield f"Ball end mill of radius {path.tool.radius:g} mm; Z is the lowest point of the ball."
+    width, height = (2 * half for half in lens.plan.half_extent)
+    yield (
+        f"Zero point: X0 Y0 on the axis of the lens, Z0 on the top of the flat blank; the lens is {width:g} mm x "
+        f"{height:g} mm, and its highest point lies {stock:g} mm below Z0."
+    )
+    cut = f"Roughing in steps of {depth:g} mm leaves {stock:g} mm. " if stock else "There is no roughing. "
+    lines = f"Finish in lines along {path.cutting.along} with a pitch of {quantity(path.spacing.pitch, 'mm')}"
+    yield f"{cut}{lines}, straight moves within {_tolerance(path.cutting)}. The lowest Z is {path.deepest:.3f} mm."
+    yield (
+        f"Feed {path.cutting.speed:g} mm/min, a third of it downwards; rapid moves at Z = {SAFE_HEIGHT:g} mm. Time "
+        f"without acceleration about {_time(path.minutes)}, with rapid moves of {RAPID_FEED:g} mm/min."
+    )
+    yield "Start the spindle first: the file has no commands for the spindle."
+
+
+def _of_check(found: Swept, tool: RoundTool) -> Iterator[str]:
+    yield (
+        f"Check of the moves against the exact face at {len(found.points):,} points: deepest gouge ".replace(",", " ")
+        + f"{quantity(found.gouge, 'mm')}, highest cusp {quantity(found.cusp, 'mm')}."
+    )
+    if found.unreached:
+        widest = 1 / tool.face.shape.valley
+        yield (
+            f"The tool does not reach {100 * found.unreached:.2g} % of the face, where {quantity(found.left, 'mm')} "
+            f"stays at most: the tightest valley has a radius of {widest:.3g} mm; give a smaller tool_radius, or "
+            "design with lens.tool_radius."
+        )
+
+
+def _tolerance(cutting: Cutting) -> str:
+    return quantity(cutting.finish[1], "mm")
+
+
+def _time(minutes: float) -> str:
+    return f"{minutes:.2g} min" if minutes < 90 else f"{minutes / 60:.2g} h"

@@ -1,0 +1,148 @@
+"""Raster for a router with three axes: roughing in steps down, then a finish in lines to and fro, with a ball.
+
+The height of the ball without gouge decides all: finishing follows it, roughing follows that of a ball that is larger
+by the stock left on the face, and cuts at most one depth at a time from the blank, which is flat.  Z = 0 is the top of
+the blank; the highest point of the finished face lies below it by the stock.  X and Y are those of the face.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from bstcad.toolpath import chords, cusps
+from bstcad.toolpath.cusps import Passes
+from bstcad.toolpath.cutting import ROUTER, Cutting
+from bstcad.toolpath.machined_face import MachinedFace, RoundTool
+
+MAX_BALL_SLOPE = 85.0  # steepest face (degrees) that a ball reaches without its shank
+ROUGH_PITCH = 0.5  # pitch of roughing, as a fraction of the radius of the ball
+ROUGH_TOLERANCE = 0.1  # tolerance of roughing, as a fraction of the stock
+SAFE_HEIGHT = 5.0  # Z of rapid moves, above the top of the blank (mm)
+RAPID_FEED = 3000.0  # feed that the estimate of the time assumes for rapid moves (mm/min)
+PLUNGE = 1 / 3  # feed of moves straight down, as a fraction of the feed
+
+
+@dataclass(frozen=True)
+class Pass:
+    """Moves in contact with the part: the tool comes down over the first point, and goes up after the last one."""
+
+    points: np.ndarray  # x, y and z of the lowest point of the ball (n, 3), mm
+    rough: bool  # True for roughing
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Passes of a raster, in the order of the cut."""
+
+    passes: tuple[Pass, ...]
+    tool: RoundTool
+    cutting: Cutting  # completed settings
+    spacing: Passes  # spacing of the finishing lines, and their cusp
+    top: float  # z of the face's frame at Z = 0 of the path, the top of the blank (mm)
+
+    @property
+    def deepest(self) -> float:
+        """Lowest Z of the path (mm)."""
+        return min(float(each.points[:, 2].min()) for each in self.passes)
+
+    @property
+    def length(self) -> float:
+        """Length of the moves in contact (mm)."""
+        return sum(float(np.linalg.norm(np.diff(each.points, axis=0), axis=1).sum()) for each in self.passes)
+
+    @property
+    def minutes(self) -> float:
+        """Time of the path (minutes) by its lengths and feeds, without acceleration; rapid moves have RAPID_FEED."""
+        rapid = plunge = 0.0
+        x, y = 0.0, 0.0
+        for each in self.passes:
+            (x1, y1, z1), (x2, y2, z2) = each.points[0], each.points[-1]
+            rapid += math.hypot(x1 - x, y1 - y) + SAFE_HEIGHT - z2
+            plunge, (x, y) = plunge + SAFE_HEIGHT - z1, (x2, y2)
+        speed = self.cutting.speed
+        return self.length / speed + plunge / (PLUNGE * speed) + rapid / RAPID_FEED
+
+
+def raster(face: MachinedFace, wanted: Cutting) -> Raster:
+    """Return the raster that cuts a face; ValueError if the face is too steep for a ball or the path too long."""
+    cutting = wanted.completed(ROUTER)
+    tool, (cusp, tolerance), stock = RoundTool(face, cutting.radius), cutting.finish, cutting.roughing[0]
+    steepest = math.degrees(math.atan(face.shape.slope))
+    if steepest > MAX_BALL_SLOPE:
+        steep = f"the face is {steepest:.3g} degrees steep, and a ball reaches {MAX_BALL_SLOPE:g} degrees"
+        raise ValueError(f"{steep}; limit lens.max_slope, or cut the face on a machine with more axes")
+    spacing = cusps.raster_passes(tool, cusps.for_passes(cusp, tolerance), pitch=cutting.pitch, along=cutting.along)
+    top = face.highest + stock
+
+    def tip(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return tool.ball(x, y) - tool.radius - top
+
+    passes: list[Pass] = list(_roughing(face, cutting, top)) if stock else []
+    lines = 2 * max(face.outline.half_extent) / spacing.pitch
+    chords.refuse_many(lines * 2 * min(face.outline.half_extent) / tool.spacing(tolerance))
+    zigzag = np.concatenate(list(_lines(face, spacing.pitch, tool.reach + spacing.pitch, cutting.along)))
+    passes.append(Pass(_followed(zigzag, tip, tool.spacing(tolerance), tolerance), rough=False))
+    return Raster(tuple(passes), tool, cutting, spacing=spacing, top=top)
+
+
+def _lines(face: MachinedFace, pitch: float, overrun: float, along: str) -> Iterator[np.ndarray]:
+    """Yield the ends (2, 2) of lines over the outline, grown by `overrun` mm, in turn in both directions."""
+    a, b, r2 = face.outline.limits
+    a, b = (a, b) if along == "x" else (b, a)
+    r = math.sqrt(r2) + overrun
+    reach = b + r
+    count = math.ceil(2 * reach / pitch) + 1
+    for k, level in enumerate(np.linspace(-reach, reach, count)):
+        beyond = max(abs(level) - b, 0.0)
+        half = a + (r if r2 == 0 else math.sqrt(max(r * r - beyond * beyond, 0.0)))
+        ends = np.array([[-half, level], [half, level]])[:: -1 if k % 2 else 1]
+        yield ends if along == "x" else ends[:, ::-1]
+
+
+def _followed(
+    corners: np.ndarray, tip: Callable[[np.ndarray, np.ndarray], np.ndarray], spacing: float, tolerance: float
+) -> np.ndarray:
+    """Return points (n, 3) of a path over a polyline (mm) whose straight moves keep the tolerance (mm)."""
+    start, at = chords.along_polyline(corners, spacing)
+
+    def place(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x, y = (np.interp(t, at, corner) for corner in corners.T)
+        return x, y
+
+    t, z = chords.within_tolerance(start, lambda t: tip(*place(t)), tolerance)
+    return np.column_stack([*place(t), z])
+
+
+def _roughing(face: MachinedFace, cutting: Cutting, top: float) -> Iterator[Pass]:
+    """Yield the passes that take the blank down to the stock on the face, level by level from Z = 0."""
+    stock, depth = cutting.roughing
+    larger = RoundTool(face, cutting.radius + stock)
+    pitch, spacing = ROUGH_PITCH * cutting.radius, min(larger.spacing(ROUGH_TOLERANCE * stock), cutting.radius / 4)
+
+    def tip(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return larger.ball(x, y) - cutting.radius - top
+
+    lines = [
+        _followed(ends, tip, spacing, ROUGH_TOLERANCE * stock)
+        for ends in _lines(face, pitch, larger.reach + pitch, cutting.along)
+    ]
+    lowest = min(float(line[:, 2].min()) for line in lines)
+    for level in range(1, math.ceil(-lowest / depth) + 1):
+        above, floor = -(level - 1) * depth, -level * depth
+        for line in lines:
+            yield from (Pass(run, rough=True) for run in _runs(line, above=above, floor=floor))
+
+
+def _runs(line: np.ndarray, above: float, floor: float) -> Iterator[np.ndarray]:
+    """Yield the parts of a line of points (n, 3) that are lower than `above`, raised to `floor` (mm)."""
+    low = line[:, 2] < above
+    starts = np.flatnonzero(low & ~np.append(False, low[:-1]))
+    ends = np.flatnonzero(low & ~np.append(low[1:], False)) + 1
+    for start, end in zip(starts, ends, strict=True):
+        run = line[max(start - 1, 0) : end + 1].copy()  # with the neighbours, where the blank is already cut
+        run[:, 2] = np.maximum(run[:, 2], floor)
+        yield run

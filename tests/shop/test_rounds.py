@@ -1,0 +1,153 @@
+"""Rounds of cutting and measuring in a simulated shop, whose errors the code under test does not know."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+import bstcad
+from bstcad import cli, commands
+from bstcad import folder as folders
+from bstcad.measured import alignment, compensation
+from bstcad.measured.alignment import BackFace
+from bstcad.measured.cloud import Cloud
+from bstcad.measured.compensation import Settings, Statistics
+from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.surfaces import sag
+from tests.conftest import quick_effort
+
+POINTS, GAUGE, MISPLACED, TURNED = 30_000, 20e-6, 0.03, 0.05  # number, noise (mm), mm, degrees
+
+
+class Shop:
+    """A machine with errors that repeat, and some that do not; a gauge that holds each part otherwise."""
+
+    def __init__(self, lens, low=5e-3, mid=5e-4, varying=0.0):
+        self.lens, self.low, self.mid, self.varying = lens, low, mid, varying
+        self.half = lens.outline.half_extent
+
+    def error(self, x, y, part):
+        u, v = x / self.half[0], y / self.half[1]
+        low = self.low * (0.5 * (u * u + v * v) + 0.3 * (u**3 - u * v * v) + 0.4 * u * v)
+        period = self.half[0] / 2
+        mid = self.mid * np.sin(2 * np.pi * x / period + 0.3) * np.cos(2 * np.pi * y / (1.2 * period))
+        phase = np.random.default_rng(part).uniform(0, 2 * np.pi, 2)
+        return low + mid + self.varying * 2 * np.sin(5 * u + phase[0]) * np.sin(4 * v + phase[1])
+
+    def cut(self, net, part):
+        """The height of the part that is cut from a net."""
+        return lambda x, y: sag(net, x, y) + self.error(x, y, part)
+
+    def measure(self, height, seed, points=POINTS, noise=GAUGE, misplaced=MISPLACED):
+        chance = np.random.default_rng(seed)
+        place = chance.uniform(-1, 1, (2 * points, 2)) * self.half
+        place = place[self.lens.outline.contains(*torch.from_numpy(place).T).numpy()][:points]
+        found = np.column_stack([place, height(*place.T) + chance.normal(0.0, noise, len(place))])
+        pivot = BackFace.of(self.lens).pivot
+        turn = Rotation.from_rotvec(np.radians(TURNED) * chance.normal(size=3) / np.sqrt(3)).as_matrix()
+        moved = (found - pivot) @ turn.T + pivot + misplaced * chance.normal(size=3) / np.sqrt(3)
+        return Cloud(moved, "mm", Path(f"part-{seed}.csv"), sha256=str(seed))
+
+    def deviation(self, height):
+        """PV and RMS (mm) of a part after its alignment, without noise."""
+        face, points = BackFace.of(self.lens), self.measure(height, 99, 20_000, noise=0.0, misplaced=0.0).points
+        found = alignment.align(face, points, alignment.first_pose(face, points)[0])
+        return np.ptp(found.distances), found.rms
+
+
+@pytest.fixture(scope="module")
+def lens(small_design):
+    return folders.read_nominal(small_design.folder)[1].lens.plain()
+
+
+def rounds(shop, count, settings=Settings(), parts=1):  # noqa: B008
+    """Yield (round, part that is cut from it); all parts differ."""
+    net, before = shop.lens.back_net, []
+    for number in range(count):
+        measured = [shop.measure(shop.cut(net, 10 * number + k), 100 + 10 * number + k) for k in range(parts)]
+        found = compensation.next_round(shop.lens, net, measured, settings, before)
+        net = found.net
+        before.append(found.deviation)
+        yield found, shop.cut(net, 10 * (number + 1))
+
+
+def test_two_rounds_lower_the_deviation_tenfold(lens):
+    shop = Shop(lens, varying=8e-5)
+    first, _ = shop.deviation(shop.cut(lens.back_net, 0))
+    *_, (found, part) = rounds(shop, 2)
+    after, rms = shop.deviation(part)
+    assert after < first / 10 and rms < 2e-4
+    assert found.net.shape == lens.back_net.shape and (found.net.x, found.net.y) == (lens.back_net.x, lens.back_net.y)
+
+
+def test_a_gain_of_half_leaves_half(lens):
+    shop = Shop(lens)
+    _, before = shop.deviation(shop.cut(lens.back_net, 0))
+    [(found, part)] = rounds(shop, 1, Settings(gain=0.5))
+    assert shop.deviation(part)[1] == pytest.approx(before / 2, rel=0.1)
+    assert found.expected.rms == pytest.approx(found.deviation.rms / 2, rel=0.02)
+
+
+@pytest.mark.parametrize("period", [1.0, 2.0, 4.0])
+def test_the_low_pass_keeps_what_iso_16610_61_states(period):
+    """A wave as long as the cutoff keeps half of its height."""
+    m, pitch = 129, 0.125
+    net = BSplineSurface(0.0, torch.zeros((m, m), dtype=torch.float64), (0.0, pitch * (m - 1)), (0.0, pitch * (m - 1)))
+    kept, along = compensation.transmission(net, 2.0), compensation.frequencies(net)[:, 0]
+    expected = np.exp(-np.pi * (np.sqrt(np.log(2) / np.pi) * 2.0 / period) ** 2)
+    assert np.interp(1 / period, along, kept[:, 0]) == pytest.approx(expected, abs=2e-3)
+
+
+def test_what_does_not_repeat_is_told_from_what_repeats(lens):
+    """Three parts show how far their mean is uncertain; a perfect part is not corrected by the noise of its gauge."""
+    [(found, _)] = rounds(Shop(lens, varying=3e-4), 1, parts=3)
+    assert 3e-5 < found.standard_error < 3e-4 and found.parts == 3
+    perfect = [Shop(lens).measure(lambda x, y: sag(lens.back_net, x, y), seed, noise=2e-4) for seed in (1, 2)]
+    with pytest.raises(ValueError, match="nothing is cut: the repeatable deviation is .* µm RMS, and it is known to"):
+        compensation.next_round(lens, lens.back_net, perfect, Settings(), [])
+
+
+def test_rounds_that_diverge_are_refused(lens):
+    shop = Shop(lens)
+    cloud = shop.measure(shop.cut(lens.back_net, 0), 1)
+    for gain in (0.0, 1.8, 2.5):
+        with pytest.raises(ValueError, match=r"--gain .* a gain above 2 enlarges the deviation"):
+            compensation.next_round(lens, lens.back_net, [cloud], Settings(gain=gain), [])
+    with pytest.raises(ValueError, match=r"--cutoff 0.001: is not between"):
+        compensation.next_round(lens, lens.back_net, [cloud], Settings(cutoff=1e-3), [])
+    with pytest.raises(ValueError, match="the rounds diverge: the deviation was .* check datum, sign and axes"):
+        compensation.next_round(lens, lens.back_net, [cloud], Settings(), [Statistics(1e-4, 1e-5)])
+    half = replace(cloud, points=cloud.points[cloud.points[:, 0] > 0])
+    with pytest.raises(ValueError, match=r"part-1.csv: no correction is computed .* measured fraction of the face"):
+        compensation.next_round(lens, lens.back_net, [half], Settings(), [])
+
+
+def test_a_folder_remembers_its_rounds(lens, small_design, tmp_path, capsys):
+    folder = tmp_path / "design"
+    shutil.copytree(small_design.folder, folder)
+    shop, net = Shop(lens), lens.back_net
+    for number in (1, 2):
+        cloud = shop.measure(shop.cut(net, 0), number)
+        path = tmp_path / f"part-{number}.csv"
+        np.savetxt(path, cloud.points, delimiter=",", header="x [mm],y [mm],z [mm]", comments="", fmt="%.9f")
+        found = commands.compensate(folder, [path], effort=quick_effort())
+        place = folder / "compensated" / f"round-{number}"
+        assert found.folder == place and found.figures["round"] == number
+        assert json.loads((place / "compensation.json").read_text()) == found.figures
+        assert {"lens.step", "lens.stl", "correction.csv", "correction.png", "design.npz"} <= {
+            each.name for each in place.iterdir()
+        }
+        again = bstcad.open(place).lens.back_net
+        change = found.figures["correction"]["pv_mm"]
+        assert float((again.heights - net.heights).abs().max()) > 0.3 * change
+        net = again
+    light = found.figures["rrmsd"]
+    assert light["design"] < light["expected"] < light["measured"] / 2  # waves near the cutoff stay in part
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["compensate", str(folder), "--measured", str(path)])
+    assert ended.value.code == 2 and "an earlier round has used this cloud" in capsys.readouterr().err
