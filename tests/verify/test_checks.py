@@ -392,8 +392,8 @@ def test_a_scene_that_asks_for_nothing_is_judged_by_no_limit_on_the_light(folder
 def test_light_that_is_unaccounted_for_fails(folder, nominal, monkeypatch):
     simulate = measure.simulate
 
-    def leaky(*arguments):
-        [found] = simulate(*arguments)
+    def leaky(*arguments, **options):
+        [found] = simulate(*arguments, **options)
         return (replace(found, flux=found.flux | {"missed the lens": found.flux["missed the lens"] - 1e-9}),)
 
     monkeypatch.setattr(measure, "simulate", leaky)
@@ -410,8 +410,8 @@ def test_rays_that_do_not_see_what_the_tubes_see_fail(folder, nominal, monkeypat
     """A third of the light moved by a pixel: the rays' figure is of another lens than the tubes'."""
     simulate = measure.simulate
 
-    def moved(*arguments):
-        [found] = simulate(*arguments)
+    def moved(*arguments, **options):
+        [found] = simulate(*arguments, **options)
         return (replace(found, box=found.box + 0.33 * (found.box.roll(1, 0) - found.box)),)
 
     effort = replace(FEW, rays=512)
@@ -424,9 +424,9 @@ def test_the_rays_are_none_that_tailoring_saw(folder, nominal, monkeypatch):
     """Each set has a seed of its own; stages 1 and 2 use seed and seed + 1."""
     seeds, simulate = [], measure.simulate
 
-    def heard(lights, *rest):
+    def heard(lights, *rest, **options):
         seeds.extend(seed for *_, seed in lights)
-        return simulate(lights, *rest)
+        return simulate(lights, *rest, **options)
 
     monkeypatch.setattr(measure, "simulate", heard)
     checks.verify(folder, nominal)
