@@ -1,29 +1,38 @@
 """The insert of a mould that forms the back of a lens: python templates/mould_insert.py outputs/disk
 
 The insert is a round block with a shoulder.  On its top is the negative of the freeform face, enlarged by the shrinkage
-of the plastic.
+of the plastic: that of [moulding] in the scene, or else 0.5 % of the cavity in every direction.  `bstcad export --as
+cavity` writes the whole cavity.
 """
 
 import sys
-from dataclasses import replace
 
 import cadquery as cq
 
 import bstcad
+from bstcad.scene.moulding import Moulding
 
 design = bstcad.open(sys.argv[1] if len(sys.argv) > 1 else "outputs/disk")
-shrinkage = 0.005  # relative shrinkage of PMMA in every direction
+moulding = design.scene.moulding or Moulding(shrinkage=0.005)
+x, y, z = moulding.factors  # cavity / part along each axis
 below, shoulder = 12.0, 4.0  # mm; heights of the block below the face, and of its wider foot
 
 # (x, y, z) -> (x, -y, -z) rotates the lens by 180 degrees about x, so that the steel is below the face.
 back, outline = design.lens.back, design.lens.outline
-net = (1 + shrinkage) * back.control_points()[:, ::-1] * (1, -1, -1)
+net = back.control_points()[:, ::-1] * (x, -y, -z)
 face = bstcad.BSplineSurface.from_control_points(net)
-larger = {key: (1 + shrinkage) * value for key, value in vars(outline).items() if key != "shape"}
+if x == y:
+    rim = outline.scaled(x)
+elif type(outline) is bstcad.Rectangle:
+    rim = bstcad.Rectangle(x * outline.width, y * outline.height)
+else:
+    sys.exit(
+        "moulding.shrinkage: a round rim needs one shrinkage along x and y; cut the block with cavity.step instead"
+    )
 lowest = net[..., 2].min() - below
-insert = bstcad.Lens(bstcad.Plane(lowest), face, replace(outline, **larger), design.lens.index)
+insert = bstcad.Lens(bstcad.Plane(lowest), face, rim, design.lens.index)
 
-reach = max(outline.half_extent) * 1.5  # mm
+reach = max(rim.half_extent) * 1.5  # mm
 foot = cq.Workplane("XY", origin=(0, 0, lowest)).circle(reach + 6).extrude(shoulder)
 block = foot.faces(">Z").workplane().circle(reach + 2).extrude(below - 2 - shoulder)
 part = bstcad.mounted(block, [(insert, (0, 0))])

@@ -1,4 +1,4 @@
-"""Read clouds of measured points from text (point_text.py) and from PLY and STL files (point_mesh.py)."""
+"""Read clouds of measured points: text (point_text.py), PLY and STL (point_mesh.py), height maps (point_grid.py)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bstcad.measured import point_grid
 from bstcad.measured.point_mesh import read_mesh
 from bstcad.measured.point_text import INCH, INPUT_HINT, MeasuredPoints, read_text
 from bstcad.optics.outlines import Outline
@@ -52,7 +53,15 @@ def _read(path: Path) -> tuple[MeasuredPoints, bytes]:
     if not data.strip():
         raise ValueError(f"is empty; {INPUT_HINT}")
     ending = path.suffix.lower()
-    measured = read_mesh(data, ending) if ending in MESH_SUFFIXES else read_text(data)
+    if name := point_grid.grid_format(data):
+        measured = point_grid.read_grid(data, name)
+    elif ending in point_grid.ENDINGS:
+        known = ", ".join(dict.fromkeys(name for _, _, name in point_grid.FORMATS))
+        raise ValueError(
+            f"its name ends in {ending}, but it begins like none of the formats {known}; export the file again"
+        )
+    else:
+        measured = read_mesh(data, ending) if ending in MESH_SUFFIXES else read_text(data)
     if len(measured.positions) < MIN_CLOUD_POINTS:
         without = f" and {measured.without_data} without data" if measured.without_data else ""
         raise ValueError(

@@ -31,10 +31,7 @@ NOMINAL_WORDS = {"nom", "nominal", "soll", "sollwert", "theo", "theoretical", "c
 HEADING_LINES = 50  # number of lines that are searched for a heading
 SAMPLE_LINES = 200  # number of lines from which the columns are inferred if there is no heading
 MAX_POSITION = 1e6  # largest accepted coordinate (mm); a larger one is an error of the file
-FOREIGN_FORMATS = {  # names of formats that are not read, by a file's first bytes
-    b"PK\x03\x04": "a zip archive, such as X3P", b"aISO-": "an SDF file (ISO 25178-71)", b"bISO-": "an SDF file (ISO "
-    "25178-71)", b"VCA DATA": "an OPD file of an interferometer", b"\x89HDF": "an HDF5 file, such as DATX",
-}  # fmt: skip
+COMPRESSED_SUR = b"DSCOMPRESSED"  # first bytes of a compressed file of MountainsMap
 # Pattern of a field that marks missing data, as an empty field does.
 NO_DATA = (
     r"[+-]?nan(?:\(\w*\))?|[+-]?1\.#(?:qnan|ind|snan)0*|no[ _]?data|bad|invalid|missing|masked|null|none|n/?a"
@@ -102,8 +99,9 @@ def _read_zygo(every: list[tuple[int, str]]) -> MeasuredPoints:
     """Read points from the numbered lines of a Zygo XYZ file: pixel column, pixel row and height in µm.
 
     MetroPro Reference Guide, ASCII data file format: the seventh number of line 8 is the width of a pixel in metres,
-    0 if the lateral scale was not calibrated.  Points are listed between two lines "#".  Rows are counted from the top;
-    if an instrument counts them from the bottom, the alignment reports that y is reversed.
+    0 if the lateral scale was not calibrated.  Points are listed between two lines "#".  Zero is put in the middle of
+    the listed pixels.  Rows are counted from the top; if an instrument counts them from the bottom, the alignment
+    reports that y is reversed.
     """
     marks = [place for place, (_, line) in enumerate(every) if line == "#"]
     if "xyz" not in every[0][1].lower() or not marks:
@@ -121,15 +119,15 @@ def _read_zygo(every: list[tuple[int, str]]) -> MeasuredPoints:
         raise ValueError(f"contains no points; {INPUT_HINT}")
     width = 1e3 * pixel
     positions = _table(lines, _Layout(None, False), (0, 1, 2)) * [width, -width, 1e-3]
+    positions[:, :2] -= (np.nanmin(positions[:, :2], axis=0) + np.nanmax(positions[:, :2], axis=0)) / 2
     columns = f"x (pixels of {width:.4g} mm), y (rows of pixels from the top) and z (\u00b5m)"
     return make_points(positions, [number for number, _ in lines], columns)
 
 
 def decode_text(data: bytes) -> str:
     """Decode UTF-8, UTF-16 or Windows-1252; raise ValueError if the bytes are not text."""
-    for start, what in FOREIGN_FORMATS.items():
-        if data.startswith(start):
-            raise ValueError(f"is {what}; {INPUT_HINT}, as text, PLY or STL")
+    if data.startswith(COMPRESSED_SUR):
+        raise ValueError("is a compressed SUR file; save it without compression, or as X3P")
     encoding, sample = "utf-8-sig", data[:400]
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         encoding = "utf-16"

@@ -39,7 +39,8 @@ WRONG = {
     "decimal commas": ("x,y,z\n" + lines(GOOD, ",").replace(".", ","), "line 2 has 6 fields, but its heading"),
     "nominal alone": ("X_nom,Y_nom,Z_nom\n" + lines(GOOD, ","), "its heading, 'X_nom,Y_nom,Z_nom', names nominal"),
     "pixels": ("Zygo XYZ Data File - Format 2\n#\n0 0 No Data\n0 1 16025.3\n#", "header states no width of a pixel"),
-    "a zip archive": (b"PK\x03\x04" + bytes(50), "is a zip archive, such as X3P"),
+    "another zip archive": (b"PK\x03\x04" + bytes(50), "is not a readable X3P file (File is not a zip file)"),
+    "a compressed SUR": (b"DSCOMPRESSED" + bytes(50), "is a compressed SUR file; save it without compression"),
     "half of UTF-16": ("x,y,z\n".encode("utf-16") + b"1", "is not text in UTF-16"),
     "more columns": (lines(np.hstack([GOOD, GOOD]), ","), "has 6 columns, but no heading names x, y and z"),
     "x twice": ("x,y,z,x\n" + lines(GOOD[:, [0, 1, 2, 0]], ","), "names x, y or z twice"),
@@ -132,8 +133,8 @@ def test_a_zygo_file_is_read_in_its_pixels_from_the_top(tmp_path):
     found = clouds.load(tmp_path / "a.xyz", ROUND)
     assert found.without_data == 1 and len(found.points) == 81 * 61 - 1 and "0.1 mm" in found.columns
     across, up, height = found.points.T
-    assert (across.max(), up.min(), up.max()) == (pytest.approx(8.0), pytest.approx(-6.0), 0.0)
-    assert height == pytest.approx(0.01 * across**2 + 0.02 * up, abs=1e-8)
+    assert (across.max(), up.min(), up.max()) == (pytest.approx(4.0), pytest.approx(-3.0), pytest.approx(3.0))
+    assert height == pytest.approx(0.01 * (across + 4) ** 2 + 0.02 * (up - 3), abs=1e-8)
 
 
 def test_a_cloud_without_a_unit_as_large_as_the_lens_in_inches_is_in_inches(tmp_path):

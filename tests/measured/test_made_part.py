@@ -16,6 +16,7 @@ from bstcad.commands import ProofOptions
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.measured.alignment import BackFace, align, first_pose
+from bstcad.measured.shrinkage import axis_scales
 from bstcad.optics.measure import measure
 from bstcad.report.figure_jobs import NoPictures
 from bstcad.verify import checks
@@ -111,8 +112,11 @@ def half(points):
 
 
 FAULTS = {  # a cloud of a lens, the check that fails, words of its sentence
-    "swapped axes": (lambda lens: as_designed(lens)[:, [1, 0, 2]], "made-axes", "x is y, y is x"),
-    "a flipped face": (lambda lens: as_designed(lens) * [1, 1, -1], "made-axes", "z is -z"),
+    "swapped axes of a flipped face": (
+        lambda lens: as_designed(lens)[:, [1, 0, 2]] * [1, 1, -1],
+        "made-axes",
+        "x is y, y is x, z is -z",
+    ),
     "a scale of 1.001": (lambda lens: 1.001 * as_designed(lens), "made-scale", ""),
     "half a face": (lambda lens: half(as_designed(lens)), "made-covered", ""),
     "another lens": (lambda lens: cloud(with_form_error(lens, 0.05, 1.5), 5000), "made-distance", ""),
@@ -126,6 +130,27 @@ def test_a_fault_is_named(nominal, same_light, fault):
     assert not part.facts["passed"] and words in failed(part)[check]
     if fault not in ("half a face", "another lens"):
         assert part.facts["scale"] == pytest.approx(1.001 if "scale" in fault else 1.0, abs=5e-5)
+
+
+def test_the_scale_along_each_axis_is_found_where_the_relief_determines_it(nominal):
+    """A plane determines none of them."""
+    lens = with_form_error(nominal.lens, 0.02, 0.7)
+    face, true = BackFace.of(lens), np.array([1.001, 0.9995, 1.004])
+    found = (points(lens, 8000) - face.pivot) * true + face.pivot + np.random.default_rng(6).normal(0, 1e-5, (8000, 3))
+    fitted = axis_scales(face, align(face, found, first_pose(face, found)[0]))
+    assert np.array(fitted.scales) == pytest.approx(true, abs=1e-4)
+    assert max(fitted.uncertainties) < 1e-4
+    flat = replace(lens, back=replace(lens.back, heights=torch.zeros_like(lens.back.heights)))
+    face, found = BackFace.of(flat), points(flat, 3000)
+    facts = axis_scales(face, align(face, found, first_pose(face, found)[0])).facts()
+    assert facts["scale_xyz"] == [None, None, None] == facts["scale_xyz_uncertainty"]
+
+
+def test_a_part_of_a_mould_states_the_shrinkage_that_it_had(nominal, same_light):
+    """The small scene assumes 0.5 % of the cavity; the part is larger by a thousandth, so it shrank less."""
+    part = judged(1.001 * as_designed(nominal.lens), nominal)
+    [found] = part.facts["moulding_shrinkage"]
+    assert found == pytest.approx(1 - 0.995 * 1.001, abs=5e-5)
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +219,7 @@ def test_many_parts_of_one_design_are_judged_beside_it(small_design, nominal, tm
     assert cli.run(["verify", str(folder), "--measured", str(given), "-o", str(place)]) == 0
     out, page = capsys.readouterr().out, (place / "report.html").read_text()
     assert f"Files: {place}" in out and "values, X act, Y act, Z act; 100 points without data left out" in out
-    assert "columns of measured values X act, Y act, Z act; left out: 100 without data" in " ".join(page.split())
+    assert "measured values X act, Y act, Z act; left out: 100 without data" in " ".join(page.split())
     report = bstcad.open(folder).verify(measured=given, folder=place, progress=False)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
     written = json.loads((place / "report.json").read_text())

@@ -41,9 +41,13 @@ def figures(lens, found):
     return deviation(lens, placed, fit_form_error(face, placed)), placed
 
 
+@pytest.fixture(scope="module")
+def wanted(nominal, clean):
+    return figures(nominal.lens, clean)[0]
+
+
 @pytest.mark.parametrize(("share", "sides"), [(0.001, DUST), (0.05, SLIPS)], ids=["dust", "slips"])
-def test_the_form_is_that_without_outliers(nominal, clean, share, sides):
-    wanted, _ = figures(nominal.lens, clean)
+def test_the_form_is_that_without_outliers(nominal, clean, wanted, share, sides):
     given, off = dirty(clean, share, sides)
     found, placed = figures(nominal.lens, given)
     assert found.form_rms == pytest.approx(wanted.form_rms, rel=0.01)
@@ -51,11 +55,8 @@ def test_the_form_is_that_without_outliers(nominal, clean, share, sides):
     assert found.pv <= 1.01 * wanted.pv and off.sum() - len(placed.outliers) <= 0.02 * off.sum() + 1  # the rim's
 
 
-def test_outliers_of_one_height_or_within_the_noise_change_the_form_little(nominal, clean):
-    wanted, alike, small = (
-        figures(nominal.lens, given)[0]
-        for given in (clean, *(dirty(clean, 0.05, DUST, heights)[0] for heights in ("alike", "small")))
-    )
+def test_outliers_of_one_height_or_within_the_noise_change_the_form_little(nominal, clean, wanted):
+    alike, small = (figures(nominal.lens, dirty(clean, 0.05, DUST, heights)[0])[0] for heights in ("alike", "small"))
     assert alike.form_rms == pytest.approx(wanted.form_rms, rel=0.05) == small.form_rms
 
 

@@ -1,0 +1,223 @@
+"""Files of gauges: each format is read back with the truth it was written from, and each fault is one sentence."""
+
+import io
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+import x3pio
+from scipy.spatial import cKDTree
+
+from bstcad import folder as folders
+from bstcad.measured import cloud as clouds
+from bstcad.measured import made_part, point_grid
+from bstcad.measured.alignment import BackFace
+from bstcad.optics.outlines import Circle
+from bstcad.optics.surfaces import sag
+from tests.measured import gauge_files
+from tests.measured.gauge_files import BY_SURFACE_TOPOGRAPHY, WRITERS, grid_points
+from tests.measured.synthetic import with_form_error
+
+PITCH = 0.1  # mm; a map of the small lens of 8 mm x 6 mm then has 81 x 61 points, nearly 5 000
+ROUND = Circle(4.0)
+MAPS = ("x3p", "sdf", "text.sdf", *BY_SURFACE_TOPOGRAPHY)
+
+
+@pytest.fixture(scope="module")
+def lens(small_design):
+    """The small lens with a relief that has no symmetry: its own light is a disc."""
+    return with_form_error(folders.read_nominal(small_design.folder)[1].lens, 0.01, 1.0)
+
+
+@pytest.fixture(scope="module")
+def heights(lens):
+    """Heights (rows y, columns x) of the back, mm."""
+    x, y = np.meshgrid(np.linspace(-4, 4, 81), np.linspace(-3, 3, 61))
+    return sag(lens.back, x.ravel(), y.ravel()).reshape(x.shape)
+
+
+def with_gaps(heights):
+    return np.where(np.random.default_rng(1).random(heights.shape) < 0.3, np.nan, heights)
+
+
+# A fault of a file: the height map with it, its pitch / PITCH, the checks that fail, and words of the sentence.
+FAULTS = {
+    "none": (lambda heights: heights, 1, [], ""),
+    "30 % missing": (with_gaps, 1, [], ""),
+    "mirrored": (lambda heights: heights[::-1], 1, ["made-axes"], "y is -y"),
+    "turned by 90 degrees": (lambda heights: np.rot90(heights), 1, ["made-axes"], "x is -y, y is x"),
+    "mm as metres": (lambda heights: 1e3 * heights, 1e3, None, "its points seem to be in micrometres"),
+    "mm as inches": (lambda heights: heights / 25.4, 1 / 25.4, ["made-unit"], "inches"),
+}
+
+
+def written(form, *given):
+    """The bytes of a file; the test is skipped without the package that reads its format."""
+    if form in BY_SURFACE_TOPOGRAPHY:
+        pytest.importorskip("SurfaceTopography")
+    return WRITERS[form](*given)
+
+
+def loaded(folder, form, data, outline=ROUND):
+    path = folder / f"cloud.{form}"
+    path.write_bytes(data)
+    return clouds.load(path, outline)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("form", WRITERS)
+def test_a_file_is_read_back_with_its_truth(tmp_path, lens, heights, form, fault):
+    """A cloud that reads as the truth has the truth's checks, which the next test names."""
+    change, scale, checks, words = FAULTS[fault]
+    truth, pitch = change(heights), scale * PITCH
+    data = written(form, truth, pitch)
+    if checks is None:
+        with pytest.raises(ValueError, match=words) as error:
+            loaded(tmp_path, form, data, lens.outline)
+        assert "\n" not in str(error.value)
+        return
+    found, known = loaded(tmp_path, form, data, lens.outline), grid_points(truth, pitch)
+    measured = known[~np.isnan(known[:, 2])]
+    assert found.unit == ("inches" if "made-unit" in checks else "mm")
+    assert len(found.points) == len(measured) and found.without_data == np.isnan(truth).sum() * (
+        3 if form == "stl" else 1
+    )
+    mm = 25.4 if found.unit == "inches" else 1.0
+    distance, which = cKDTree(measured * mm).query(found.points)
+    assert distance.max() < 3e-6 * mm and len(set(which)) == len(measured)  # half a step of float32 at 25 mm is 1e-6 mm
+
+
+@pytest.mark.parametrize("fault", [fault for fault, (*_, checks, _) in FAULTS.items() if checks is not None])
+def test_a_fault_of_a_height_map_is_said(tmp_path, lens, heights, fault):
+    change, scale, checks, words = FAULTS[fault]
+    coarse = change(heights[::2, ::2])
+    found = loaded(tmp_path, "x3p", WRITERS["x3p"](coarse, 2 * scale * PITCH), lens.outline)
+    _, made = made_part.aligned(found, BackFace.of(lens), 0.01)
+    failed = {check.id: check.where for check in made if not check.passed}
+    assert list(failed) == checks and words in "".join(failed.values())
+
+
+# ---- origin, unit and kind ------------------------------------------------------------------------------------------
+
+
+def map_of(count=20):
+    return np.random.default_rng(2).normal(0, 0.1, (count, count))
+
+
+def test_a_stated_origin_is_kept_and_a_point_cloud_is_read(tmp_path):
+    """Without an origin, the middle of the map is zero."""
+    heights, stream = map_of(), io.BytesIO()
+    place = x3pio.Placement.translation(1e-3, -2e-3, 5e-3)
+    options = {"placement": place, "coordinate_system": x3pio.CoordinateSystem.VIEW}
+    x3pio.write(stream, 1e-3 * heights, x_scale=3e-4, y_scale=4e-4, **options)
+    found = loaded(tmp_path, "x3p", stream.getvalue()).points
+    assert found[0] == pytest.approx([1.0, -2.0, 5.0 + heights[0, 0]])
+    assert found[-1] == pytest.approx([1.0 + 19 * 0.3, -2.0 + 19 * 0.4, 5.0 + heights[-1, -1]])
+    stream = io.BytesIO()
+    x3pio.write_points(stream, 1e-3 * found)
+    assert loaded(tmp_path, "x3p", stream.getvalue()).points == pytest.approx(found)
+    middle = loaded(tmp_path, "sdf", WRITERS["sdf"](heights, 0.3))
+    assert middle.points[:, :2].min(0) == pytest.approx([-2.85, -2.85]) == -middle.points[:, :2].max(0)
+    assert middle.columns == "map of 20 x 20 points, 0.3 mm x 0.3 mm apart"
+
+
+def test_the_format_is_known_by_the_contents(tmp_path):
+    heights = map_of()
+    for form in ("x3p", "sdf", "text.sdf"):
+        assert len(loaded(tmp_path, "csv", WRITERS[form](heights, 0.3)).points) == 400
+    for ending in point_grid.ENDINGS:
+        with pytest.raises(
+            ValueError, match=f"its name ends in {ending}, but it begins like none of the formats X3P, SD"
+        ):
+            loaded(tmp_path, ending[1:], b"1,2,3\n" * 200)
+
+
+def test_a_missing_package_is_named_with_its_command(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "SurfaceTopography.IO", None)
+    for form in ("opd", "sur", "opdx"):
+        with pytest.raises(ValueError, match=r"pip install 'bstcad\[metrology\]'") as error:
+            loaded(tmp_path, form, WRITERS[form](map_of(), 0.3))
+        assert "SurfaceTopography" in str(error.value) and "\n" not in str(error.value)
+
+
+# ---- damaged files ---------------------------------------------------------------------------------------------------
+
+
+def claimed(form):
+    """A small file whose header declares about 10^9 points."""
+    heights, n = map_of(), 31_623
+    if form == "datx":
+        return gauge_files.datx(heights, 0.3, (n, n))
+    data = WRITERS[form](heights, 0.3)
+    if form == "x3p":
+        stream = io.BytesIO()
+        with zipfile.ZipFile(io.BytesIO(data)) as given, zipfile.ZipFile(stream, "w") as archive:
+            for name in given.namelist():
+                content = given.read(name)
+                archive.writestr(name, content if name != "main.xml" else enlarged(content, n))
+        return stream.getvalue()
+    count, large = (20).to_bytes(4, "little"), n.to_bytes(4, "little")
+    if form == "sdf":
+        return data.replace(count * 2, large * 2, 1)
+    if form == "text.sdf":
+        return data.replace(b"= 20", f"= {n}".encode())
+    if form == "opd":
+        return data.replace((20).to_bytes(2, "little") * 2, n.to_bytes(2, "little") * 2, 1)
+    if form == "sur":
+        return data.replace(count * 2 + (400).to_bytes(4, "little"), large * 2 + (n * n).to_bytes(4, "little"), 1)
+    return data.replace(count, large)
+
+
+def enlarged(main, n):
+    for axis in (b"X", b"Y"):
+        main = main.replace(b"<Size" + axis + b">20<", b"<Size" + axis + b">%d<" % n)
+    return main
+
+
+def one_sentence(folder, form, data):
+    """The error of a file, without a huge memory; None if it is read."""
+    tracemalloc.start()
+    try:
+        loaded(folder, form, data)
+        return None
+    except ValueError as error:
+        assert "\n" not in str(error) and len(str(error)) < 600
+        return str(error)
+    finally:
+        assert tracemalloc.get_traced_memory()[1] < 2e7
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("form", MAPS)
+def test_a_damaged_file_is_one_sentence_without_a_huge_memory(tmp_path, form):
+    heights, random = map_of(), np.random.default_rng(3)
+    data = written(form, heights, 0.3)
+    assert one_sentence(tmp_path, form, data) is None  # imports the packages, too
+    assert claimed(form) != data
+    assert "export" in one_sentence(tmp_path, form, claimed(form))
+    for share in (0.01, 0.3, 0.9):
+        assert one_sentence(tmp_path, form, data[: int(share * len(data))])
+    for _ in range(20):
+        spoilt = bytearray(data)
+        spoilt[random.integers(len(data))] ^= int(random.integers(1, 256))
+        one_sentence(tmp_path, form, bytes(spoilt))
+
+
+def test_a_profile_a_layer_too_many_and_a_bomb_are_refused(tmp_path):
+    stream = io.BytesIO()
+    x3pio.write(stream, np.zeros(500), x_scale=1e-5)
+    assert "has a profile of 500 points; measure the area" in one_sentence(tmp_path, "x3p", stream.getvalue())
+    stream = io.BytesIO()
+    x3pio.write(stream, np.zeros((2, 20, 20)), x_scale=1e-4, y_scale=1e-4)
+    assert "has 2 layers; export only the layer" in one_sentence(tmp_path, "x3p", stream.getvalue())
+    assert "has a profile of 400 points" in one_sentence(tmp_path, "sdf", WRITERS["sdf"](map_of().reshape(1, 400), 0.3))
+    bomb = bytearray(WRITERS["x3p"](map_of(), 0.3))
+    entry = bomb.index(b"PK\x01\x02")  # of main.xml in the directory of the archive
+    bomb[entry + 24 : entry + 28] = (4 * 10**9).to_bytes(4, "little")
+    assert "bytes after decompression, and 1000000000 are possible" in one_sentence(tmp_path, "x3p", bytes(bomb))
+
+
+def test_other_files_are_no_height_maps():
+    assert point_grid.grid_format(b"x,y,z") == "" and point_grid.grid_format(b"") == ""
+    assert {name for *_, name in point_grid.FORMATS} == {"X3P", "SDF", "DATX", "OPDx", "OPD", "SUR"}
