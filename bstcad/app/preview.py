@@ -31,6 +31,7 @@ from bstcad.scene.scene import Scene
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Hooks, Progress
 from bstcad.tailoring.source_image import ExtendedSource
+from bstcad.tolerance.as_made import AsMade, as_made
 
 COARSE_NET = 33  # control points per side in the first rounds of stage 1
 TRANSPORT_CELLS = 48  # cells per side of the transport map
@@ -82,6 +83,12 @@ class Preview:
     def rrmsds(self) -> tuple[float, ...]:
         """RRMSD on each target, on the pixels of the preview."""
         return tuple(rrmsd(target, picture) for target, picture in self.pictures)
+
+    def as_made(self, grade: str | None = None, layer_height: float | None = None) -> AsMade:
+        """Return the pictures of the lens as made by a grade (None: that of the scene); see tolerance.as_made."""
+        pairs = zip(self.scene.goals, self.pictures, strict=True)
+        goals = [replace(goal, picture=target) for goal, (target, _) in pairs]
+        return as_made(self.scene, self.lens, goals, grade=grade, layer_height=layer_height)
 
 
 def preview(scene: Scene, size: PreviewSize = QUICK, outdated: Callable[[], bool] = lambda: False) -> Preview:

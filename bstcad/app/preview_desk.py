@@ -1,7 +1,8 @@
 """The thread that makes previews.  Quick previews come first; slower answers follow if no page waits for a quick one.
 
 A request of a page replaces the page's earlier request, whose work ends at the next step.  The answers come in the
-order of STAGES: a quick preview, a refined preview, the effects that are left out, and predictions for each quality.
+order of STAGES: a quick preview, a refined preview, the picture of the part as made, the effects that are left out, and
+predictions for each quality.
 There is one thread, since two simultaneous previews on two cores would each take twice as long.
 """
 
@@ -16,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bstcad.app.preview import QUICK, REFINED, Outdated, preview
+from bstcad.app.preview import QUICK, REFINED, Outdated, Preview, preview
 from bstcad.runs import processes
 from bstcad.scene.new_scene import Plate
 from bstcad.scene.scene import Scene, of_text
@@ -24,7 +25,7 @@ from bstcad.scene.scene_file import tables
 from bstcad.sweep.net_choice import with_net
 from bstcad.sweep.plan import plan
 
-STAGES = ("preview", "settled", "effects", "predicted")  # names of the answers to a request, in their order
+STAGES = ("preview", "settled", "made", "effects", "predicted")  # names of the answers to a request, in their order
 MAX_PAGES = 32  # largest number of pages with a stored request
 IDLE_DELAY = 0.7  # pause (s) between the first preview of a request and its other answers, in case another change comes
 JOIN_TIMEOUT = 0.5  # time (s) that `end` waits for the thread
@@ -39,6 +40,7 @@ class PreviewRequest:
     number: int  # number of the request; later requests of a page have larger numbers
     scene: Scene
     text: str = ""  # text of the scene file, to whose lines a plan refers
+    grade: str | None = None  # grade of the picture as made; None: no such picture
     answers: list[tuple[str, Any]] = field(default_factory=list)  # (stage, answer or the Exception that prevented it)
     replaced: bool = False  # True once a later request of the page has come
     preview_time: float = math.inf  # time at which the first preview was ready (time.monotonic)
@@ -151,6 +153,7 @@ class PreviewDesk:
     def _make(self, request: PreviewRequest, stage: str) -> Any:
         """Return the answer of a stage: a preview, or entries of `plan --json` (for "effects", with the chosen `net`).
 
+        "made" gives a pair (preview, its picture as made), or None without a grade.
         Outdated once the request is replaced or another one has fewer answers.
         """
 
@@ -164,6 +167,12 @@ class PreviewDesk:
 
         if stage in ("preview", "settled"):
             return preview(request.scene, QUICK if stage == "preview" else REFINED, outdated)
+        if stage == "made":
+            if request.grade is None:
+                return None
+            tick()
+            finer = next(found for _, found in reversed(request.answers) if isinstance(found, Preview))
+            return finer, finer.as_made(request.grade)
         effects = None
         if request.plan is None:
             tick()

@@ -11,8 +11,10 @@ from bstcad.report.figure_jobs import light_path_of
 from bstcad.report.light_figures import View
 from bstcad.report.record import LEFT_OUT, LeftOut, changes
 from bstcad.report.rendering import data_url, turnable
+from bstcad.report.report import made_sentences
 from bstcad.report.units import Rows, duration, number, quantity, tables
 from bstcad.sweep.prediction import Interval
+from bstcad.tolerance.as_made import AsMade
 
 SOLID_CELLS = 96  # cells per side of the mesh of the solid on the page
 # Error of the preview's thicknesses and relief, as a fraction of the relief.  The largest differences from finished
@@ -37,6 +39,17 @@ def of_preview(found: Preview) -> dict[str, Any]:
     solid = json.loads(turnable(found.lens, path, cells=SOLID_CELLS) or "null")
     head = {"seconds": round(found.seconds, 3), "targets": targets, "figures": figures(found)}
     return head | {"remarks": list(found.remarks), "solid": solid}
+
+
+def of_made(found: Preview, made: AsMade) -> dict[str, Any]:
+    """Return the pictures on each target as designed and as made, and the sentences on them."""
+    targets = []
+    for k, goal in enumerate(made.goals):
+        view = View.of(found.scene, k)
+        tones = {"designed": view.tones(goal.designed, goal.target), "made": view.tones(goal.made, goal.target)}
+        pictures = {name: data_url(view.picture(each)) for name, each in tones.items()}
+        targets.append(pictures | {"key": goal.key, "rrmsds": [number(value) for value in goal.rrmsds]})
+    return {"targets": targets, "words": made.words, "sentences": made_sentences(made.facts(), found.scene.optic)}
 
 
 def figures(found: Preview) -> Rows:

@@ -129,6 +129,11 @@ class Hit:
 def cross(rays: Rays, interface: Interface) -> Hit:
     """Trace rays to an interface and through it: refract or reflect rays that meet it inside the outline."""
     at, normal = intersect(interface.surface, rays, interface.outline, interface.status_if_missed)
+    return leave(rays, interface, at, normal)
+
+
+def leave(rays: Rays, interface: Interface, at: Rays, normal: Normal) -> Hit:
+    """Refract or reflect rays at an interface, with its losses.  at, normal: see `intersect`; rays: those before it."""
     hit = deflect(at, normal, interface.law, level=interface.surface.level)
     if not interface.losses:
         return hit

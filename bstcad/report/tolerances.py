@@ -45,8 +45,13 @@ Disagreement = TypedDict("Disagreement", {"median": Size, "95 %": Size})  # rela
 class Grade:
     """Grade of manufacture that gives the default widths of the errors."""
 
-    name: str  # "moulded", "diamond-turned" or "precise"; "none": only errors that the scene names
+    name: str  # name of the grade, such as "moulded"; "none": only errors that the scene names
     words: str  # description of the grade
+
+    @property
+    def has_finish(self) -> bool:
+        """True for a grade of a maker, whose layers or roughness change the picture."""
+        return self.name.startswith(("milled", "resin"))
 
 
 @dataclass(frozen=True)

@@ -1,20 +1,27 @@
-"""Limits of all errors, from three grades of manufacture and alignment and from the [[tolerance]] tables.
+"""Limits of all errors, from the grades of manufacture and alignment and from the [[tolerance]] tables.
 
-The grades are round numbers of the magnitude that manufacturers state for moulded plastic, diamond-turned and precision
-optics of some 20 mm.  They follow no standard and no particular manufacturer; replace them with your own limits.
+The first three grades are round numbers of the magnitude that manufacturers state for moulded plastic, diamond-turned
+and precision optics of some 20 mm.  The other four are those of a maker with a router or a resin printer, for plates of
+some 100 mm.  They follow no standard and no particular manufacturer; replace them with your own limits.
+
+Sources of the roughness Ra: moulded lenses and lenses printed by inkjet have less than 20 nm (PMC5724772).  Prints have
+tens of µm before a coat of resin and a few nm after it (Vaidya and Solgaard 2018, Microsyst. Nanoeng. 4, 18).  Most of
+it is that of the steps, which `layer_height` describes, and not that between the steps.  The other values are orders of
+magnitude: PMMA polished (20 nm) and sanded with 2000 grit (0.2 µm), correlation and smoothing lengths, form.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from bstcad.optics import domes
+from bstcad.optics.finish import Finish
 from bstcad.optics.lens import Lens
 from bstcad.scene.errors import SceneError
-from bstcad.scene.quality import FORM, NONE, RIPPLE, TWO_FACE_ERRORS, Tolerance, settings_of
+from bstcad.scene.quality import FINISH_KEYS, FORM, NONE, RIPPLE, TWO_FACE_ERRORS, Tolerance, settings_of
 from bstcad.tolerance.perturbations import Kind, Perturbation, Setup, form_error, kinds, ripple
 
 DEFAULT_GRADE: Final = "diamond-turned"
@@ -40,22 +47,45 @@ class ToleranceGrade:
     form_length: float  # correlation length of the form error / smaller of width and height of the lens
     ripple: float  # ripple, mm RMS
     period: float  # period of the ripple, mm
+    finish: Finish  # layers, smoothing and roughness; its tool marks are ripple and period
 
 
+# Limits of a part that is mounted by hand in the light of the sun, in the units of ToleranceGrade.
+HOBBY: Final = {
+    "decentre": 0.5, "tilt": 0.5, "screen": 5e-3, "thickness": 0.1, "front_power": 0.02, "temperature": 15.0,
+    "wavelength": 10.0, "source": 0.05, "form_length": 0.15,
+}  # fmt: skip
 GRADES = {
     "moulded": ToleranceGrade(
         "moulded plastic", decentre=0.05, tilt=0.1, screen=1e-3, thickness=0.05, index=5e-4, front_power=2e-3,
         scale=1e-3, temperature=10.0, wavelength=5.0, source=0.05, form=5e-4, form_length=0.15, ripple=2e-5, period=1.0,
+        finish=Finish(roughness=10.0),
     ),
     "diamond-turned": ToleranceGrade(
         "diamond-turned, screwed together", decentre=0.02, tilt=0.03, screen=3e-4, thickness=0.02, index=2e-4,
         front_power=3e-4, scale=1e-4, temperature=3.0, wavelength=2.0, source=0.02, form=1e-4, form_length=0.15,
-        ripple=5e-6, period=0.5,
+        ripple=5e-6, period=0.5, finish=Finish(roughness=5.0),
     ),
     "precise": ToleranceGrade(
         "precise, aligned when mounted", decentre=0.005, tilt=0.005, screen=1e-4, thickness=0.005, index=5e-5,
         front_power=5e-5, scale=2e-5, temperature=1.0, wavelength=0.5, source=0.005, form=3e-5, form_length=0.15,
-        ripple=2e-6, period=0.5,
+        ripple=2e-6, period=0.5, finish=Finish(roughness=2.0),
+    ),
+    "milled-polished": ToleranceGrade(
+        "milled by a router, sanded and polished", **HOBBY, index=5e-4, scale=5e-4, form=1e-2, ripple=1e-4, period=0.5,
+        finish=Finish(roughness=20.0, roughness_length=0.05, smoothing_length=0.2),
+    ),
+    "milled-sanded": ToleranceGrade(
+        "milled by a router and sanded", **HOBBY, index=5e-4, scale=5e-4, form=1e-2, ripple=3e-4, period=0.5,
+        finish=Finish(roughness=200.0, roughness_length=0.02, smoothing_length=0.1),
+    ),
+    "resin-printed": ToleranceGrade(
+        "printed in resin", **HOBBY, index=5e-3, scale=3e-3, form=2e-2, ripple=1e-5, period=1.0,
+        finish=Finish(roughness=100.0, roughness_length=0.02, layer_height=0.05, smoothing_length=0.05),
+    ),
+    "resin-printed-coated": ToleranceGrade(
+        "printed in resin, with a levelling coat", **HOBBY, index=5e-3, scale=3e-3, form=2e-2, ripple=1e-5, period=1.0,
+        finish=Finish(roughness=10.0, roughness_length=0.05, layer_height=0.05, smoothing_length=0.4),
     ),
 }  # fmt: skip
 
@@ -91,6 +121,17 @@ def graded_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[
 def base_grade(table: Sequence[Tolerance]) -> str:
     """Return the grade of the errors that a `graded_table` does not name; "none" if these errors are zero."""
     return settings_of([entry for entry in table if entry.name is None], "")["grade"]
+
+
+def finish_of(table: Sequence[Tolerance]) -> Finish:
+    """Return the finish of the part by a `graded_table`: that of its general grade, changed by its general keys."""
+    values = settings_of([entry for entry in table if entry.name is None], "")
+    marks, general = settings_of(table, "back.ripple"), GRADES.get(values["grade"])
+    grade = GRADES.get(marks.get("grade", values["grade"]))  # None: no tool marks unless a table states their limit
+    finish = Finish() if general is None else general.finish
+    ripple, period = (0.0, finish.period) if grade is None else (grade.ripple, grade.period)
+    finish = replace(finish, ripple=marks.get("limit", ripple), period=marks.get("period", period))
+    return replace(finish, **{key: values[key] for key in FINISH_KEYS if key in values})
 
 
 def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None = None) -> tuple[Perturbation, ...]:

@@ -241,6 +241,10 @@ area.addEventListener("change", () => {
 });
 element("quality").addEventListener("change", ({ target }) => change({ key: "tailoring.quality", words: QUALITIES[target.value] }));
 
+element("grade").addEventListener("change", () => {
+  if (!state.error) preview();
+});
+
 // ---- the preview ----
 
 async function preview() {
@@ -250,7 +254,7 @@ async function preview() {
   element("status").textContent = "Computing a new preview …";
   let reply;
   try {
-    reply = await ask(`${at}/preview`, { page, number: mine });
+    reply = await ask(`${at}/preview`, { page, number: mine, made: element("grade").value });
     while (mine === number && !reply.replaced && !reply.stage) reply = await ask(answer(mine, 0));
   } catch (error) {
     if (mine === number) noEstimates(error.message);
@@ -260,7 +264,7 @@ async function preview() {
   show(reply);
   if (reply.refused) return;
   findImpossible(mine);
-  for (let stage = 1; stage < 4; stage++) {
+  for (let stage = 1; stage < 5; stage++) {
     do {
       reply = await ask(answer(mine, stage)).catch(() => ({ replaced: true }));
       if (mine !== number || reply.replaced) return;
@@ -282,6 +286,7 @@ async function findImpossible(mine) {
 
 function show(reply) {
   if (reply.stage === "preview" || reply.stage === "settled") showLight(reply);
+  else if (reply.stage === "made") showMade(reply.made, reply.refused);
   else showPlan(reply);
 }
 
@@ -295,8 +300,26 @@ function noEstimates(sentence) {
   status.className = "error";
   for (const part of ["figures", "remarks"]) (element(part).tBodies?.[0] ?? element(part)).replaceChildren();
   showOffer(null);
+  showMade(null);
   element("solid-figure").classList.remove("drawn");
   noPlan("");
+}
+
+// Show the light as designed beside the light as made, with the sentences on it.
+function showMade(made, refused) {
+  element("made-targets").replaceChildren(...(made?.targets ?? []).map((target) => {
+    const pair = document.createElement("div"), of = made.targets.length > 1 ? `${target.key}: ` : "";
+    pair.className = "both";
+    pair.append(figure(target.designed, `${of}Light as designed`, `${of}as designed: RRMSD ${target.rrmsds[0]}`));
+    pair.append(figure(target.made, `${of}Light as made`, `${of}${made.words}: RRMSD ${target.rrmsds[1]}`));
+    return pair;
+  }));
+  const sentences = refused ? [`No picture as made: ${refused}.`] : made?.sentences ?? [];
+  element("made-says").replaceChildren(...sentences.map((sentence) => {
+    const words = document.createElement("p");
+    words.textContent = sentence;
+    return words;
+  }));
 }
 
 function noPlan(sentence) {
