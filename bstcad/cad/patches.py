@@ -9,6 +9,7 @@ Large nets are passed to OCC and back as bytes of OCC's binary files (BinTools),
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape
 from bstcad.optics.bspline import BSplineSurface, knots, parameter
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
+from bstcad.optics.sides import MIN_SIDE
 from bstcad.optics.surfaces import Conic, Sphere
 
 PATCH_MARGIN = 1.02  # ratio of a conic patch's width to the rim's, so that the rim does not touch the patch's boundary
@@ -55,6 +57,29 @@ def _net_patch(face: BSplineSurface, outline: Outline, outward: bool) -> Patch:
     if isinstance(outline, Circle):
         _check_round(face, outline.radius)
     return Patch(bspline_surface(face.control_points(), *map(knots, face.shape)), outward, net_parameters(face))
+
+
+def part_of_net(face: BSplineSurface, x: tuple[float, float], y: tuple[float, float], outward: bool) -> Patch:
+    """Return the patch of the control points that act over a window (mm): there it is the net, to the last bit.
+
+    Clamped knots change a net in its end spans only, which are 1.5 pitches wide.  So the part begins 1.5 pitches or
+    more outside the window, or at the border of the net.  outward: see `Patch`.
+    """
+    rows, columns = (
+        _acting(*span, first=first, pitch=pitch, count=count)
+        for span, (first, _), pitch, count in zip((x, y), (face.x, face.y), face.pitch, face.shape, strict=True)
+    )
+    net = face.control_points()[rows, columns]
+    (x_low, y_low, _), (x_high, y_high, _) = net[0, 0].tolist(), net[-1, -1].tolist()
+    part = BSplineSurface(face.z, face.heights[rows, columns], (x_low, x_high), (y_low, y_high))
+    return Patch(bspline_surface(net, *map(knots, part.shape)), outward, net_parameters(part))
+
+
+def _acting(low: float, high: float, *, first: float, pitch: float, count: int) -> slice:
+    """Return the control points of one side that act from low to high (mm), MIN_SIDE or more."""
+    start = max(math.floor((low - first) / pitch - 1.5), 0)
+    end = min(max(math.ceil((high - first) / pitch + 1.5), start + MIN_SIDE - 1), count - 1)
+    return slice(max(min(start, end - MIN_SIDE + 1), 0), end + 1)
 
 
 def net_parameters(face: BSplineSurface) -> ParameterMap:

@@ -113,12 +113,12 @@ def outline_loop(outline: Outline) -> list[LoopPiece]:
         return circle(0.0, 0.0, outline.radius)
     a, b = outline.half_extent
     corners = [(-a, -b), (a, -b), (a, b), (-a, b)]
-    return [_line(p, q) for p, q in zip(corners, corners[1:] + corners[:1], strict=True)]
+    return [line(p, q) for p, q in zip(corners, corners[1:] + corners[:1], strict=True)]
 
 
 def circle(x: float, y: float, radius: float) -> list[LoopPiece]:
     """Return a circle as two halves, counterclockwise, so that no wall meets itself in a seam."""
-    return [_arc((x, y), radius, start, span=math.pi) for start in (0.0, math.pi)]
+    return [arc((x, y), radius, start, span=math.pi) for start in (0.0, math.pi)]
 
 
 def wire_loop(given: cadquery.Wire | cadquery.Edge | cadquery.Workplane) -> list[LoopPiece]:
@@ -145,14 +145,17 @@ def shape_in(given: Any) -> tuple[Any, str]:
     return values[0], type(values[0]).__name__
 
 
-def _line(start: Sequence[float], end: Sequence[float]) -> LoopPiece:
+def line(start: Sequence[float], end: Sequence[float]) -> LoopPiece:
+    """Return the straight piece between two points (x, y) (mm)."""
     p, length = np.array(start, float), math.dist(start, end)
     x, y = (np.array(end, float) - p) / length
     points, left = (lambda t: p + t[:, None] * np.array([x, y])), (lambda t: np.tile([-y, x], (len(t), 1)))
     return LoopPiece(points, left, length, straight=True)
 
 
-def _arc(centre: tuple[float, float], radius: float, start: float, *, span: float, turn: int = 1) -> LoopPiece:
+def arc(centre: tuple[float, float], radius: float, start: float, *, span: float, turn: int = 1) -> LoopPiece:
+    """Return the arc about a centre (mm) from an angle `start` over `span` (rad); turn: 1 counterclockwise, -1 not."""
+
     def outwards(t: np.ndarray) -> np.ndarray:
         angle = start + turn * t
         return np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -169,14 +172,14 @@ def _pieces(edge: cadquery.Edge) -> list[LoopPiece]:
         raise ValueError("a wire is not parallel to the plane z = 0; draw it on a Workplane('XY')")
     start, end = (curve.Value(t).Coord()[:2] for t in (first, last))
     if curve.GetType() == Kind.GeomAbs_Line:
-        pieces = [_line(start, end)]
+        pieces = [line(start, end)]
     elif curve.GetType() == Kind.GeomAbs_Circle:
         x, y, _ = curve.Circle().Location().Coord()
         turn = 1 if curve.Circle().Axis().Direction().Z() > 0 else -1
         angle, halves = math.atan2(start[1] - y, start[0] - x), math.ceil((last - first) / math.pi - 1e-9)
         span = (last - first) / halves
         starts = (angle + turn * k * span for k in range(halves))
-        pieces = [_arc((x, y), curve.Circle().Radius(), each, span=span, turn=turn) for each in starts]
+        pieces = [arc((x, y), curve.Circle().Radius(), each, span=span, turn=turn) for each in starts]
     else:
         parts = 1 if math.dist(start, end) > WIRE_TOLERANCE else 2  # two for a closed edge: no wall has a seam
         ends = np.linspace(first, last, parts + 1).tolist()
