@@ -88,7 +88,7 @@ $(READY): pyproject.toml constraints.txt
 	@$(BIN)/python -c 'import cadquery' || \
 	    { echo "A system library is missing (see above); on Debian or Ubuntu run: sudo apt install libgl1 libx11-6"; \
 	      exit 1; }
-	@echo "Compiling the kernels, once (half a minute)"
+	@echo "Compiling the kernels, once (about a minute)"
 	@$(BIN)/python -m bstcad.cli generate templates/disk.toml --quality draft --set lens.back.control_points=65 \
 	    -o $(VENV)/first-run > $(VENV)/first-run.log 2>&1; \
 	    test $$? -le 1 || { cat $(VENV)/first-run.log; exit 1; }

@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from bstcad import commands, pipeline
 from bstcad import folder as folders
 from bstcad.commands import OwnCheck, OwnSection, ProofOptions
 from bstcad.folder import Made, same_front
+from bstcad.measured.compensation import Settings as CompensationSettings
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, tubes_picture
@@ -41,9 +42,14 @@ from bstcad.runs import progress as progresses
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import MIN_ROUND_POINTS
 from bstcad.scene.scene import Scene, load
+from bstcad.shop.as_built import AsBuilt
+from bstcad.shop.rounds import Compensated
 from bstcad.tailoring.merit import PictureError
 from bstcad.tailoring.run import Hooks
 from bstcad.transport.mapping import TransportMap
+
+if TYPE_CHECKING:
+    from bstcad.tolerance.as_made import AsMade
 
 RELATIVE_TOLERANCE = 1e-9  # largest ignored difference of indices (relative) and of the ends of nets (in net widths)
 PREVIEW_TUBES = 521  # flux tubes per side of the light, for the picture of a design that is not verified yet
@@ -221,15 +227,18 @@ class Design:
         with commands.scene_errors():
             return mounting.part_of(self.lens, self.scene.mount).solid
 
-    def export(self, *kinds: str, points: int | None = None, **cutting: float | str) -> list[Path]:
+    def export(
+        self, *kinds: str, points: int | None = None, tiles: str | tuple[int, int] | None = None, **cutting: float | str
+    ) -> list[Path]:  # fmt: skip
         """Write additional files, by names such as "zemax", into the folder of the design; return their paths.
 
         points: number of grid points along the wider side (default: number of control points; for "zemax", a grid
-        through the knots).  cutting: settings of "spiral" and "raster": tool_radius, cusp, pitch, tolerance, stock and
+        through the knots).  tiles: numbers of tiles along x and along y, such as "2x3" or (2, 3); None: 2x2.
+        cutting: settings of "spiral" and "raster": tool_radius, cusp, pitch, tolerance, stock and
         depth in mm, feed in mm/min, along ("x" or "y").  SceneError if a name is unknown or a value impossible, or if
         the design has not been written.
         """
-        return commands.export(self._own_folder(), kinds, points, cutting).paths
+        return commands.export(self._own_folder(), kinds, points, cutting, tiles=tiles).paths
 
     def write(
         self, folder: AnyPath, *, progress: bool = True, effort: Effort | None = None,
@@ -284,7 +293,8 @@ class Design:
     ) -> dict[str, Any]:  # fmt: skip
         """Study the tolerances of manufacture, mounting and source; write tolerance.json and return its entries.
 
-        grade: "moulded", "diamond-turned" or "precise", for errors that no [[tolerance]] names; None: as in the scene.
+        grade: "moulded", "diamond-turned", "precise", "milled-polished", "milled-sanded", "resin-printed" or
+        "resin-printed-coated", for errors that no [[tolerance]] names; None: as in the scene.
         wanted: yield (0 to 1) for which the loosest tolerances are computed.  seed: seed of the random trials.
         workers: number of processes for the traces (a script then needs `if __name__ == "__main__":`); scheduler:
         address of a dask scheduler instead.
@@ -295,6 +305,50 @@ class Design:
         with progresses.for_script(progress) as shown:
             settings = StudySettings(grade, wanted, seed, progress=shown)
             return commands.tolerance(folder, settings, workers, scheduler).facts()
+
+    def compensate(
+        self, *measured: AnyPath, gain: float | None = None, cutoff: float | None = None,
+        by: Literal["form", "light"] = "form", progress: bool = True,
+    ) -> Compensated:  # fmt: skip
+        """Write what to cut next to the design's folder, from measured points of the parts that were cut last.
+
+        measured: files of points of the back, one per part.  gain: part of the deviation that is corrected; None: 1/n
+        in round n.  cutoff: cutoff (mm) of the low pass; None: the light chooses.  by: correct the whole deviation
+        ("form"), or only what changes the picture ("light").  The result has `folder` and `figures`.
+        """
+        clouds, settings = [Path(path).expanduser() for path in measured], CompensationSettings(gain, cutoff, by)
+        with progresses.for_script(progress) as shown:
+            return commands.compensate(self._own_folder(), clouds, settings, progress=shown)
+
+    def retailor(
+        self, *, thickness: float | None = None, index: float | None = None, front: float | AnyPath | None = None,
+        folder: AnyPath | None = None, progress: bool = True,
+    ) -> Design:  # fmt: skip
+        """Tailor the back anew to the blank as it was built; write and verify the new design, and return it.
+
+        thickness: distance of the vertices (mm).  index: refractive index at the main wavelength.  front: curvature
+        (1/mm), or file of measured points of the front.  None: as designed.  folder: of the new design; None: the
+        design's folder with "-as-built" behind its name.
+        """
+        measured = Path(front).expanduser() if isinstance(front, str | os.PathLike) else front
+        place = None if folder is None else Path(folder).expanduser()
+        with progresses.for_script(progress) as shown:
+            written, report, found = commands.retailor(
+                self._own_folder(), AsBuilt(thickness, index, measured), place, hooks=Hooks(shown)
+            )
+        return Design(found.made, report, written)
+
+    def as_made(self, grade: str | None = None, *, layer_height: float | None = None) -> AsMade:
+        """Predict the pictures of the lens as made: with layers or tool marks, roughness and form error of a grade.
+
+        grade: grade as in `tolerance`; None: as in the scene.  layer_height: height of the layers of a print (mm);
+        None: that of the grade.  The result has `goals` with the pictures `designed` and `made`, their `rrmsds` and
+        `contrasts`, and the `changes` by each effect; `facts()` returns its figures as a dictionary.
+        """
+        from bstcad.tolerance.as_made import as_made  # loaded late, as in commands.tolerance
+
+        made = self._made
+        return as_made(made.scene, made.lens, made.goals, grade=grade, layer_height=layer_height)
 
     def show(self, png: AnyPath | None = None) -> None:
         """Draw the lens with rays and screen in the file `png` or, if None, in a window; return once it is closed."""

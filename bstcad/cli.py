@@ -18,9 +18,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from bstcad import __version__
 from bstcad.runs import signals
 
 with signals.exit_on_signal():  # loading these libraries takes a quarter of a second
@@ -30,6 +29,66 @@ with signals.exit_on_signal():  # loading these libraries takes a quarter of a s
     from rich.table import Table
     from rich.text import Text
 
+    from bstcad.cli_options import (
+        EXPORT_NAMES,
+        Against,
+        Along,
+        AsBuiltBlank,
+        AsJson,
+        Browser,
+        Budget,
+        By,
+        Clouds,
+        Cusp,
+        Cutoff,
+        Depth,
+        Device,
+        Distance,
+        Feed,
+        Folder,
+        Gain,
+        Grade,
+        KeyName,
+        Kinds,
+        Layer,
+        Light,
+        Listed,
+        MadeGrade,
+        MadePng,
+        Measured,
+        Name,
+        Opened,
+        Output,
+        PathTolerance,
+        Picture,
+        Pitch,
+        Png,
+        Points,
+        Port,
+        Quality,
+        ReachPng,
+        Report,
+        Resume,
+        SceneFile,
+        Scenes,
+        Scheduler,
+        Seed,
+        Settings,
+        Size,
+        Stock,
+        Template,
+        Tiles,
+        ToolRadius,
+        Topic,
+        Trial,
+        Verbose,
+        Version,
+        Workers,
+        Written,
+        Yield,
+        examples,
+        user_path,
+    )
     from bstcad.runs import files, processes, progress
     from bstcad.runs.files import SceneError, note, sentence_of
     from bstcad.step_text import beginning
@@ -44,7 +103,6 @@ INTERRUPTED, INTERNAL_ERROR = 130, 70  # exit codes after Ctrl-C and after a fau
 NOTHING_KEPT = "there was no lens yet, and nothing is kept"  # message of generate after Ctrl-C
 NOTHING_MORE = "nothing more is written"  # message of the other commands after Ctrl-C
 TERMINAL_INTERVAL, FILE_INTERVAL = 1.0, 30.0  # pause (s) before a sweep repeats a text: on a terminal, in a file
-EXPORT_NAMES = ", ".join(files.EXPORTS)
 COMMAND_SYNONYMS = {  # wrong word -> command to suggest
     **dict.fromkeys(("design", "make", "run", "build", "create", "optimise", "optimize"), "generate"),
     **dict.fromkeys(("check", "prove", "test", "report", "measure"), "verify"),
@@ -87,12 +145,6 @@ app = typer.Typer(
 )
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
-        print(f"bstcad {__version__}")
-        raise typer.Exit
-
-
 @app.callback(invoke_without_command=True)
 def _bstcad(context: typer.Context, version: Version = False) -> None:
     if context.invoked_subcommand is None:
@@ -123,24 +175,6 @@ def load_commands() -> ModuleType:
     with loading():
         from bstcad import commands
     return commands
-
-
-def user_path(path: str | Path) -> Path:
-    """Return a path with ~ expanded, since the shell does not expand -o=~/x.  SceneError for a name not in UTF-8."""
-    path = Path(os.path.expanduser(path))
-    try:
-        str(Path(os.getcwd(), path)).encode()  # libraries need a working folder even for absolute paths
-    except UnicodeEncodeError:
-        raise SceneError(f"{str(path)!r}: its name is not UTF-8 text; rename it") from None
-    return path
-
-
-def design_folder(path: str | Path) -> Path:
-    """Return the path of an existing folder or file, with ~ expanded; SceneError if there is none."""
-    path = user_path(path)
-    if not path.exists():
-        raise SceneError(f"{path}: no such folder or file; give a design's folder, such as outputs/thu")
-    return path
 
 
 def load_scene(path: Path, settings: list[str] | None, quality: str | None = None) -> Scene:
@@ -200,100 +234,6 @@ def say(summary: Any, where: object) -> None:
     console.print(f"Files: {where}", markup=False, highlight=False, soft_wrap=True)
 
 
-# --- arguments and options --------------------------------------------------------------------------------------------
-
-
-def argument(kind: Any, metavar: str, words: str, **more: Any) -> Any:
-    """Return the type of an argument of type `kind`, with the help `words`."""
-    return Annotated[kind, typer.Argument(metavar=metavar, help=words, **more)]
-
-
-def option(kind: Any, metavar: str | None, words: str, *names: str, **more: Any) -> Any:
-    """Return the type of an option of type `kind`, with the help `words`."""
-    return Annotated[kind, typer.Option(*names, metavar=metavar, help=words, **more)]
-
-
-def path_option(metavar: str, words: str, *names: str) -> Any:
-    """Return the type of an option that is a path, with the help `words`."""
-    return option(Path | None, metavar, words, *names, parser=user_path)
-
-
-Version = option(bool, None, "Print the version and exit.", "--version", callback=_version, is_eager=True)
-SceneFile = argument(Path, "SCENE", "Scene file (TOML); see templates/.", parser=user_path)
-Folder = argument(Path, "DIR", "Folder of a design.", parser=design_folder)
-Output = path_option("DIR", "Folder for the files (default: a folder in outputs/).", "--output", "-o")
-Settings = option(list[str] | None, "KEY=VALUE", "Replace one value of the scene: --set target.pixels=128.", "--set")
-Quality = option(str | None, "Q", "Effort: draft, standard or fine (fast to accurate), or paper (Wang et al. 2023).")
-Verbose = option(bool, None, "List every check with its value and limit.", "--verbose")
-Workers = option(int | None, "N", "Distribute the work over N processes on this machine.")
-Scheduler = option(str | None, "URL", "Distribute the work over the workers of the dask scheduler at this address.")
-Device = option(str, "D", "Device for the design: auto, cpu or cuda.")
-Resume = option(bool, None, "Continue the stopped or killed design from the checkpoint beside DIR.", "--resume")
-AsJson = option(bool, None, "Print the result as JSON, for programs.", "--json")
-Name = argument(str | None, "NAME", "Name of the scene; NAME.toml is written.")
-Picture = option(Path | None, "FILE", "Picture that the plate projects on a wall.")
-Light = option(str | None, "L", "Light source of the plate: sun, laser, lamp or led (default: laser).")
-Size = option(
-    str | None, "MM", "Size of the plate: 80 (default), 80x60 (width x height) or 120xphoto (proportions of the photo)."
-)
-Distance = option(
-    str | None, "MM", "Distance from plate to wall (default: 5 times the plate's longer side, for the sun 2.5 times)."
-)
-Template = option(str | None, "T", "Copy this template instead; see --list.")
-Listed = option(bool, None, "List the templates.", "--list")
-Opened = argument(Path | None, "SCENE|DIR", "Scene, design, or folder of scenes and designs.", parser=user_path)
-Port = option(int, "N", "Port on this machine (0: any free port).", min=0, max=65535)
-Browser = option(bool, None, "Open the page in the browser.", "--browser/--no-browser")
-Written = argument(Path, "DIR|STEP", "Folder of a design, or a single STEP file.", parser=design_folder)
-Measured = path_option("CLOUD", "Measured points (CSV, PLY, STL) of a made part, which is also verified.")
-Clouds = option(
-    list[Path], "CLOUD", "Measured points (CSV, PLY, STL) of a part that was cut last; several are averaged.",
-    "--measured", parser=user_path,
-)  # fmt: skip
-Gain = option(float, "G", "Part of the measured deviation that is corrected.")
-Cutoff = option(float | None, "MM", "Cutoff of the low pass of the correction (default: four pitches of the net).")
-Report = path_option("DIR", "Write the report of the made part to this folder only.", "--output", "-o")
-Against = option(str | None, "NAMES", "Also trace the lens with other programs: batoid, mitsuba, or batoid,mitsuba.")
-Grade = option(str | None, "G", "Grade of errors without a [\\[tolerance]]: moulded, diamond-turned or precise.")
-Yield = option(float | None, "P", "Find the loosest tolerances with this yield (percentage that passes).", "--yield")
-Seed = option(int, "N", "Seed of the random trials.", min=0)
-Trial = option(int | None, "N", "Write only the lens of this trial, as trial-N.step.", min=0)
-Kinds = option(str | None, "NAMES", f"Kinds of files, separated by commas: {EXPORT_NAMES}.", "--as")
-Points = option(
-    int | None, "N", "Points along the longer side (default: number of control points; zemax: through all knots)."
-)
-ToolRadius = option(
-    float | None, "MM", "Radius of the tool of a path (default: lens.tool_radius, or spiral 0.5, raster 1.5)."
-)
-Cusp = option(float | None, "MM", "Height of the cusps between passes (default: spiral 0.00005, raster 0.01).")
-Pitch = option(float | None, "MM", "Spacing of the passes, in place of the cusp height.")
-PathTolerance = option(
-    float | None, "MM", "Distance of straight moves from the exact path (default: spiral 0.000005, raster 0.0005)."
-)
-Stock = option(float | None, "MM", "Stock that the roughing of a raster leaves (default: 0.2; 0: no roughing).")
-Depth = option(float | None, "MM", "Depth of cut of roughing (default: 1).")
-Feed = option(float | None, "MM/MIN", "Feed of a raster (default: 800).")
-Along = option(str | None, "AXIS", "Axis along which the lines of a raster run: x (default) or y.")
-Png = path_option("FILE", "PNG file to write (default: a window is opened).", "--png", "-o")
-ReachPng = path_option("FILE", "PNG of the target and of the area that light can reach (target[1]: FILE_2).", "--png")
-Budget = option(
-    float,
-    "S",
-    "Seconds for all runs together, on all machines, including verification. A run that is predicted to exceed this "
-    "budget is not started; a run that exceeds it by a tenth is ended. The first run is never ended.",
-)
-Scenes = argument(list[str], "SCENES...", "Scene files (TOML), or patterns such as 'scenes/*.toml'.")
-Topic = argument(
-    str | None, "TOPIC", "Page, check or remark, as reports name it, such as check-rrmsd (default: the first page)."
-)
-KeyName = argument(str | None, "KEY", "Key or table, such as lens.tool_radius (default: all keys).")
-
-
-def examples(*lines: str) -> str:
-    """Return the end of a command's help: examples to copy."""
-    return "\n\n".join(("Examples:", *(f"  bstcad {line}" for line in lines)))
-
-
 # --- designing --------------------------------------------------------------------------------------------------------
 
 
@@ -325,18 +265,27 @@ def generate(
     raise Interrupted(" with the best lens so far; run the same command with --resume to continue")
 
 
-@app.command(epilog=examples("plan templates/thu.toml", "plan my-lens.toml --png reach.png"))
-def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False, png: ReachPng = None) -> int:
+@app.command(epilog=examples("plan templates/thu.toml", "plan my-lens.toml --made resin-printed --made-png made.png"))
+def plan(
+    scene: SceneFile, settings: Settings = None, as_json: AsJson = False, png: ReachPng = None, made: MadeGrade = None,
+    layer: Layer = None, made_png: MadePng = None,
+) -> int:  # fmt: skip
     """Predict time, error and memory of a design; list neglected effects and unreachable parts of the target."""
+    if made is None and (layer is not None or made_png is not None):
+        raise SceneError("--layer and --made-png need --made GRADE; add it, for example --made resin-printed")
     with loading():
         wanted = load_scene(scene, settings)
+        from bstcad import commands
         from bstcad import folder as folders
         from bstcad.report import report as reports
+        from bstcad.scene.quality import GRADE_NAMES
         from bstcad.scene.target import numbered
         from bstcad.sweep.net_choice import with_net
         from bstcad.sweep.plan import plan as planned
         from bstcad.sweep.plan import reach_drawn
 
+    if made is not None and made not in GRADE_NAMES:
+        raise SceneError(f"--made {made}: unknown grade; give one of {', '.join(GRADE_NAMES)}")
     warn(wanted)
     wanted, choice = with_net(wanted)
     if choice is not None:
@@ -347,16 +296,19 @@ def plan(scene: SceneFile, settings: Settings = None, as_json: AsJson = False, p
     effects = next(parts)
     for k, picture in enumerate(drawn):
         files.put(png.with_stem(numbered(png.stem, k)), picture)
+    part = None if made is None else commands.predict_as_made(wanted, made, layer, made_png)
     if as_json:
         net = {"control_points": choice.facts()} if choice else {}
         sizes = {"files": {"lens.step": round(folders.step_size(wanted))}}
-        likely = next(parts)
-        print(json.dumps({"verdict": None} | effects | likely | net | sizes, ensure_ascii=False, indent=2))
+        likely, as_made = next(parts), {} if part is None else {"made": part.facts()}
+        print(json.dumps({"verdict": None} | effects | likely | as_made | net | sizes, ensure_ascii=False, indent=2))
         return 0
     console = Console()
     console.print(reports.plan_effects(effects, wanted.title or wanted.name, wanted.optic))
     print("predicting time, RRMSD and memory …", file=sys.stderr, flush=True)
     console.print(reports.plan_predictions(next(parts)))
+    for sentence in () if part is None else reports.made_sentences(part.facts(), wanted.optic):
+        console.print(sentence, end="\n\n", markup=False, highlight=False)
     console.print(f"Files: {folders.size_sentence(wanted)}.")
     return 0
 
@@ -424,16 +376,37 @@ def verify(
 @app.command(
     epilog=examples("compensate outputs/thu --measured cloud.csv", "compensate outputs/thu --measured a.csv --gain 0.8")
 )
-def compensate(folder: Folder, measured: Clouds, gain: Gain = 1.0, cutoff: Cutoff = None) -> int:
+def compensate(
+    folder: Folder, measured: Clouds, gain: Gain = None, cutoff: Cutoff = None, by: By = "form"
+) -> int:  # fmt: skip
     """Write the back to cut next, from measured points of the parts that were cut last."""
     from bstcad.measured.compensation import Settings as CompensationSettings
 
     processes.begin()
     commands = load_commands()
     with progress.watch(Console(stderr=True)) as watched:
-        found = commands.compensate(folder, measured, CompensationSettings(gain, cutoff), progress=watched)
+        found = commands.compensate(folder, measured, CompensationSettings(gain, cutoff, by), progress=watched)
     print(found.sentences, f"Files: {found.folder}", sep="\n")
     return 0
+
+
+@app.command(
+    epilog=examples(
+        "retailor outputs/thu --as-built thickness=12.05,index=1.4912",
+        "retailor outputs/thu --as-built front=front.csv -o outputs/serial-17",
+    )
+)
+def retailor(folder: Folder, blank: AsBuiltBlank, output: Output = None, verbose: Verbose = False) -> int:
+    """Tailor the back anew to a blank as it was built."""
+    from bstcad.shop.as_built import AsBuilt
+
+    built = AsBuilt.parse(",".join(blank))
+    processes.begin()
+    commands = load_commands()
+    with progress.watch(Console(stderr=True)) as watched:
+        place, report, found = commands.retailor(folder, built, output, hooks=commands.Hooks(watched))
+    print(found.sentence(report.contents.rrmsd))
+    return conclude(report.contents, place, verbose)
 
 
 @app.command(epilog=examples("tolerance outputs/thu --yield 90", "tolerance outputs/thu --grade precise --trial 17"))
@@ -467,14 +440,15 @@ def tolerance(
         "export outputs/thu --as zemax,dxf",
         "export outputs/thu --as points --points 1001",
         "export outputs/thu --as raster --tool-radius 1.5 --cusp 0.01",
+        "export outputs/sun_caustic --as tiles --tiles 2x3",
     )
 )
 def export(
     folder: Folder, kinds: Kinds = None, points: Points = None, tool_radius: ToolRadius = None, cusp: Cusp = None,
     pitch: Pitch = None, tolerance: PathTolerance = None, stock: Stock = None, depth: Depth = None, feed: Feed = None,
-    along: Along = None,
+    along: Along = None, tiles: Tiles = None,
 ) -> int:  # fmt: skip
-    """Write files for a workshop: tables, Zemax grid sag, tool paths, height maps, outlines, previews, data sheet."""
+    """Write files for a workshop: tables, Zemax grid sag, tool paths, tiles, outlines, previews, data sheet."""
     if kinds is None:
         raise SceneError(f"--as: is missing; give one or more kinds of files: {EXPORT_NAMES}")
     settings = {
@@ -482,7 +456,7 @@ def export(
         "depth": depth, "feed": feed, "along": along,
     }  # fmt: skip
     given = {name: value for name, value in settings.items() if value is not None}
-    written = load_commands().export(folder, split_names(kinds), points, given)
+    written = load_commands().export(folder, split_names(kinds), points, given, tiles=tiles)
     print(*written.notes, "Files: " + ", ".join(map(str, written.paths)), sep="\n")
     return 0
 

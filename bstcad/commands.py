@@ -25,6 +25,7 @@ import numpy as np
 
 import bstcad
 from bstcad import folder as folders
+from bstcad.cad.tiling import Tiling
 from bstcad.folder import Made
 from bstcad.judges import comparison
 from bstcad.judges.comparison import Comparison
@@ -39,11 +40,12 @@ from bstcad.optics.measure import FULL, Effort, Light, SpectralLine
 from bstcad.pipeline import DesignState, design, purpose
 from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
 from bstcad.report.data_sheet import DataSheet
+from bstcad.report.drawing import png as rendered
 from bstcad.report.exports import Exported
 from bstcad.report.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, draw_wavefront, light_path_of
 from bstcad.report.goal_figures import GoalFigures, figures_of, photometry
 from bstcad.report.grid_sag import GridLight
-from bstcad.report.light_figures import draw_judges, draw_part
+from bstcad.report.light_figures import View, draw_judges, draw_part, picture_as_made
 from bstcad.report.photometric_figures import draw_isolux, far_field_of
 from bstcad.report.prescription import SHEET, Order
 from bstcad.report.record import Contents, Examined, LeftOut, Report, StageRecord, contents_of, with_part
@@ -54,9 +56,12 @@ from bstcad.runs import cluster, files, processes, signals
 from bstcad.runs.checkpoint import Keeper
 from bstcad.runs.environment import circumstances
 from bstcad.runs.files import MachineError, SceneError
+from bstcad.scene.moulding import CAVITY
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
-from bstcad.shop import rounds
+from bstcad.scene.target import numbered
+from bstcad.shop import as_built, rounds
+from bstcad.shop.as_built import AsBuilt, Retailored
 from bstcad.shop.rounds import Compensated
 from bstcad.step_text import beginning
 from bstcad.sweep.estimates import diagnosis, left_out
@@ -68,8 +73,10 @@ from bstcad.verify.checks import Proof
 from bstcad.verify.verdict import Check, verdict
 
 if TYPE_CHECKING:
+    from bstcad.tolerance.as_made import AsMade
     from bstcad.tolerance.study import StudySettings
 
+TILE_FILES = "tile-*-*.step"  # pattern of the names of tiles
 # In a run with a time limit: time reserved for the report, and smallest time for the rays of the verification (s).
 REPORT_TIME, MIN_RAY_TIME = 2.0, 0.5
 
@@ -167,7 +174,7 @@ def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), prog
         proven = time.perf_counter()
         irradiances = tuple(light.picture for light in proof.lights)
         folders.write_design(made, irradiances, building)
-        exported = _export(made, made.scene.output.export, building)
+        exported = _export_of_scene(made, building)
         order = _order(made, proof.shape, building)
         drawn.sheet(_sheet(made, proof, figures_of(made.goals, proof.lights), irradiances[0], order=order))
         progress("report", 0, 1, "")
@@ -354,6 +361,28 @@ def compensate(
         return rounds.compensate(made, path, measured, settings, progress=progress, effort=effort)
 
 
+def retailor(
+    path: Path, built: AsBuilt, folder: Path | None = None, options: ProofOptions = ProofOptions(),
+    hooks: Hooks = NO_HOOKS,
+) -> tuple[Path, Report, Retailored]:  # fmt: skip
+    """Tailor the back of the design in the folder `path` anew to its blank as built; write and verify the new design.
+
+    Return (folder of the new design, its report, the RRMSDs before).  folder: of the new design; None: `path` with
+    "-as-built" behind its name.  After a Ctrl-C the best lens so far is written.
+    """
+    folder = folder or path.resolve().with_name(f"{path.resolve().name}-as-built")
+    if folder.resolve() == path.resolve():
+        raise SceneError(f"{folder}: is the folder of the earlier design; give another folder")
+    made = read(path)
+    processes.begin()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with files.exclusive(folder), scene_errors():
+        with signals.stop_on_interrupt() as wished:
+            found = as_built.retailor(made, built, replace(hooks, interrupted=wished))
+        report = write(found.made, folder, options, hooks.progress)
+    return folder, report, found
+
+
 def examine(path: Path) -> Examined:
     """Examine a single STEP file: checks and dimensions of the solid, without a design."""
     beginning.check(path)
@@ -476,20 +505,47 @@ def tolerance(
         return tolerancing.tolerance(folder, settings if found is None else replace(settings, spread=found.spread))
 
 
+def predict_as_made(
+    scene: Scene, grade: str | None = None, layer_height: float | None = None, png: Path | None = None
+) -> AsMade:
+    """Predict the pictures of a scene's lens as made by a grade of manufacture, from a reduced design.
+
+    layer_height: height of the layers of a print (mm); None: that of the grade.  png: file of the pictures to write,
+    one per target (FILE, FILE_2, …).
+    """
+    from bstcad.app.preview import REFINED, preview  # loaded late, since the other commands do not need it
+
+    found = preview(scene, REFINED)
+    made = found.as_made(grade, layer_height)
+    if png is None:
+        return made
+    for k, goal in enumerate(made.goals):
+        figure = picture_as_made(goal.target, goal.designed, goal.made, View.of(found.scene, k))
+        files.put(png.with_stem(numbered(png.stem, k)), rendered(figure))
+    return made
+
+
 def export(
-    folder: Path, kinds: Sequence[str], points: int | None = None, cutting: Mapping[str, Any] = MappingProxyType({})
-) -> Exported:
+    folder: Path, kinds: Sequence[str], points: int | None = None, cutting: Mapping[str, Any] = MappingProxyType({}),
+    *, tiles: str | tuple[int, int] | None = None,
+) -> Exported:  # fmt: skip
     """Write files for a shop to the design's folder `folder`; kinds and points as in bstcad.report.exports.export.
 
     cutting: settings of tool paths, by the names of the fields of bstcad.toolpath.cutting.Cutting.
+    tiles: numbers of tiles along x and along y, such as "2x3" or (2, 3); None: 2x2.  Older tiles are removed.
     """
     with folders.amending(folder) as amended:
         made = read(folder)
         with scene_errors("export: "):
-            written = _export(made, kinds, amended, points=points, cutting=_cutting(cutting))
+            tiling = exports.DEFAULT_TILING if tiles is None else Tiling.parse(tiles)
+            written = _export(made, kinds, amended, points=points, cutting=_cutting(cutting), tiling=tiling)
         if exports.SHEET in kinds:
             written.paths.append(amended / SHEET)
             files.put(written.paths[-1], data_sheet.draw(_sheet_again(made, folder)))
+    if "tiles" in kinds:
+        new = {path.name for path in written.paths}
+        for old in (path for path in folder.glob(TILE_FILES) if path.name not in new):
+            old.unlink()
     return replace(written, paths=[folder / path.name for path in written.paths])
 
 
@@ -503,9 +559,23 @@ def _cutting(settings: Mapping[str, Any]) -> Cutting:
     return Cutting(**settings)
 
 
+def _export_of_scene(made: Made, folder: Path) -> Exported:
+    """Write the files of output.export; a note states why a cavity cannot be built, as a check does for part.step."""
+    kinds = made.scene.output.export
+    written = _export(made, [kind for kind in kinds if kind != CAVITY], folder)
+    if CAVITY in kinds:
+        try:
+            cavity = _export(made, [CAVITY], folder)
+        except ValueError as error:
+            cavity = Exported([], [f"cavity.step is not written: {error}"])
+        written = Exported(written.paths + cavity.paths, written.notes + cavity.notes)
+    return written
+
+
 def _export(
-    made: Made, kinds: Sequence[str], folder: Path, *, points: int | None = None, cutting: Cutting = DEFAULTS
-) -> Exported:
+    made: Made, kinds: Sequence[str], folder: Path, *, points: int | None = None, cutting: Cutting = DEFAULTS,
+    tiling: Tiling = exports.DEFAULT_TILING,
+) -> Exported:  # fmt: skip
     scene, lens = made.scene, made.lens
     light = GridLight(scene.light.central, tuple(target.screen for target in scene.targets))
     far = far_field_of(scene)
@@ -513,7 +583,7 @@ def _export(
         cutting = replace(cutting, tool_radius=scene.lens.tool_radius)
     return exports.export(
         lens, kinds, folder, points=points, label=folders.label(scene), mount=scene.mount, light=light, far=far,
-        cutting=cutting,
+        cutting=cutting, moulding=scene.moulding, part=scene.part.of(scene.lens), tiling=tiling,
     )  # fmt: skip
 
 

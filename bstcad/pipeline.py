@@ -31,6 +31,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import ResolvedTailoring
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2, two_faces
+from bstcad.tailoring.carried import carry_light
 from bstcad.tailoring.feasibility import find_demand, is_infeasible
 from bstcad.tailoring.grazing import without_reflection
 from bstcad.tailoring.machinability import BOUNDS_STAGE, active_bounds, enforce_bounds, place_back
@@ -66,6 +67,7 @@ Stage2State = stage2.TubeSearch | paper.RaySearch | stage2.Stage3State
 SOLUTION_SIGNS = {"convex": 1.0, "concave": -1.0}  # sign σ (tailoring/light_behind.py) for each tailoring.solution
 DEVICES = ("auto", "cpu", "cuda")
 COMPARISON_STAGE = "float32 beside float64"  # name of the stage that compares precisions
+EARLIER_STAGE = "earlier lens"  # name of the stage that rates an earlier lens, in the place of stage 1
 # Seconds for writing, verification and report on two cores: constant part, per net of 513 x 513 control points, per
 # picture of 512 x 512 pixels, and per target for the finer flux tubes that two nets need.
 BASE_SECONDS, SECONDS_PER_NET, SECONDS_PER_PICTURE, SECONDS_PER_WITNESS = 4.0, 5.0, 3.0, 15.0
@@ -83,8 +85,8 @@ class Stage1Result:
     """The result of stage 1."""
 
     lens: Parameters  # parameters of the lens after stage 1
-    mapping: Mapping  # transport map of stage 1
-    transport: TransportMap  # inverse map, from corners of the target's pixels to the lens
+    mapping: Mapping | None  # transport map of stage 1; None: an earlier lens in its place
+    transport: TransportMap | None  # inverse map, from corners of the target's pixels to the lens; None: not known
     precision: PrecisionComparison | None  # comparison of float32 with float64; None: not made
     rrmsd: float  # RRMSD of the lens for the centre of the source, without a mount
 
@@ -109,6 +111,16 @@ class DesignOptions:
     merit: PictureError | None = None  # function of a picture and the target that stages 2 and 3 minimise; None: RRMSD²
     compare_later: bool = False  # compare float32 with float64 only when a report needs it (`Made.with_report_data`)
     preview: bool = False  # make a preview, see `Task.preview`
+    earlier: Earlier | None = None  # earlier lens that stage 2 or 3 refines; None: stage 1 makes a lens
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """Lens of an earlier design of nearly the same scene."""
+
+    lens: Lens  # index: that for the channel of the largest weight
+    parameters: Parameters  # parameters for the blank of the new scene
+    transport: TransportMap | None = None  # transport map of the earlier design, for the report; None: not known
 
 
 def design(
@@ -136,6 +148,10 @@ def design(
     knobs = scene.tailoring.resolved(scene.lens.back.net)
     later = options.compare_later and knobs.max_time is None
     task = replace(task_of(scene, goals, knobs, edge), progress=hooks.progress, merit=merit, preview=options.preview)
+    if options.earlier is not None:
+        if PROCEDURES[knobs.method][2] is not stage2.steps:
+            raise SceneError(f"tailoring.method: {knobs.method!r} refines no earlier lens; remove this key")
+        task = replace(task, refines=True)
     if not task.preview:  # a preview is so small that the return of its memory takes longer than it helps
         task = replace(task, tidy=processes.return_freed)
     task = with_solution(scene, task)
@@ -148,7 +164,10 @@ def design(
         lens = lens.with_back(lens.back_net.refined(scene.lens.back.net))
     if fresh:
         driver.end("loading")  # loading of the libraries, the scene and its files
-    followed = start.followed or _stage1(scene, task, driver, lens, state=start.first, compare=not later)
+    followed = start.followed
+    if followed is None and options.earlier is not None:
+        followed = _earlier_lens(task, driver, lens, options.earlier)
+    followed = followed or _stage1(scene, task, driver, lens, state=start.first, compare=not later)
     after_stage1, stages = followed.lens.apply_to(lens), len(driver.record.stages)
     lens = scene.as_mounted(after_stage1)  # the clear apertures now follow the tailored back
     if start.lens:
@@ -159,8 +178,10 @@ def design(
     if scene.lens.front.fixed:  # tailoring may have converted the front to float32
         lens = replace(lens, front=scene.lens.front_surface)
     sent, source = followed.transport, task.heaviest.source
-    at_back = sent.plane == "back"
-    steep = needed_steepness(source, lens, goals[0], x=sent.x, y=sent.y, origins=sent.source, at_back=at_back)
+    steep = None
+    if sent is not None:
+        at_back = sent.plane == "back"
+        steep = needed_steepness(source, lens, goals[0], x=sent.x, y=sent.y, origins=sent.source, at_back=at_back)
     making = _design_course(followed, driver.record, stopped, steep)
     designed = resolved(scene, lens), scene.as_mounted(lens), goals
     made = Made(*designed, making=making, device=device, transport=followed.transport)
@@ -309,25 +330,46 @@ def _with_comparison(making: DesignCourse, task: Task, lens: Lens, before: int) 
     return replace(making, twins=comparison, stages=stages, seconds_total=making.seconds_total + stage.seconds)
 
 
-def _design_course(result: Stage1Result, record: DesignRecord, stopped: str, steep: Steepness) -> DesignCourse:
+def _design_course(result: Stage1Result, record: DesignRecord, stopped: str, steep: Steepness | None) -> DesignCourse:
     """Return the course of a design for the report; stopped: reason why tailoring ended; steep: needed slope."""
-    solved = result.mapping.transport
-    return DesignCourse(
-        seconds_total=record.seconds,
-        stages=tuple(StageRecord(**asdict(stage)) for stage in record.stages),
-        history=tuple(CurvePoint(*entry) for entry in record.history),
-        transport={
+    sent: dict[str, Any] = {}
+    if result.mapping is not None:
+        solved = result.mapping.transport
+        sent = {
             "grid": result.mapping.source.n,
             "iterations": solved.iterations,
             "mass_error": solved.mass_error[-1],
             "stopped": solved.reason,
-            "steep_share": steep.share,
-            "steepest_deg": steep.steepest,
-        },
+        }
+    if steep is not None:
+        sent |= {"steep_share": steep.share, "steepest_deg": steep.steepest}
+    return DesignCourse(
+        seconds_total=record.seconds,
+        stages=tuple(StageRecord(**asdict(stage)) for stage in record.stages),
+        history=tuple(CurvePoint(*entry) for entry in record.history),
+        transport=sent or None,
         skipped_steps=record.skipped,
         stopped=stopped,
         twins=None if result.precision is None else cast(PrecisionTest, asdict(result.precision)),
     )
+
+
+def _earlier_lens(task: Task, driver: Driver, lens: Lens, earlier: Earlier) -> Stage1Result:
+    """Return an earlier lens in the place of the result of stage 1."""
+    if driver.reason_to_interrupt:
+        raise KeyboardInterrupt
+    found, light = earlier.parameters.apply_to(lens), task.heaviest
+    before = earlier.lens.to(found.like.dtype, found.like.device)
+    slopes = carry_light(light.source, before, light.through(found), task.goals[0])
+    each = found, found.with_last_net(slopes.nets[-1])
+    found, rrmsd = min(((lens, task.rrmsd(lens)) for lens in each), key=lambda rated: _or_infinite(rated[1]))
+    require_light(found, rrmsd)
+    driver.end(EARLIER_STAGE, rrmsd)
+    return Stage1Result(Parameters.of(found), None, earlier.transport, precision=None, rrmsd=rrmsd)
+
+
+def _or_infinite(rrmsd: float) -> float:
+    return math.inf if math.isnan(rrmsd) else rrmsd
 
 
 def _stage1(

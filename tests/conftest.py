@@ -37,6 +37,7 @@ SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tole
     "target.y": [-25.0, 25.0],
     "target.pixels": [64, 48],
     "target.outline": {"shape": "circle", "radius": 20.0},
+    "moulding.shrinkage": 0.005,
     "tailoring.quality": "draft",
     "tailoring.rays": 256,
     "tailoring.rounds": 3,

@@ -22,7 +22,7 @@ PACKAGE = Path(__file__).parent.parent / "bstcad"
 # Parts of the package that are files at its top, and these files; all others are rooms.
 AT_TOP = {
     "designs": {"pipeline", "folder"},  # how a lens comes about, and its folder
-    "commands": {"commands", "api", "cli"},  # for scripts and for the terminal
+    "commands": {"commands", "api", "cli", "cli_options"},  # for scripts and for the terminal
 }
 ENGINE = {
     "runs", "scene", "optics", "photometry", "step_text", "transport", "tailoring", "baselines", "cad", "analysis",
@@ -59,9 +59,21 @@ MAY_IMPORT = {
     "designs": {*ENGINE, "bstcad"} - {"judges", "measured"},
     # Designs come about in processes of their own; a sweep times and judges with the engine's tools.
     "sweep": {"runs", "scene", "optics", "tailoring", "analysis", "verify", "report", "designs", "bstcad"},
-    "tolerance": {"runs", "scene", "optics", "cad", "verify", "report", "designs", "bstcad"},
+    # A picture as made has the scatter of analysis, and the blur by an extended source of tailoring.
+    "tolerance": {
+        "runs",
+        "scene",
+        "optics",
+        "tailoring",
+        "cad",
+        "analysis",
+        "verify",
+        "report",
+        "designs",
+        "bstcad",
+    },
     # Rounds of cutting and measuring write the folders of designs.
-    "shop": {"runs", "scene", "optics", "measured", "report", "designs", "bstcad"},
+    "shop": {"runs", "scene", "optics", "measured", "report", "tailoring", "designs", "bstcad"},
     "commands": {*ENGINE, "designs", "sweep", "tolerance", "shop", "app", "bstcad"},
     # The workbench's previews are designs made small, by the steps of tailoring.
     "app": {
@@ -74,6 +86,7 @@ MAY_IMPORT = {
         "designs",
         "sweep",
         "tolerance",
+        "shop",
         "commands",
         "bstcad",
     },  # fmt: skip

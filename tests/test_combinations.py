@@ -1,7 +1,7 @@
 """Every two values of every two choices of a scene in at least one lens; every light, rim and front by `make bench`.
 
 Each scene is designed with few control points and pixels, written, proved from its files and opened again; flux tubes
-repeat what its rays found.  Each value is previewed in two scenes at least and planned in two; these scenes alone have
+repeat what its rays found.  Each value is previewed in a scene at least and planned in one; these scenes alone have
 a data sheet, estimates of effects that are left out, and a comparison of precisions, too.  A scene may end in a report,
 whose failed checks are true (MAY_FAIL), or in a refusal that names the keys that do not go together (REFUSED).  A new
 value of a choice is one line of CHOICES.
@@ -16,7 +16,7 @@ import itertools
 import math
 import random
 import re
-from collections import Counter, defaultdict
+from collections import defaultdict
 
 import numba
 import numpy as np
@@ -38,8 +38,11 @@ from bstcad.report.figure_jobs import NoPictures
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import as_front, net_extent
 from bstcad.scene.lamp import IntensityFile, RayFile
+from bstcad.shop import as_built
+from bstcad.shop.as_built import AsBuilt
 from bstcad.sweep.plan import plan
 from bstcad.sweep.prediction import run_pilot
+from bstcad.tailoring.run import stage_effort
 from bstcad.tailoring.stage2 import PrecisionComparison
 from tests.conftest import verify_with
 from tests.sweep.conftest import typical_pilot
@@ -261,6 +264,14 @@ CHOICES = {
         "thickness": {"lens.max_thickness": 12.0, "lens.edge_thickness": 1.0},
     },
     "mount": {"none": {}, "flange": flange, "cut": cut},
+    "moulding": {
+        "none": {},
+        "one shrinkage": {"moulding": {"shrinkage": 0.005}, "output.export": ["cavity"]},
+        "along each axis": {
+            "moulding": {"shrinkage": [0.005, 0.006, 0.004], "relative_to": "part"},
+            "output.export": ["cavity"],
+        },
+    },
     "elements": {
         "none": {},
         "dome before": elements("before", thickness=3.0, index=1.5, curvature=[0.004, 0.005], tilt=[3.0, 0.0]),
@@ -276,15 +287,22 @@ CHOICES = {
     "accuracy": {"none": {}, "asked": {"tailoring.accuracy": 0.3}},
     "time": {"none": {}, "limited": {"tailoring.max_time": 100.0}},
     "reach": {"whole": {}, "part": part},
+    "export": {"none": {}, "tiles": {"output.export": ["tiles"]}},
     "targets": {"one": {}, "two": two},
+    "grade": {
+        "none": {},
+        "milled": {"tolerance": [{"grade": "milled-sanded", "roughness": 300.0}]},
+        "printed": {"tolerance": [{"grade": "resin-printed", "layer_height": 0.1}]},
+        "coated": {"tolerance": [{"grade": "resin-printed-coated"}, {"name": "back.form", "limit": 1e-3}]},
+    },
 }
 PLAIN = {choice: next(iter(values)) for choice, values in CHOICES.items()}
 SMALL = {
     "name": "combination", "accept": {}, "target": {"z": BACK + THROW, "pixels": 24},
     "lens": {"material": "PMMA", "min_thickness": 1.5, "back": {"kind": "bspline", "z": BACK, "control_points": 21}},
     "tailoring": {
-        "quality": "draft", "rays": 40, "transport_grid": 24, "transport_iterations": 6, "stage2_iterations": 4,
-        "rounds": 2, "source_points": 4,
+        "quality": "draft", "rays": 40, "transport_grid": 24, "transport_iterations": 6, "stage2_iterations": 2,
+        "rounds": 2, "source_points": 2,
     },
 }  # fmt: skip
 WITHOUT_DOME = {  # values that do not go with a dome
@@ -296,6 +314,7 @@ WITHOUT_DOME = {  # values that do not go with a dome
     "mount": ("cut",),
     "elements": ("dome before", "window behind", "fold mirror behind"),
     "wavefront": ("plane", "sphere"),
+    "export": ("tiles",),
 }
 REFUSED = (  # the least sets of values that no scene has together
     *(
@@ -322,7 +341,7 @@ REFUSED = (  # the least sets of values that no scene has together
 NAMED = {  # the key of a choice, as the sentence of a refusal has it
     "light": "source.", "wavefront": "wavefront", "rim": "lens.outline", "net": "lens.back.control_points",
     "front": ".reflect", "effects": "effects[0]", "elements": "behind", "wall": "target", "targets": "target",
-    "back": "back", "bounds": "lens.", "mount": "mount", "medium": "lens.encapsulant",
+    "export": "output.export", "back": "back", "bounds": "lens.", "mount": "mount", "medium": "lens.encapsulant",
 }  # fmt: skip
 
 
@@ -387,21 +406,22 @@ def scene_with(first, holding, chance):
     return scene
 
 
-def holding_each_value(scenes, times=2):
-    """Return the numbers of few scenes that hold each value so many times, or as often as it occurs (greedy cover)."""
-    occurring = Counter(value for scene in scenes for value in scene.items())
-    missing, found = {value: min(times, count) for value, count in occurring.items()}, []
-    while any(missing.values()):
-        new = [sum(missing[value] > 0 for value in scene.items()) * (k not in found) for k, scene in enumerate(scenes)]
+def holding_each_value(scenes):
+    """Return the numbers of few scenes that together hold each value that occurs (greedy cover)."""
+    missing, found = {value for scene in scenes for value in scene.items()}, []
+    while missing:
+        new = [len(missing & scene.items()) for scene in scenes]
         found.append(new.index(max(new)))
-        for value in scenes[found[-1]].items():
-            missing[value] = max(missing[value] - 1, 0)
+        missing -= scenes[found[-1]].items()
     return found
 
 
 PAIRS = covering(to_cover(2))
 PREVIEWED = holding_each_value(PAIRS)  # numbers of the scenes that are previewed
 PLANNED = [len(PAIRS) - 1 - k for k in holding_each_value(PAIRS[::-1])]  # numbers of the scenes that are planned
+HALF = len(PAIRS) // 2
+TURNED = holding_each_value(PAIRS[HALF:] + PAIRS[:HALF])
+RETAILORED = [(k + HALF) % len(PAIRS) for k in TURNED]  # numbers of the scenes with a blank as built
 TRIPLES = "light", "rim", "front"
 
 
@@ -426,9 +446,17 @@ MAY_REFUSE = (  # sentences of designs, and the choices that cannot be had toget
     (r"lens.front.optimise: with the front that the target needs, mount\.", {"front": "free sphere"}),
     (r"target: .* of the light would have to leave the back outside of lens.outline", {"front": "tailored spline"}),
     (r"lens.back.half_angle: .* of the light.* cannot reach a lit part", {"back": "dome", "medium": "encapsulant"}),
+    (
+        r"lens.back.half_angle: .* of the light.* cannot reach a lit part",  # 5.1 % of it; 5 % are allowed
+        {"back": "dome", "wall": "off axis", "light": "chip"},
+    ),
+    (
+        r"lens.back.half_angle: .* of the light.* cannot reach a lit part",  # a disc of 24 mm, 40 mm away, is narrow
+        {"back": "dome", "wall": "tilted", "picture": "profile", "front": "conic"},
+    ),
 )
 COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which figures are found
-    "optics.measure": {"SETS": 4, "MIN_TUBES": 48, "MIN_SOURCE_POINTS": 4, "MAX_SOURCE_POINTS": 8},
+    "optics.measure": {"SETS": 4, "MIN_TUBES": 48, "MIN_SOURCE_POINTS": 2, "MAX_SOURCE_POINTS": 4},
     "scene.scene": {"VERIFICATION_POINTS": 4},
     "tailoring.run": {
         "FINE_EFFORT": Effort(48, accuracy=0.0, witness=False),
@@ -520,17 +548,17 @@ def quick():
         numba.set_num_threads(threads[1])
 
 
-def faults(chosen, folder, *, previewed=True, planned=True):
+def faults(chosen, folder, *, previewed=True, planned=True, retailored=True):
     """The faults of a scene from its plan to its files and back, as sentences."""
     with pytest.MonkeyPatch.context() as patch:
         if not (previewed or planned):
             patch.setattr("bstcad.commands.Pictures", NoPictures)
             patch.setattr("bstcad.commands.left_out", lambda *given: ())
             patch.setattr("bstcad.pipeline.compare_precisions", lambda *given: NO_DIFFERENCE)
-        return _faults(chosen, folder, previewed=previewed, planned=planned)
+        return _faults(chosen, folder, previewed=previewed, planned=planned, retailored=retailored)
 
 
-def _faults(chosen, folder, *, previewed, planned):
+def _faults(chosen, folder, *, previewed, planned, retailored):
     scene = scene_of(chosen)
     try:
         seen = preview(scene, HASTY) if previewed else None
@@ -543,9 +571,24 @@ def _faults(chosen, folder, *, previewed, planned):
     assert not planned or ({"simulated", "left_out", "blur"} <= set(told) and "predicted" in predicted)
     assert again.report.rrmsd == pytest.approx(report.rrmsd, rel=1e-3)
     assert again.lens.back.shape == as_pair(again.scene.lens.back.net)
+    if chosen["grade"] != "none":
+        made = again.as_made()
+        assert all(np.isfinite(goal.made).all() and 0 < goal.light <= 1 + 1e-9 for goal in made.goals)
+        assert made.finish.is_marked and all(len(goal.changes) == 3 for goal in made.goals)
     if found := _failed(report, chosen):
         found = _failed(again.verify(effort=MORE_RAYS, progress=False), chosen)
-    return found + list(_differences(report, again))
+    return found + list(_differences(report, again)) + (list(_as_built(again)) if retailored else [])
+
+
+def _as_built(design):
+    """Yield a fault if the back cannot be tailored to a thickness and an index of the blank, or is then worse."""
+    made = design._made
+    thickness = made.lens.back_net.vertex_z - made.lens.front.z + 0.02
+    index = made.scene.index + 2e-3 if made.scene.lens.passes.enters else None
+    found = as_built.retailor(made, AsBuilt(thickness=thickness, index=index))
+    after = max(light.rrmsd for light in found.made.lights(found.made.lens, found.made.goals, stage_effort(made.goals)))
+    if not after < 1.1 * max(found.design, found.before) + MAX_DIFFERENCE:
+        yield f"as built: RRMSD {found.design:.3f} designed, {found.before:.3f} before, {after:.3f} after"
 
 
 def _differences(report, design):
@@ -595,11 +638,11 @@ def test_a_refusal_names_both_keys(together, tmp_path, capsys):
     assert all(named.get(value, NAMED[choice]) in str(refusal.value) for choice, value in together)
 
 
-def test_each_value_is_previewed_and_planned_twice():
-    counts = Counter(value for scene in PAIRS for value in scene.items())
-    for numbers in (PREVIEWED, PLANNED):
-        held = Counter(value for k in numbers for value in PAIRS[k].items())
-        assert counts.keys() == held.keys() and min(held.values()) >= 2 and len(numbers) < len(PAIRS) / 2
+def test_each_value_is_previewed_planned_and_tailored_to_a_blank():
+    all_values = {value for scene in PAIRS for value in scene.items()}
+    for numbers in (PREVIEWED, PLANNED, RETAILORED):
+        assert {value for k in numbers for value in PAIRS[k].items()} == all_values
+        assert len(set(numbers)) == len(numbers) < len(PAIRS) / 4
 
 
 @pytest.mark.parametrize(
@@ -608,8 +651,18 @@ def test_each_value_is_previewed_and_planned_twice():
     ids=[f"{chosen['light']}, {chosen['front']}, {chosen['rim']}" for chosen in PAIRS],
 )
 def test_each_pair(number, chosen, tmp_path):
-    assert faults(chosen, tmp_path / "out", previewed=number in PREVIEWED, planned=number in PLANNED) == []
+    assert (
+        faults(
+            chosen,
+            tmp_path / "out",
+            previewed=number in PREVIEWED,
+            planned=number in PLANNED,
+            retailored=number in RETAILORED,
+        )
+        == []
+    )
     gc.collect()
+    gc.freeze()  # kernels and modules that it loaded stay: they are walked over once
 
 
 @pytest.mark.bench

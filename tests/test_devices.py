@@ -28,7 +28,7 @@ TINY = {
     "lens.back.control_points": 33,
     "tailoring.rays": 48,
     "tailoring.transport_grid": 32,
-    "tailoring.rounds": 2,
+    "tailoring.rounds": 1,
     "tailoring.source_points": 4,
 }
 PIXELS = 25  # odd, as the tubes are even: in a symmetric lens no edge of a tube runs along a pixel border

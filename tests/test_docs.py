@@ -44,7 +44,7 @@ RUN = [page for page in PAGES if any(block.kind != "toml" for block in blocks(pa
 LONG = {  # make bench runs the blocks of these pages, and make docs those of tutorials; other tests do what they do
     "measured-part", "time-and-accuracy", "tolerances", "two-faces", "part-with-flange", "led", "your-photo", "effects",
     "first-lens", "reading-the-report", "machinable", "mirror", "failed-picture", "white-light", "cadquery",
-    "street-light",
+    "street-light", "from-python",
 }  # fmt: skip
 FENCES = re.compile(r"^```(\S+)", re.M)
 

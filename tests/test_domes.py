@@ -112,6 +112,8 @@ def test_a_dome_is_designed_written_and_proved_from_its_files(designed):
     for kind in ("zemax", "turning", "spiral", "raster", "heightmap"):
         with pytest.raises(SceneError, match=f'^export: "{kind}" is a \\w+ (of|over) heights .* write "sag"'):
             again.export(kind)
+    with pytest.raises(SceneError, match=r'^export: "tiles" cuts .*, and lens.back is a dome; use lens.step$'):
+        again.export("tiles")
     for change in (lambda: again.with_lens(again.lens),):
         with pytest.raises(SceneError, match="is not possible for a dome yet"):
             change()

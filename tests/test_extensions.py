@@ -2,9 +2,6 @@
 
 import json
 import math
-import os
-import subprocess
-import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -443,8 +440,8 @@ def test_a_share_that_is_no_tensor_is_named(scene):
         bstcad.measure(scene.flat_lens(33), half.channels(), half.target.screen, half.target.irradiance())
 
 
-def test_an_installed_package_brings_an_effect_along(scene, tmp_path):
-    """The entry point is found when the scene file is read in another process."""
+def test_an_installed_package_brings_an_effect_along(scene, tmp_path, monkeypatch):
+    """The entry point is found when the scene file is read."""
     (tmp_path / "dusty_lenses.py").write_text(
         "class Dust:\n    def __init__(self, nm): pass\n    def share(self, cos_in, cos_out, path): return cos_in\n"
     )
@@ -454,9 +451,6 @@ def test_an_installed_package_brings_an_effect_along(scene, tmp_path):
     (facts / "entry_points.txt").write_text("[bstcad.effects]\nspray = dusty_lenses:Dust\n")
     path = tmp_path / "scene.toml"
     path.write_text('effects = [{ kind = "own", name = "spray" }]\n' + scene.toml())
-    script = "import sys, bstcad; c, = bstcad.load(sys.argv[1]).channels(); print(c.losses.own[0].line)"
-    told = subprocess.run(
-        [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=True,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), os.getcwd()])},
-    )  # fmt: skip
-    assert told.stdout.strip() == "taken by spray"
+    monkeypatch.syspath_prepend(tmp_path)
+    [channel] = bstcad.load(path).channels()
+    assert channel.losses.own[0].line == "taken by spray"

@@ -154,7 +154,29 @@ def measured(job: Mapping[str, Any], run_folder: Path, output: Path, resume: boo
     return State("finished", passed=part.get("passed"), rrmsd=part.get("rrmsd_predicted"), folder=output.name)
 
 
-JOBS = {work.__name__: work for work in (design, tolerance, tradeoff, measured)}  # functions by kind of run
+def compensate(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool) -> State:
+    """Write what to cut next, from the file of measured points in the run's folder."""
+    from bstcad import commands
+
+    [cloud] = run_folder.glob(f"{CLOUD}.*")
+    found = commands.compensate(output, [cloud], progress=ProgressFile(run_folder / PROGRESS))
+    return State("finished", rrmsd=found.figures["rrmsd"]["expected"], folder=found.folder.name)
+
+
+def retailor(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool) -> State:
+    """Tailor the back anew to a blank as built.  job: thickness (mm) and index, one of which may be None."""
+    from bstcad import commands
+    from bstcad.shop.as_built import AsBuilt
+
+    hooks = commands.Hooks(ProgressFile(run_folder / PROGRESS))
+    built = AsBuilt(job.get("thickness"), job.get("index"))
+    folder, report, _ = commands.retailor(output, built, hooks=hooks)
+    return State("finished", passed=report.contents.passed, rrmsd=report.contents.rrmsd, folder=folder.name)
+
+
+# functions by kind of run
+JOBS = {work.__name__: work for work in (design, tolerance, tradeoff, measured, compensate, retailor)}
+STUDIES = tuple(kind for kind in JOBS if kind != design.__name__)  # kinds of runs of a finished design
 
 
 # ---- the process -----------------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ import traceback
 import zipfile
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ import bstcad
 from bstcad import folder as folders
 from bstcad.app import crop, design_runs, dome_offer, form, preview_json, scene_text, sketch
 from bstcad.app.connections import bound, uvicorn_server
+from bstcad.app.design_process import STUDIES
 from bstcad.app.design_runs import SCENE_TEXT, Run
 from bstcad.app.followers import impossible_choices, take_change
 from bstcad.app.guard import POLICY, SANDBOX, Guard
@@ -43,13 +45,14 @@ from bstcad.runs.files import SentenceError
 from bstcad.scene import new_scene, scene_file
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.picture import SAMPLES
+from bstcad.scene.quality import GRADE_NAMES
 from bstcad.scene.scene_file import MAX_DOTS
 from bstcad.scene.schema import rows
 
 Body = Mapping[str, Any]  # JSON object that a page sends
 ANSWER_TIMEOUT = 20.0  # time (s) until a waiting request returns without an answer and the page polls again
 UPLOAD = "/api/picture"  # address to which a page sends a picture
-LARGE_BODY_PATHS = rf"{UPLOAD}|/api/design/[^/]+/measured"  # paths whose bodies may have LARGEST_UPLOAD bytes
+LARGE_BODY_PATHS = rf"{UPLOAD}|/api/design/[^/]+/(measured|compensate)"  # their bodies may have LARGEST_UPLOAD bytes
 STATIC = Path(__file__).parent / "static"  # folder of scripts and styles
 # Content types, by file ending, of the files of a design that a page shows; all other files are downloads.
 CONTENT_TYPES = {".html": "text/html", ".json": "application/json", ".png": "image/png", ".pdf": "application/pdf"}
@@ -61,7 +64,10 @@ KEYS_PAGE = "reference/scene-keys"  # page of the documentation that is generate
 MAX_VALID_TEXTS = 31  # largest number of scenes, besides the current one, whose latest valid text is stored
 # Files at the top of the list of a design's files.
 FIRST_FILES = ("lens.step", "part.step", "report.html", "datasheet.pdf", "lens.stl", "lens.3mf")
-CLOUD_ENDINGS = ((b"ply", ".ply"), (b"solid", ".stl"))  # (first bytes of a file of measured points, file ending)
+CLOUD_ENDINGS = (  # (offset of the first bytes of a file of measured points, these bytes in lower case, file ending)
+    (0, b"ply", ".ply"), (0, b"solid", ".stl"), (0, b"pk\x03\x04", ".x3p"), (1, b"iso-", ".sdf"), (1, b"bcr-", ".sdf"),
+    (1, b"hdf\r\n", ".datx"), (0, b"vca data", ".opdx"), (2, b"directory", ".opd"), (0, b"digital surf", ".sur"),
+)  # fmt: skip
 
 
 class Workbench:
@@ -94,7 +100,8 @@ class Workbench:
             f"{design}/stop": self.stop,
             f"{design}/go-on": self.go_on,
             f"{design}/edit": self.edit,
-            f"{design}/measured": self.measured,
+            f"{design}/measured": partial(self.measured, kind="measured"),
+            f"{design}/compensate": partial(self.measured, kind="compensate"),
             "/api/scenes": _json_handler(self.add_scene),
             f"{scene}/change": _json_handler(self.change_scene),
             f"{scene}/proportions": _json_handler(self.take_proportions),
@@ -103,6 +110,7 @@ class Workbench:
             f"{scene}/make": _json_handler(self.make),
             f"{design}/tolerance": _json_handler(self.tolerance),
             f"{design}/tradeoff": _json_handler(self.tradeoff),
+            f"{design}/retailor": _json_handler(self.retailor),
         }
         routes = [Route(path, answer) for path, answer in get_routes.items()]
         routes += [Route(path, answer, methods=["POST"]) for path, answer in post_routes.items()]
@@ -164,7 +172,7 @@ class Workbench:
         return self._page("manual.html.j2", title="Documentation", text=text)
 
     def _page(self, template: str, status: int = 200, **values: Any) -> HTMLResponse:
-        common = {"version": bstcad.__version__, "has_docs": self.has_docs, "rrmsd_words": RRMSD}
+        common = {"version": bstcad.__version__, "has_docs": self.has_docs, "rrmsd_words": RRMSD, "grades": GRADE_NAMES}
         return HTMLResponse(form.environment().get_template(template).render(**common, **values), status_code=status)
 
     # ---- pages ----
@@ -214,7 +222,7 @@ class Workbench:
         result = {"rrmsd": record.rrmsds(known) if known else "", "doubts": doubts(known) if known else ()}
         result |= {"report": known, "files": names, "has_light": "figures/irradiance.png" in names}
         result["counts"] = counts(known.checks) if known else ""
-        jobs = {kind: self._news(Run(folder, kind)) for kind in ("tolerance", "tradeoff", "measured")}
+        jobs = {kind: self._news(Run(folder, kind)) for kind in STUDIES}
         return self._page("design.html.j2", title=name, name=name, run=self._news(run), jobs=jobs, **result)
 
     def compare_page(self, request: Request) -> Response:
@@ -343,10 +351,14 @@ class Workbench:
     # ---- previews ----
 
     def preview(self, name: str, body: Body) -> dict[str, Any]:
-        """Request previews of a scene and answer as `answer` does for the first stage; body: {page, number}."""
+        """Request previews of a scene and answer as `answer` does for the first stage.
+
+        body: {page, number, made}; made: grade of the picture as made, or absent.
+        """
         text = self.workspace.opened(name).text
         page, number = str(_required(body, "page"))[:40], _integer(_required(body, "number"))
-        asking = PreviewRequest(page, number, self.workspace.scene(name, text), text)
+        grade = str(body["made"]) if body.get("made") in GRADE_NAMES else None
+        asking = PreviewRequest(page, number, self.workspace.scene(name, text), text=text, grade=grade)
         self.desk.ask(asking)
         return self._answered(name, asking, 0)
 
@@ -372,6 +384,8 @@ class Workbench:
             return head | {"refused": f"the computation failed ({why}); a design may still succeed"}
         if name in ("preview", "settled"):
             return head | preview_json.of_preview(found) | {"offer": self._offer(scene, body.text, found)}
+        if name == "made":
+            return head | {"made": None if found is None else preview_json.of_made(*found)}
         return head | (preview_json.of_plan(found) if name == "effects" else preview_json.of_predictions(found))
 
     def _offer(self, name: str, text: str, found: Preview) -> dict[str, Any] | None:
@@ -474,15 +488,24 @@ class Workbench:
         self.workspace.design(f"{name}-tradeoff")  # raises if the folder of the result lies outside
         return self._begin(name, "tradeoff", {"budget": budget})
 
-    async def measured(self, request: Request) -> Response:
-        """Judge a made part by its measured points, the body of the request."""
+    def retailor(self, name: str, body: Body) -> dict[str, Any]:
+        """Start to tailor the back anew; body: {"thickness": mm, "index": number}, one of which may be empty."""
+        given = {key: body.get(key) for key in ("thickness", "index")}
+        values = {key: None if value in (None, "") else _number(value, key) for key, value in given.items()}
+        if not any(values.values()):
+            raise SceneError("thickness: is empty, and so is index; give what was measured of the blank")
+        self.workspace.design(f"{name}-as-built")  # raises if the folder of the result lies outside
+        return self._begin(name, "retailor", values)
+
+    async def measured(self, request: Request, kind: str) -> Response:
+        """Judge a made part, or compute what to cut next, by its measured points, the body of the request."""
         data, name = await request.body(), request.path_params["name"]
         head = data[:80].lstrip().lower()
-        ending = next((ending for start, ending in CLOUD_ENDINGS if head.startswith(start)), ".csv")
+        ending = next((ending for offset, first, ending in CLOUD_ENDINGS if head.startswith(first, offset)), ".csv")
         if ending == ".csv" and b"\0" in data[:200]:
             ending = ".stl"  # binary STL
         contents = {f"cloud{ending}": data}
-        return JSONResponse(await run_in_threadpool(self._begin, name, "measured", contents=contents))
+        return JSONResponse(await run_in_threadpool(self._begin, name, kind, contents=contents))
 
     def _begin(
         self, name: str, kind: str, job: Body | None = None, contents: Mapping[str, bytes] | None = None

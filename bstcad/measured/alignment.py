@@ -133,6 +133,7 @@ class Alignment:
     outside: int  # number of points outside the outline, or on its rim
     off_face: int  # number of points inside the outline, but far from the face
     outliers: np.ndarray = field(repr=False)  # isolated points near the face (k, 3), mm, in the frame of the design
+    out: np.ndarray = field(repr=False)  # mask of the outliers among the points of the cloud
 
     @property
     def outlier_fraction(self) -> float:
@@ -165,12 +166,19 @@ def align(face: BackFace, cloud: np.ndarray, start: Pose) -> Alignment:
             judged[chosen] = True
         out[chosen] = isolated
         pose = _least_squares(face, cloud[~out], pose)
+    return at_pose(face, cloud, pose, out)
+
+
+def at_pose(face: BackFace, cloud: np.ndarray, pose: Pose, out: np.ndarray) -> Alignment:
+    """Return the alignment of a cloud (n, 3) at a pose; out: mask (n,) of the outliers."""
     points, inside, near = _face_points(face, cloud[~out], pose)
     distances, normals = face.distance(points)
     _, motions = gauss_newton_step(face, points, distances, normals)
     counts = {"outside": int((~inside).sum()), "off_face": int((inside & ~near).sum())}
     free, outliers = _undetermined(motions), pose.to_design(cloud[out])
-    return Alignment(pose, points, distances, normals, motions=motions, undetermined=free, outliers=outliers, **counts)
+    return Alignment(
+        pose, points, distances, normals, motions=motions, undetermined=free, outliers=outliers, out=out, **counts
+    )
 
 
 def _least_squares(face: BackFace, cloud: np.ndarray, pose: Pose) -> Pose:

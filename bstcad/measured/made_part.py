@@ -14,6 +14,7 @@ from bstcad.measured import alignment as aligning
 from bstcad.measured.alignment import Alignment, BackFace, Pose
 from bstcad.measured.cloud import Cloud
 from bstcad.measured.form_error import Deviation, FormError, deviation, fit_form_error, minimum_zone
+from bstcad.measured.shrinkage import AxisScales, axis_scales
 from bstcad.optics.goal import Goal, worst
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, Light
@@ -57,7 +58,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     figures = deviation(lens, alignment, form)
     cheap = replace(nominal.effort(effort), witness=False)
     lights = [_light(lens, form, nominal, goal, effort=cheap) for goal in nominal.goals]
-    scale = aligning.scale(face, alignment)
+    scale, axes = aligning.scale(face, alignment), axis_scales(face, alignment)
     checks = (
         *of_cloud,
         *_light_checks(nominal, lights),
@@ -65,6 +66,8 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     )
     facts = _facts(face, alignment, figures, cloud) | {
         "scale": scale[0],
+        **axes.facts(),
+        "moulding_shrinkage": _moulding_shrinkage(nominal, scale[0], axes),
         "passed": all(check.passed for check in checks),
     }
     predicted = [_predicted(light, high) for light, high in lights]
@@ -194,6 +197,18 @@ def _light(lens: Lens, form: FormError, nominal: Nominal, goal: Goal, *, effort:
     light = light_with(form)
     samples = (light_with(form.posterior_sample(draw, sign)).rrmsd for sign in (1.0, -1.0))
     return light, max(light.rrmsd, math.hypot(*samples) / math.sqrt(2))  # quadratic mean of two opposite samples
+
+
+def _moulding_shrinkage(nominal: Nominal, scale: float, axes: AxisScales) -> list[float] | None:
+    """Return the shrinkage (or three along x, y, z) by which the next part has the size of the design; None: no mould.
+
+    scale, axes: size of the part relative to the design, which was made in the cavity of the scene's [moulding].
+    """
+    moulding = nominal.scene.moulding
+    if moulding is None or not (moulding.is_uniform or np.isfinite(axes.uncertainties).all()):
+        return None
+    found = moulding.as_measured([scale] * 3 if moulding.is_uniform else axes.scales)
+    return list(found[:1] if moulding.is_uniform else found)
 
 
 def _facts(face: BackFace, alignment: Alignment, error: Deviation, cloud: Cloud) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bstcad.optics import irradiance, ops, sampling
+from bstcad.optics import domes, irradiance, ops, sampling
 from bstcad.optics.bspline import is_net
 from bstcad.optics.channels import Channel, source_numbers, weighted_sum
 from bstcad.optics.emitters import Emitter
@@ -266,7 +266,11 @@ def _as_fractions(
         return Simulation(box / whole, tent / whole, flux, count)
     underside_lit = first.front.outline is not None and first.passes.sense > 0 and not first.before
     if underside_lit and splits_missed:
-        stopped = sum(part * on_underside(source, lens.front.plain(), lens.outline) for part, source, lens, _ in lights)
+        stopped = sum(
+            part
+            * on_underside(source, lens.front.plain(), domes.opening(lens) if domes.is_dome(lens) else lens.outline)
+            for part, source, lens, _ in lights
+        )
         flux[UNDERSIDE] = max(min(stopped, flux["missed the lens"]), 0.0)
         flux["missed the lens"] -= flux[UNDERSIDE]
     return Simulation(box / whole, tent / whole, flux, count)

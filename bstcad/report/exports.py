@@ -1,4 +1,4 @@
-"""Files of `bstcad export` and `[output] export`, by kind: tables, tool paths, drawings, preview meshes.
+"""Files of `bstcad export` and `[output] export`, by kind: tables, tool paths, tiles, drawings, preview meshes.
 
 Tables are text: the first line names the columns, lengths in mm.  Drawings show the outline of a bare lens, or the part
 with its [mount], seen from the back: x to the right, y up, mm.  Each kind of edge is a set of closed curves on its own
@@ -21,6 +21,7 @@ import torch
 
 from bstcad.analysis.far_field import NOMINAL_LUMENS, FarField
 from bstcad.cad.mesh import DEFAULT_LABEL, Label, preview_files
+from bstcad.cad.tiling import Tiling
 from bstcad.optics import domes
 from bstcad.optics.bspline import is_net
 from bstcad.optics.lens import Lens
@@ -30,11 +31,13 @@ from bstcad.photometry import eulumdat, ies, intensity_files, tm25
 from bstcad.photometry.intensity import Intensity, Luminaire
 from bstcad.report.grid_sag import MAX_POINTS, MIN_POINTS, GridLight, GridSag, axes, table_note
 from bstcad.report.heightmap import HeightMap, default_pixels
+from bstcad.report.tile_files import joints, tile_files
 from bstcad.report.toolpath_files import toolpath_files
 from bstcad.report.units import environment, paragraphs
 from bstcad.runs import files
 from bstcad.scene.blank import export_complaints
-from bstcad.scene.mount import Mount
+from bstcad.scene.moulding import CAVITY, MISSING, Moulding
+from bstcad.scene.mount import Mount, Part
 from bstcad.toolpath.cutting import DEFAULTS, Cutting
 
 SIDECAR = ".txt"  # suffix of a text file that states how far interpolation of a table moves the light
@@ -44,6 +47,7 @@ RAY_COUNT = 1_000_000  # number of rays of a file
 SHEET = "datasheet"  # kind of export that `export` omits: the caller draws it from the report in the design's folder
 
 OUTLINE, RIM, FLANGE, SCREWS, HOLES = "OUTLINE", "RIM", "FLANGE", "SCREW_HOLES", "HOLES"  # layers of edges
+JOINTS = "JOINTS"  # layer of the joints between tiles
 CENTRES, TEXT = "CENTRES", "TEXT"  # layers of centre marks and of text
 MARK_OVERSHOOT = 1.5  # length by which a centre mark extends beyond the edge of a hole or rim (mm)
 SVG_MARGIN = 3.0  # margin around the drawing in the SVG (mm)
@@ -66,6 +70,8 @@ STYLES = {  # attributes of the other groups (SVG), by layer
 }
 DXF_SIGNS = str.maketrans({"Ø": "%%c", "°": "%%d", "×": "x"})  # codes that CAD systems show in any font
 
+DEFAULT_TILING = Tiling()  # tiles of `--as tiles` without `--tiles`, and of a scene
+
 # (layer, kind, content); content (mm), by kind: "circle": x, y, radius; "box", centred on the axis: half width, half
 # height, corner radius; "line": x and y of one end, then of the other; "text": x, y and the string.
 Piece = tuple[str, str, tuple[Any, ...]]
@@ -82,7 +88,8 @@ class Exported:
 def export(
     lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = None, label: Label = DEFAULT_LABEL,
     mount: Mount | None = None, light: GridLight | None = None, far: FarField | None = None,
-    cutting: Cutting = DEFAULTS,
+    cutting: Cutting = DEFAULTS, moulding: Moulding | None = None, part: Part | None = None,
+    tiling: Tiling = DEFAULT_TILING,
 ) -> Exported:  # fmt: skip
     """Write the files of `kinds` (files.EXPORTS; nothing for SHEET) to the folder, each completely or not at all.
 
@@ -90,7 +97,9 @@ def export(
     longer side (OpticStudio: at the knots).  label: name of a mesh or part.  mount: mount in drawings; None: drawings
     show the outline of the lens.  light: light that is traced to compute the error of grids and tables; None: the error
     is not computed.  far: light for intensity files; None: they cannot be exported.  cutting: settings of tool paths.
-    ValueError: a kind is unknown, points is out of range, or a tool path is not possible.
+    moulding: shrinkage for the cavity; None: it cannot be exported.  part: data of the part that STEP files state.
+    tiling: numbers of tiles along x and along y.
+    ValueError: a kind is unknown, points is out of range, or a tool path or a tile is not possible.
     """
     for kind in kinds:
         if kind not in files.EXPORTS:
@@ -98,9 +107,17 @@ def export(
     if points is not None and not MIN_POINTS <= points <= MAX_POINTS:
         raise ValueError(f"points = {points} is not possible; give a number from {MIN_POINTS} to {MAX_POINTS}")
     lens, paths, notes, intensity = lens.plain(), [], [], None
-    for complaint in export_complaints(kinds, domes.is_dome(lens), lens.passes.index_before):
+    for complaint in export_complaints(
+        kinds, domes.is_dome(lens), lens.passes.index_before, front_ends=lens.front.outline is not None
+    ):  # fmt: skip
         raise ValueError(complaint)
     for kind in dict.fromkeys(kinds):
+        if kind == CAVITY:
+            if moulding is None:
+                raise ValueError(MISSING)
+            paths += _write_cavity(lens, moulding, mount, folder, label=label, part=part or Part())
+            notes.append(paths[-1].read_text(encoding="utf-8").strip())
+            continue
         if kind in (*INTENSITIES, RAYS) and far is None:
             raise ValueError(f"'{kind}' needs the light of a scene; export it from the folder of a design")
         if kind == RAYS and far is not None:
@@ -110,8 +127,9 @@ def export(
         if kind in INTENSITIES and far is not None and intensity is None:  # traced once for all files
             intensity = Stated(far.table(lens), far.lumens)
         for name, data in _files(
-            kind, lens, points, label=label, mount=mount, light=light, intensity=intensity, cutting=cutting
-        ):
+            kind, lens, points, label=label, mount=mount, light=light, intensity=intensity, cutting=cutting,
+            tiling=tiling, part=part or Part(),
+        ):  # fmt: skip
             files.put(folder / name, data.encode("utf-8") if isinstance(data, str) else data)
             paths.append(folder / name)
             if name.endswith(SIDECAR):
@@ -129,6 +147,8 @@ def _files(
     light: GridLight | None,
     intensity: Stated | None,
     cutting: Cutting,
+    tiling: Tiling,
+    part: Part,
 ) -> Iterator[tuple[str, str | bytes]]:
     count = min(max(lens.back_net.shape), MAX_POINTS) if points is None else points
     match kind:
@@ -161,6 +181,9 @@ def _files(
             yield "heightmap.png", picture.png()
             yield "heightmap.tif", picture.tiff()
             yield f"heightmap{SIDECAR}", picture.words() + "\n"
+        case "tiles":
+            yield from tile_files(lens, tiling, label.name, part)
+            yield "tiles.svg", tiles_svg(lens.outline, tiling)
         case "dxf":
             yield "outline.dxf", dxf(lens.plan, mount, label)
         case "svg":
@@ -169,6 +192,21 @@ def _files(
             yield from preview_files(lens, label)
         case "ies" | "ldt" | "csv" if intensity is not None:
             yield f"intensity.{kind}", photometric_file(kind, lens, intensity, label)
+
+
+def _write_cavity(
+    lens: Lens, moulding: Moulding, mount: Mount | None, folder: Path, *, label: Label, part: Part
+) -> list[Path]:
+    """Write the solid of the cavity and its sidecar; return their paths."""
+    from bstcad.cad import cavity
+
+    solid, about = cavity.cavity(lens, moulding, mount)
+    what = "lens" if mount is None else "part"
+    step, sidecar = folder / "cavity.step", folder / f"cavity{SIDECAR}"
+    files.put(step, cavity.step_file(solid, label.name, part))
+    words = f"cavity.step: the {what}, enlarged about x = y = 0, z = {about:.6g} mm; {moulding.words()}\n"
+    files.put(sidecar, words.encode("utf-8"))
+    return [step, sidecar]
 
 
 # --- photometric files ---------------------------------------------------------------------------------------------
@@ -357,10 +395,14 @@ def svg(outline: Outline, mount: Mount | None = None, label: Label = DEFAULT_LAB
     The SVG backend of ezdxf 1.4.5 is not used: it converts circles to splines and text to curves, rounds to a millionth
     of the page and has no groups.
     """
-    pieces = drawing(outline, mount, label)
-    texts = [at for _, kind, at in pieces if kind == "text"]
     whole = outline if mount is None else (mount.flange.outline if mount.flange else mount.rim_of(outline)).outline
     a, b = (half + SVG_MARGIN + MARK_OVERSHOOT * (mount is not None) for half in whole.half_extent)
+    return svg_of(drawing(outline, mount, label), (a, b))
+
+
+def svg_of(pieces: Sequence[Piece], half_extent: tuple[float, float]) -> str:
+    """Return pieces of a drawing as SVG in true size; half_extent: half of its width and height (mm), without text."""
+    (a, b), texts = half_extent, [at for _, kind, at in pieces if kind == "text"]
     right = max([a, *(x + LETTER_WIDTH * len(line) + SVG_MARGIN for x, _, line in texts)])
     low = min([-b, *(y - SVG_MARGIN for _, y, _ in texts)])
     layers: dict[str, list[tuple[str, tuple[Any, ...]]]] = {}
@@ -371,6 +413,17 @@ def svg(outline: Outline, mount: Mount | None = None, label: Label = DEFAULT_LAB
         styles=STYLES, edges=EDGES, n=lambda value: f"{_plain(value):.15g}",
         dash=lambda at: (CHAIN_LENGTHS[0] - math.dist(at[:2], at[2:])) / 2 % sum(CHAIN_LENGTHS),  # a dash at the centre
     ) + "\n"  # fmt: skip
+
+
+def tiles_svg(outline: Outline, tiling: Tiling) -> str:
+    """Return the plan of the tiles of a plate as SVG in true size, seen from the back: outline, joints and names."""
+    cells = tiling.cells(outline)
+    pieces = [_edge(OUTLINE, outline), *((JOINTS, "line", ends) for ends in joints(cells))]
+    for cell in cells:
+        x, y = (sum(span) / 2 for span in cell.extent)
+        pieces.append((TEXT, "text", (x - LETTER_WIDTH * len(cell.name) / 2, y - CAPITAL_HEIGHT / 2, cell.name)))
+    a, b = outline.half_extent
+    return svg_of(pieces, (a + SVG_MARGIN, b + SVG_MARGIN))
 
 
 def words(outline: Outline, mount: Mount, label: Label) -> list[str]:

@@ -314,6 +314,22 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
 
 
 @styled
+def picture_as_made(target: np.ndarray, designed: np.ndarray, made: np.ndarray, view: View) -> Figure:
+    """Draw target, light as designed and as made, and the difference of the last two in percent of the lit pixels.
+
+    target, designed, made: (rows, columns) in coordinates, with equal sums.
+    """
+    pictures = {"Target": target, "As designed": designed, "As made": made}
+    shown = {title: view.irradiance(picture) for title, picture in pictures.items()}
+    figure, _ = _side_by_side(shown, "As made − as designed", view, height=1.3 + 2.2 * view.proportion)
+    view.note(
+        figure,
+        f"  The grey tones look as the light looks to an eye (sRGB); the scale states the {view.receiver.light}.",
+    )
+    return figure
+
+
+@styled
 def reach_picture(target: np.ndarray, reachable: np.ndarray, view: View) -> Figure:
     """Draw the target, and beside it the target again, in vermilion where no light can reach it.
 

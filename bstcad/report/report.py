@@ -262,6 +262,11 @@ def _of_target(plan: Mapping[str, Any], of: str, optic: str) -> Iterator[Rendera
         yield Text()
 
 
+def made_sentences(made: Mapping[str, Any], optic: str) -> list[str]:
+    """Return sentences on the picture of a part as made; made: entry `made` of `bstcad plan --json`."""
+    return paragraphs("plan.txt.j2", "made", made=made, optic=optic)
+
+
 def plan_predictions(plan: Mapping[str, Any]) -> Group:
     """Return predicted seconds, RRMSD and memory by quality, and for a finer net; plan: as for `plan_effects`."""
     from rich.console import Group

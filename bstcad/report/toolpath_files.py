@@ -15,6 +15,7 @@ import numpy as np
 
 from bstcad.optics.bspline import require_net
 from bstcad.optics.lens import Lens
+from bstcad.report.shop_figures import left_figure
 from bstcad.report.units import quantity
 from bstcad.toolpath import gcode
 from bstcad.toolpath.chords import digits
@@ -22,32 +23,33 @@ from bstcad.toolpath.cutting import Cutting
 from bstcad.toolpath.machined_face import MachinedFace, RoundTool
 from bstcad.toolpath.raster import RAPID_FEED, SAFE_HEIGHT, Raster, raster
 from bstcad.toolpath.spiral import Spiral, spiral
-from bstcad.toolpath.swept_volume import Swept, check_raster, check_spiral
+from bstcad.toolpath.swept_volume import LEFT, Swept, check_raster, check_spiral
 
 ANGLE_DIGITS = 7  # decimals of C (degrees): a tenth of a nanometre at 50 mm from the axis
 ROWS_AT_A_TIME = 100_000  # rows of a table that are formatted at a time
 
 
-def toolpath_files(kind: str, lens: Lens, cutting: Cutting, name: str) -> Iterator[tuple[str, str]]:
-    """Yield (name, text) of the files of a path, "spiral" or "raster", over each face of a lens that is a net.
+def toolpath_files(kind: str, lens: Lens, cutting: Cutting, name: str) -> Iterator[tuple[str, str | bytes]]:
+    """Yield (name, content) of the files of a path, "spiral" or "raster", over each face of a lens that is a net.
 
+    If the tool does not reach a part of the face, a picture shows where.
     name: of the lens, for the heading.  ValueError if a face is too steep for the tool, or the path too long.
     """
     for side, face in machined_faces(lens):
         file = f"toolpath-{kind}" + ("" if side == "back" else f"-{side}")
         if kind == "spiral":
             turned = spiral(face, cutting)
-            sentences = [*_of_part(name, side), *spiral_words(turned), *_of_check(check_spiral(turned), turned.tool)]
+            found, cusp = check_spiral(turned), turned.passes.cusp
+            sentences = [*_of_part(name, side), *spiral_words(turned), *_of_check(found, turned.tool)]
             yield f"{file}.csv", _table("c_deg,x_mm,z_mm", _formats(turned), *_columns(turned, face))
         else:
             milled = raster(face, cutting)
-            sentences = [
-                *_of_part(name, side),
-                *raster_words(milled, lens),
-                *_of_check(check_raster(milled), milled.tool),
-            ]
+            found, cusp = check_raster(milled), milled.spacing.cusp
+            sentences = [*_of_part(name, side), *raster_words(milled, lens), *_of_check(found, milled.tool)]
             yield f"{file}.nc", gcode.gcode(milled, sentences)
             yield f"{file}.csv", raster_table(milled)
+        if found.unreached:
+            yield f"{file}-unreached.png", left_figure(found.points, found.clearance, LEFT * cusp)
         yield f"{file}.txt", " ".join(sentences) + "\n"
 
 

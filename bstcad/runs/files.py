@@ -26,7 +26,7 @@ DESIGN_FILES = ("report.json", "lens.step", "scene.toml")  # files, any of which
 # Kinds of files for a shop, as in `bstcad export --as` and the scene's output.export.
 Export = Literal[
     "sag", "points", "zemax", "turning", "spiral", "raster", "heightmap",
-    "dxf", "svg", "preview", "datasheet", "ies", "ldt", "csv", "tm25",
+    "tiles", "dxf", "svg", "preview", "cavity", "datasheet", "ies", "ldt", "csv", "tm25",
 ]  # fmt: skip
 EXPORTS: tuple[str, ...] = get_args(Export)
 HEIGHT_EXPORTS = {  # kinds that need a back of heights z(x, y), which a dome is not, and what they are

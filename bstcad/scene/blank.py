@@ -40,6 +40,7 @@ from bstcad.scene.schema import (
 )
 
 INDICES = (1.01, 5.0)  # range of the refractive index
+INDEX_OFFSETS = (-0.05, 0.05)  # range of the index of a melt minus that of its material
 BOUNDS = ("tool_radius", "max_slope", "max_thickness", "edge_thickness")  # optional keys of lens that bound its faces
 MAX_CELL_RATIO = 1.5  # longer / shorter side of a cell of the net, above which a warning proposes another net
 Outlined = Annotated[Rectangle | Circle, Field(discriminator="shape")]
@@ -75,12 +76,19 @@ class Back(Record):
         return simplified(self.control_points)
 
 
-def export_complaints(kinds: Iterable[str], dome: bool, index_before: float) -> Iterator[str]:
-    """Yield a sentence for each kind of export that cannot hold a lens; index_before: of the medium at its front."""
+def export_complaints(kinds: Iterable[str], dome: bool, index_before: float, front_ends: bool = False) -> Iterator[str]:
+    """Yield a sentence for each kind of export that cannot hold a lens; index_before: of the medium at its front.
+
+    front_ends: True if the front has an outline of its own, with a plane around it.
+    """
     for kind in kinds:
         if dome and kind in HEIGHT_EXPORTS:
             heights = f'"{kind}" is {HEIGHT_EXPORTS[kind]} heights z(x, y), and the back of a dome is none'
             yield f'{heights}; use lens.step or lens.stl, or write "sag" (polar distances), "points" or "preview"'
+        elif dome and kind == "tiles":
+            yield '"tiles" cuts a back of heights z(x, y) along planes, and lens.back is a dome; use lens.step'
+        elif front_ends and kind == "tiles":
+            yield '"tiles" cuts whole faces, and the front ends in lens.front.outline; remove it, or use lens.step'
         elif index_before != 1 and kind == "zemax":
             yield '"zemax" starts its light in air, and lens.encapsulant is not air; use lens.step in its place'
 
@@ -121,6 +129,10 @@ class LensBlank(Record):
 
     material: Annotated[str | None, Key("Name of the material on refractiveindex.info; or give the index.")] = None
     index: Annotated[float | None, Key("Refractive index, in place of material.", "", *INDICES, example=1.49)] = None
+    index_offset: Annotated[
+        float | None,
+        Key("Index of the glass as melted minus the material's.", "", *INDEX_OFFSETS, example=3e-4),
+    ] = None
     encapsulant: Annotated[
         float | None,
         Key("Index of the encapsulant between lamp and front, in place of air.", "", *INDICES, example=1.41),
@@ -164,7 +176,9 @@ class LensBlank(Record):
 
     def index_at(self, wavelength: float) -> float:
         """Return the lens's refractive index at a wavelength (nm); 1 if light does not enter the solid."""
-        return stated_index(self.material, self.index, wavelength) if self.passes.enters else 1.0
+        if not self.passes.enters:
+            return 1.0
+        return stated_index(self.material, self.index, wavelength) + (self.index_offset or 0.0)
 
     @property
     def bounded_by(self) -> tuple[str, ...]:
@@ -270,6 +284,8 @@ class LensBlank(Record):
             yield f"lens.encapsulant: light goes to a mirror through air; remove this key or lens.{mirror}.reflect"
         if self.passes.enters and len(given) != 1:
             yield 'lens: needs exactly one of material and index; give for example material = "PMMA"'
+        if self.index_offset is not None and self.material is None:
+            yield "lens.index_offset: has no effect without lens.material; change lens.index in its place"
         of_back = net_complaints(self.outline, self.back.control_points)
         yield from (f"lens.back.control_points: {complaint}" for complaint in of_back)
         if not self.back.optimise and not self.front.is_tailored:

@@ -20,9 +20,12 @@ DOTTED = rf"(?:{KEY_NAME})(?:\s*\.\s*(?:{KEY_NAME}))*"
 HEADER, KEY = re.compile(rf"\s*(\[\[?)\s*({DOTTED})\s*\]"), re.compile(rf"\s*({DOTTED})\s*=")
 
 NOT_BUILT = {  # beginnings of sentences about features that bstcad does not have yet, by a word for the feature
-    **dict.fromkeys(("rayfile", "ray_file", "rayset", "ray_set"), "files of measured rays are"),
-    **dict.fromkeys(("diffraction", "coherent", "interference"), "wave optics is"),
-    **dict.fromkeys(("scatter", "scattering", "bsdf", "haze"), "scattering is"),
+    **dict.fromkeys(("rayfile", "ray_file", "rayset", "ray_set"), "files of measured rays are not built yet"),
+    **dict.fromkeys(("diffraction", "coherent", "interference"), "wave optics is not built yet"),
+    **dict.fromkeys(
+        ("scatter", "scattering", "bsdf", "haze"),
+        "scattering is not built as an effect of a design (bstcad plan --made GRADE predicts it for rough faces)",
+    ),
 }
 # Patterns: key of a single target at the beginning of a sentence or inside it; key of one of several targets.
 THE_TARGET, ONE_TARGET = re.compile(r"^target(?=[.:])|(?<=\s)target(?=\.[a-z])"), re.compile(r"target\[\d+\]")
@@ -54,12 +57,12 @@ def with_target_key(sentence: str, key: str) -> str:
 def nearest(word: str, known: list[str], otherwise: str) -> str:
     """Return "did you mean …?" for a misspelt word, or else all known words after the words `otherwise`.
 
-    For a word of NOT_BUILT, "… not built yet" precedes the list.  Words are compared by difflib's ratio: twice the
+    For a word of NOT_BUILT, its sentence precedes the list.  Words are compared by difflib's ratio: twice the
     number of letters that they share in order, divided by the number of all letters.
     """
     choices = f"{otherwise} {', '.join(known)}"
     if missing := NOT_BUILT.get(word.casefold()):
-        return f"{missing} not built yet; {choices}"
+        return f"{missing}; {choices}"
     similar = difflib.get_close_matches(word.casefold(), known, n=1, cutoff=SIMILARITY)
     return f"did you mean {similar[0]!r}?" if similar else choices
 

@@ -168,6 +168,10 @@ Name = Literal[
 ]  # fmt: skip
 FORM, RIPPLE = ("back.form", "front.form"), ("back.ripple",)
 FACE_ERRORS = {"correlation_length": FORM, "period": RIPPLE, "pattern": RIPPLE}  # key -> errors that can have this key
+FINISH_KEYS = ("layer_height", "smoothing_length", "roughness", "roughness_length")  # keys of tables without a name
+GRADE_NAMES = (  # grades of manufacture, which tolerance/grades.py defines
+    "moulded", "diamond-turned", "precise", "milled-polished", "milled-sanded", "resin-printed", "resin-printed-coated",
+)  # fmt: skip
 TWO_FACE_ERRORS = ("front.", "lens.wedge")  # prefixes of errors that are zero unless a [[tolerance]] names them
 NONE = "none"  # grade of an error that is always zero
 
@@ -177,7 +181,18 @@ class Tolerance(Record):
 
     name: Annotated[Name | None, Key("Name of the error (lens.decentre: along x and y); all errors if absent.")] = None
     grade: Annotated[
-        Literal["moulded", "diamond-turned", "precise", "none"] | None, Key("Grade of manufacture; none: error is 0.")
+        Literal[
+            "moulded",
+            "diamond-turned",
+            "precise",
+            "milled-polished",
+            "milled-sanded",
+            "resin-printed",
+            "resin-printed-coated",
+            "none",
+        ]
+        | None,
+        Key("Grade of manufacture; none: error is 0."),
     ] = None
     limit: Annotated[float | None, Key("Limit (±) in the error's unit; form and ripple: RMS.", "", 1e-12, 1e4)] = None
     distribution: Annotated[
@@ -187,6 +202,19 @@ class Tolerance(Record):
     correlation_length: Annotated[float | None, Key("Correlation length of a form error.", "mm", 1e-3, 1e4)] = None
     period: Annotated[float | None, Key("Period of a ripple.", "mm", 1e-3, 1e4, example=0.02)] = None
     pattern: Annotated[Literal["raster", "spiral"] | None, Key("Pattern of the tool marks.", example="spiral")] = None
+    layer_height: Annotated[
+        float | None, Key("Height of the layers of a print (plan --made).", "mm", 1e-4, 1.0, example=0.05)
+    ] = None
+    smoothing_length: Annotated[
+        float | None,
+        Key("Standard deviation of the Gaussian by which a finish smooths layers.", "mm", 1e-4, 10.0, example=0.5),
+    ] = None
+    roughness: Annotated[
+        float | None, Key("Roughness Ra between layers and tool marks.", "nm", 0.0, 1e5, example=20.0)
+    ] = None
+    roughness_length: Annotated[
+        float | None, Key("Correlation length of the roughness.", "mm", 1e-4, 10.0, example=0.02)
+    ] = None
 
     def covers(self, error: str) -> bool:
         """Return True if the table covers this error; one on lens.tilt, or without a name, covers lens.tilt_x."""
@@ -222,5 +250,8 @@ def tolerance_complaints(tables: Sequence[Tolerance]) -> Iterator[str]:
         for key, names in FACE_ERRORS.items():
             if key in stated and table.name not in names:
                 yield f"{where}.{key}: this key is for {' and '.join(names)} only; remove it, or change the name"
+        for key in FINISH_KEYS:
+            if key in stated and table.name is not None:
+                yield f"{where}.{key}: this key states the finish of the part; write it into a table without a name"
         if "distribution" in stated and table.name in FORM:
             yield f"{where}.distribution: a form error is always normally distributed; remove this key"

@@ -42,6 +42,7 @@ from bstcad.scene.elements import Around, Elements, LightPath
 from bstcad.scene.errors import SceneError, explain, line_of, toml_positions, with_target_key
 from bstcad.scene.fronts import as_front, net_extent
 from bstcad.scene.lamp import Point
+from bstcad.scene.moulding import CAVITY, MISSING, Moulding
 from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture
 from bstcad.scene.quality import VERIFICATION_DRAW, VERIFICATION_POINTS, Tailoring, Tolerance
@@ -89,6 +90,7 @@ class Scene(Record):
     output: Annotated[Output, Key("Accuracy of the meshes, and files for the shop.")] = Output()
     part: Annotated[Part, Key("Data of the part for STEP files and data sheet.")] = Part()
     mount: Annotated[Mount | None, Key("Mount of the lens; with this table bstcad writes part.step.")] = None
+    moulding: Annotated[Moulding | None, Key("Shrinkage of a moulded part, for the cavity of its mould.")] = None
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -112,8 +114,13 @@ class Scene(Record):
         yield from self._of_targets(lambda target: target.complaints())
         yield from lighting.dome_complaints(source, lens, self._of_dome)
         yield from lighting.encapsulant_complaints(source, lens, self._of_dome)
-        of_export = export_complaints(self.output.export, lens.dome is not None, lens.passes.index_before)
+        ends = getattr(lens.front, "outline", None) is not None
+        of_export = export_complaints(
+            self.output.export, lens.dome is not None, lens.passes.index_before, front_ends=ends
+        )
         yield from (f"output.export: {complaint}" for complaint in of_export)
+        if CAVITY in self.output.export and self.moulding is None:
+            yield f"output.export: {MISSING}"
         yield from lens.complaints()
         yield from lighting.complaints(source, lens)
         yield from effects.complaints(self.effects, lens)

@@ -47,6 +47,11 @@ OneOrTwoWidths = Annotated[
     Annotated[float, Tag("number")] | Annotated[tuple[float, float], Tag("pair")],
     Discriminator(lambda given: "pair" if isinstance(given, list | tuple) else "number"),
 ]
+# A number, or three numbers along x, y and z.
+OneOrThreeNumbers = Annotated[
+    Annotated[float, Tag("number")] | Annotated[tuple[float, float, float], Tag("three")],
+    Discriminator(lambda given: "three" if isinstance(given, list | tuple) else "number"),
+]
 
 
 class Record(BaseModel):

@@ -24,14 +24,17 @@ from bstcad.measured.compensation import Round, Settings, Statistics
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, Effort
-from bstcad.report.compensation_figure import correction_figure
+from bstcad.report.production import write_production_page
+from bstcad.report.shop_figures import correction_figure
 from bstcad.report.units import quantity
 from bstcad.runs import files
 from bstcad.runs.files import SceneError
 from bstcad.scene.schema import MAX_CONTROL_POINTS
+from bstcad.shop import by_light
 
 ROUNDS, FIGURES = "compensated", "compensation.json"  # folder of the rounds, and file of a round
 FILTER = "Gaussian, ISO 16610-61"
+RATING_ACCURACY = 0.05  # relative error of the RRMSDs from which the cutoff is chosen
 Progress = Callable[[str, int, int, str], None]
 
 
@@ -58,6 +61,13 @@ class Compensated:
             f"RRMSD                         {light['design']:.3g} designed, {light['measured']:.3g} with the measured "
             f"deviation, {light['expected']:.3g} expected",
         ]
+        if found["by"] == "light":
+            volumes = f"{found['volume_mm3']:.3g} mm³ instead of {found['volume_by_form_mm3']:.3g} mm³ by form"
+            stays = {key: quantity(found["may_stay"][f"{key}_mm"], "mm") for key in ("pv", "rms")}
+            lines.append(
+                f"Form error that may stay      PV {stays['pv']}, RMS {stays['rms']}; the correction has {volumes}"
+            )
+            lines.append(f"RRMSD                         {light['expected_by_form']:.3g} expected by form")
         return "\n".join(lines)
 
 
@@ -75,7 +85,14 @@ def compensate(
     read = [load_cloud(path, lens.apertures[1]) for path in clouds]
     if again := next((cloud for cloud in read if cloud.sha256 in used), None):
         raise ValueError(f"{again.path}: an earlier round has used this cloud; measure the parts that were cut last")
-    found = compensation.next_round(lens, cut, read, settings, before=before, decentre=made.scene.accept.decentre)
+    goal, cheap = made.goals[0], replace(made.effort(effort), accuracy=RATING_ACCURACY, witness=False)
+    found = compensation.next_round(
+        lens, cut, read, settings, before=before, decentre=made.scene.accept.decentre,
+        rate=lambda back: made.light(lens.with_back(back), goal, cheap).rrmsd,
+        staying=lambda deviation, inside: by_light.staying(
+            made, deviation, inside, made.light(lens, goal, cheap).rrmsd
+        ),
+    )  # fmt: skip
     progress("compensate", 1, 2, "light and files")
     figures = _figures(made, found, read, effort)
     place = folder / ROUNDS / f"round-{found.number}"
@@ -91,6 +108,7 @@ def compensate(
         (building / "correction.csv").write_text(f"{heading}\n{lines}\n", encoding="utf-8")
         (building / "correction.png").write_bytes(correction_figure(x, y, [deviation, change, left]))
         (building / FIGURES).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    write_production_page(folder)
     progress("compensate", 2, 2, "")
     return Compensated(place, figures)
 
@@ -119,6 +137,8 @@ def _figures(made: Made, found: Round, clouds: Sequence[Cloud], effort: Effort) 
     lens, goal = made.lens, made.goals[0]
     back, cheap = lens.back_net, replace(made.effort(effort), witness=False)
     states = {"design": torch.zeros(back.shape), "measured": found.found.heights, "expected": found.left.heights}
+    if found.may_stay is not None:
+        states["expected_by_form"] = found.left_by_form.heights
     light = {
         name: made.light(lens.with_back(replace(back, heights=back.heights + change)), goal, cheap).rrmsd
         for name, change in states.items()
@@ -132,6 +152,10 @@ def _figures(made: Made, found: Round, clouds: Sequence[Cloud], effort: Effort) 
         "filter": FILTER,
         "cutoff_mm": found.cutoff,
         **{name: {f"{key}_mm": value for key, value in asdict(size).items()} for name, size in sizes.items()},
+        "by": "form" if found.may_stay is None else "light",
+        "volume_mm3": found.volume,
+        "volume_by_form_mm3": found.volume_by_form,
+        "may_stay": None if found.may_stay is None else {f"{k}_mm": v for k, v in asdict(found.may_stay).items()},
         "standard_error_mm": found.standard_error,
         "noise_mm": found.noise,
         "rrmsd": light,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -96,6 +96,13 @@ def no_progress(stage: str, done: int, total: int, text: str) -> None:
     """Report no progress; default of a `Progress`."""
 
 
+def stage_effort(goals: Sequence[Goal], factor: float = 1.0) -> Effort:
+    """Return STAGE_EFFORT, scaled to the number of pixels of the goals; factor: of the rays per side."""
+    pixels = max(goal.picture.size for goal in goals)
+    rays = factor * STAGE_EFFORT.rays * (pixels / STAGE_EFFORT_PIXELS**2) ** (1 / 3)
+    return replace(STAGE_EFFORT, rays=round(rays))
+
+
 @dataclass(frozen=True)
 class Edge:
     """Light at the edge of the reachable part of a target, where it is close to total internal reflection."""
@@ -124,6 +131,7 @@ class Task:
     merit: Callable[[Tensor, Tensor], Tensor] | None = None
     wave: Wave | None = None  # required wavefront behind the lens; None: no wavefront goal
     preview: bool = False  # preview: one round in stages 2 and 3, no RRMSD by rays, no costly alternative
+    refines: bool = False  # refinement of an earlier lens: only the last round of stage 2 or 3
     solution: float | None = None  # sign σ of light_behind.py, +1 or -1; None: feasibility.py chooses
     floor: float = 0.0  # smallest irradiance, relative to the mean, of the furthest picture in stage 1 of two faces
     # control points per side of the front as a function of those of the back; None: the front is not freeform
@@ -176,10 +184,8 @@ class Task:
         return math.nan if any(map(math.isnan, values)) else max(values)
 
     def stage_effort(self, factor: float = 1.0) -> Effort:
-        """Return STAGE_EFFORT, scaled to the number of pixels of the goals; factor: of the rays per side."""
-        pixels = max(goal.picture.size for goal in self.goals)
-        rays = factor * STAGE_EFFORT.rays * (pixels / STAGE_EFFORT_PIXELS**2) ** (1 / 3)
-        return replace(STAGE_EFFORT, rays=round(rays))
+        """Return the `stage_effort` of the goals; factor: of the rays per side."""
+        return stage_effort(self.goals, factor)
 
     def rated(self, lens: Lens, rrmsd: float) -> RatedLens:
         """Return the lens with its figure of merit; rrmsd: its RRMSD by `Task.rrmsd`."""

@@ -81,6 +81,9 @@ LARGE_PIXELS, FAR_OFF_RRMSD = 16, 0.04
 # glass: RRMSD 0.264 with a factor of 1.5, 0.236 with 3, but 0.408 if 60 evaluations on 64 pixels come last.)
 EVALUATION_FACTOR, SINGLE_ROUND_FACTOR = 1.5, 3.0
 IMAGE_POSITIONS, SECOND_MOMENT_POINTS = 16, 8  # cells per side of the back, source points, for the source image's width
+# Evaluations of the only round that refines an earlier lens, as a fraction of those of the stage.  (Letters, 50 µm
+# of thickness and 3e-4 of index: see docs/how-to/blank-as-built.md.)
+REFINING_SHARE = 0.1
 MIN_EVALUATIONS = 30  # evaluations below which stage 2 has a single round and stage 3 gets twice as many
 COMPARED_NET = 65  # largest number of control points per side in `compare_precisions`, for speed
 COMPARED_TUBES = 128  # tubes per side in `compare_precisions`
@@ -204,12 +207,20 @@ def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Steps:
 
     Few tubes resolve the large errors at the start as well as many tubes do.  The last round corrects finer errors.
     """
-    coarse, fine = coarse_rounds(task, lens), tuple(sheet_sizes(task.knobs, round_shares(task)))
+    fine = tuple(sheet_sizes(task.knobs, round_shares(task)))
+    if task.refines:
+        return run_rounds((_fine_round(task, fine[-1][0], refining_evaluations(task.knobs), True),), lens, state)
+    coarse = coarse_rounds(task, lens)
     factor = 1.0 if not coarse else EVALUATION_FACTOR if len(fine) > 1 else SINGLE_ROUND_FACTOR
     last = len(fine) - 1
     first, *others = (_fine_round(task, tubes, round(factor * n), k == last) for k, (tubes, n) in enumerate(fine))
     again = coarse[-1:] if others else ()
     return run_rounds((*coarse, first, *again, *others), lens, state)
+
+
+def refining_evaluations(knobs: ResolvedTailoring) -> int:
+    """Return the number of evaluations of the round that refines an earlier lens."""
+    return math.ceil(REFINING_SHARE * knobs.stage2_iterations)
 
 
 def _fine_round(task: Task, tubes: int, evaluations: int, is_last: bool) -> TubeRound:
@@ -458,7 +469,9 @@ def with_stage3(before: Stage | None, task: Task, lens: Lens, state: Any = None)
             yield replace(last, reason="")
         lens, state = last.lens, None
     rounds = stage3_rounds(task)
-    if before is None:
+    if task.refines:
+        rounds = (replace(rounds[-1], evaluations=refining_evaluations(task.knobs)),)
+    elif before is None:
         rounds = (*coarse_rounds(task, lens), *rounds)
     for step in run_rounds(rounds, lens, state and state.tube_search):
         yield replace(step, state=step.state and Stage3State(step.state))

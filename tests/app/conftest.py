@@ -55,8 +55,9 @@ from bstcad.app import preview, preview_desk
 from bstcad.cli import main
 from bstcad.sweep import plan
 from tests.sweep.conftest import typical_pilot
-preview_desk.QUICK = replace(preview.QUICK, net=48, tubes=96, rounds=1, evaluations=3, blurred=2)
-preview_desk.REFINED = replace(preview.QUICK, net=64, tubes=128, rounds=1, evaluations=6, blurred=3)
+preview_desk.QUICK = replace(preview.QUICK, net=33, tubes=64, rounds=1, evaluations=3, blurred=2)
+preview_desk.REFINED = replace(preview.QUICK, net=49, tubes=96, rounds=1, evaluations=4, blurred=2)
+preview.preview.__defaults__ = preview_desk.QUICK, *preview.preview.__defaults__[1:]  # that of the first scene, too
 plan.run_pilot = typical_pilot
 main()
 """

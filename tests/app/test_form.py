@@ -262,7 +262,7 @@ ODD = ODD | st.lists(ODD, max_size=3) | st.dictionaries(st.sampled_from(["kind",
 ODD = ODD | st.lists(st.dictionaries(st.sampled_from(["kind", "z", "profile"]), ODD, max_size=2), max_size=3)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.data())
 def test_a_wrong_scene_has_a_form_too(draw):
     """Anything may stand anywhere: a person is in the middle of typing."""

@@ -151,7 +151,12 @@ ABOUT_SCENES = (
     ASKED | {"key": "target.z", "value": float("nan")},
     DEEP_BODY,
 )
-ABOUT_DESIGNS = ({}, {"budget": float("nan"), "yield": "nan"}, {"yield": 1e999}, DEEP_BODY)
+ABOUT_DESIGNS = (
+    {},
+    {"budget": float("nan"), "yield": "nan"},
+    {"yield": 1e999, "thickness": 1e999, "index": "x"},
+    DEEP_BODY,
+)
 BODIES = {False: ABOUT_SCENES, True: ABOUT_DESIGNS}
 QUERIES = {
     "/api/design/{name}/run": ("?kind=tolerance&since=0", "?since=0"),

@@ -10,6 +10,7 @@ import pytest
 
 from bstcad import pipeline
 from bstcad.analysis.shape import describe
+from bstcad.app import preview_json
 from bstcad.app.preview import Outdated, PreviewSize, preview
 from bstcad.app.preview_desk import STAGES, PreviewDesk, PreviewRequest
 from bstcad.app.preview_json import DARK_SHAPE_ERROR, MIN_LIT_FRACTION, SHAPE_ERROR, figures
@@ -103,7 +104,8 @@ def test_the_desk_answers_the_newest_request_of_each_page_in_order(monkeypatch):
     try:
         first = PreviewRequest("one", 1, scene)
         desk.ask(first)
-        newer, other = PreviewRequest("one", 2, scene.changed({"target.z": 150.0})), PreviewRequest("two", 1, scene)
+        newer = PreviewRequest("one", 2, scene.changed({"target.z": 150.0}), grade="milled-sanded")
+        other = PreviewRequest("two", 1, scene)
         desk.ask(newer)
         desk.ask(other)
         assert desk.answer(first, 0, 60.0) is None and first.replaced
@@ -116,7 +118,11 @@ def test_the_desk_answers_the_newest_request_of_each_page_in_order(monkeypatch):
         assert [desk.answer(newer, k, 120.0)[0] for k in range(len(STAGES))] == list(STAGES)
         settled = newer.answers[1][1]
         assert np.array_equal(settled.pictures[0][1], preview(newer.scene, size=MORE).pictures[0][1])
-        assert set(newer.answers[3][1]["predicted"]) == {"draft", "standard", "fine"}
+        lens, made = newer.answers[2][1]
+        assert lens is settled and made.grade == "milled-sanded"
+        told = preview_json.of_made(lens, made)
+        assert len(told["targets"]) == 1 and len(told["sentences"]) == 2
+        assert set(newer.answers[4][1]["predicted"]) == {"draft", "standard", "fine"}
         refused = PreviewRequest("three", 1, scene.changed({"target.x": [9e4, 9.1e4]}))
         desk.ask(refused)
         assert isinstance(desk.answer(refused, 0, 60.0)[1], SceneError) and refused.done

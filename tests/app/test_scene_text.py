@@ -68,7 +68,7 @@ def leaves(table, prefix=""):
 # ---- laws ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", TEXTS)
+@pytest.mark.parametrize("name", ["beam_shaper", "flange", "led", "two_pictures"])  # with most kinds of tables
 def test_a_text_is_changed_as_its_tables_are(name):
     text, count = TEXTS[name], 0
     assert "".join(piece.text for piece in pieces(text)) == text
@@ -115,7 +115,7 @@ def test_what_goes_takes_its_own_comments_alone(name):
         assert sorted(left + own + below) == sorted(comments(text)), key
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.sampled_from(sorted(TEXTS)), st.data())
 def test_changes_one_after_another_keep_the_law(name, draw):
     text = TEXTS[name] if draw.draw(st.booleans()) else TEXTS[name].replace("\n", "\r\n").rstrip()

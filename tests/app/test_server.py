@@ -369,8 +369,27 @@ def test_every_file_of_the_list_is_sent_with_its_bytes(own):
     assert own.ask("/design/made/files/lens.step?download", range="bytes=10-19").body == own.files["lens.step"][10:20]
 
 
+def test_a_blank_as_built_is_a_run_with_what_was_measured(own):
+    body = json.dumps({"thickness": "10,5".replace(",", "."), "index": ""}).encode()
+    assert own.ask("/api/design/made/retailor", body).status == 200
+    job = json.loads((Run(own.folder / "made", "retailor").folder / "job.json").read_bytes())
+    assert (job["kind"], job["thickness"], job["index"]) == ("retailor", 10.5, None)
+    for nothing in ({}, {"thickness": "", "index": None}):
+        refused = own.ask("/api/design/made/retailor", json.dumps(nothing).encode())
+        assert refused.status == 400 and b"give what was measured of the blank" in refused.body
+    assert own.ask("/api/design/made/compensate", b"x,y,z\n1,2,3\n").status == 200
+    assert [path.name for path in Run(own.folder / "made", "compensate").folder.glob("cloud*")] == ["cloud.csv"]
+
+
 def test_a_part_is_judged_by_points_kept_by_no_senders_name(own):
     kinds = {b"x,y,z\n1,2,3\n": ".csv", b"ply\nformat": ".ply", b"solid x": ".stl", bytes(90): ".stl"}
+    kinds |= {
+        b"PK\x03\x04": ".x3p",
+        b"bISO-2.0": ".sdf",
+        b"\x01\x00Directory\x00": ".opd",
+        b"\x89HDF\r\n\x1a\n": ".datx",
+    }
+    kinds |= {b"VCA DATA\x01\x00": ".opdx", b"DIGITAL SURF\x00": ".sur"}
     for data, ending in kinds.items():
         words = {"content_disposition": 'attachment; filename="../../evil.sh"', "content_type": "text/x-sh"}
         assert own.ask("/api/design/made/measured?name=../evil", data, **words).status == 200

@@ -99,6 +99,18 @@ def test_a_change_is_seen_in_every_window_and_kept_beside_the_file_until_it_is_s
     assert path.read_bytes() == before.replace(b"100.0", b"60.5").replace(b"48", b"64")  # comments and all
 
 
+def test_the_picture_as_made_stands_beside_the_picture_as_designed(open_page, shared):
+    page = open_page(shared.address)
+    open_scene(page, shared, "printed")
+    page.click("#as-made summary")
+    page.select_option("#grade", "resin-printed")
+    page.wait_for_selector("#made-targets img", timeout=PATIENCE)
+    shown = [image.get_attribute("src") for image in page.locator("#made-targets img").all()]
+    assert len(set(shown)) == 2 and "printed in resin" in page.inner_text("#made-says")
+    page.select_option("#grade", "")
+    page.wait_for_function("() => !document.querySelector('#made-targets img')", timeout=PATIENCE)
+
+
 def test_a_wrong_entry_stays_in_its_field_and_no_lens_is_made_of_it(open_page, shared, capsys):
     """The message is the terminal's, it stands beside the entry, and no figure of the scene before stays."""
     page = open_page(shared.address)

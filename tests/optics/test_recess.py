@@ -9,11 +9,13 @@ import pytest
 import torch
 
 from bstcad.optics import ops
+from bstcad.optics.charts import SphereChart
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.point import Point
+from bstcad.optics.radial import RadialSurface
 from bstcad.optics.rays import Status
 from bstcad.optics.receivers import LevelPlane
 from bstcad.optics.surfaces import Conic, Recess, Sphere
@@ -79,6 +81,17 @@ def test_the_light_beside_the_dome_is_a_line_of_the_ledger(rays, half_angle):
     [unsplit] = through([(1.0, Point(half_angle=half_angle), lens(), 1)], [SCREEN], 400, splits_missed=False)
     assert torch.equal(unsplit.box, light.box) and UNDERSIDE not in unsplit.flux
     assert unsplit.flux["missed the lens"] == pytest.approx(light.flux["missed the lens"] + light.flux[UNDERSIDE])
+
+
+def test_the_underside_of_a_dome_ends_at_its_rim_in_space():
+    """The outline of a dome is a circle of its chart, 30.7 mm here; seen along the axis its rim has 20 mm sin 75°."""
+    lit = SphereChart(20.0).length(math.radians(75.0))
+    back = RadialSurface.sphere(0.0, 20.0, (1.1 * lit, 1.1 * lit), (33, 33))
+    dome = Lens(DOME, back, Circle(lit), 1.5, clear=(Circle(EDGE), Circle(lit)))
+    [light] = simulate_plain([(1.0, Point(), dome, 1)], [SCREEN], 200)
+    rim = 20.0 * math.sin(math.radians(75.0))
+    within = [r * r / (r * r + PLANE**2) for r in (rim, EDGE)]
+    assert light.flux[UNDERSIDE] == pytest.approx(within[0] - within[1], abs=3e-4)
 
 
 def test_a_source_in_the_dome_lights_no_underside():

@@ -138,7 +138,8 @@ def test_ctrl_c_is_a_wish_first():
 def test_the_first_ctrl_c_ends_what_only_has_to_be_written_and_verified(tmp_path):
     """There is no better lens to wait for; the design is kept, and --resume has only these two left to do."""
     path = tmp_path / "small.toml"
-    path.write_text(load(DISK, SMALL).toml())
+    hasty = {"tailoring.rays": 64, "tailoring.rounds": 1, "tailoring.stage2_iterations": 1, "target.pixels": 32}
+    path.write_text(load(DISK, SMALL | hasty).toml())
     stopped = generate(path, tmp_path / "lens")
     for line in stopped.stdout:
         if line.startswith(("write", "verify")):

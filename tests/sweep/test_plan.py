@@ -177,6 +177,7 @@ class TestCommand:
     def test_what_is_not_predicted_is_said(self, capsys):
         """The plate would reach the target."""
         few = ["plan", str(TEMPLATES / "caustic_portrait.toml"), "--set", "target.pixels=48", "--set", "target.z=24.0"]
+        few += ["--set", f"{NET}=65"]
         assert cli.run([*few, "--json"]) == 0
         out, err = capsys.readouterr()
         found = json.loads(out)

@@ -27,7 +27,9 @@ SCENES = {
     "two faces, two pictures": two_faces.SMALL,
     "dome": domes.SMALL,
     "front alone": two_faces.SMALL | {"target": two_faces.CHANGES["target"][:1], "lens.back.optimise": False},
-    "two faces, picture and wave": two_faces.SMALL | two_faces.WITH_WAVE,
+    "two faces, picture and wave": two_faces.SMALL
+    | two_faces.WITH_WAVE
+    | {"tailoring": two_faces.SMALL["tailoring"] | {"rounds": 2, "stage2_iterations": 12}},
     "paper": TINY
     | {
         "tailoring.quality": "paper",

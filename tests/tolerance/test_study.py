@@ -30,7 +30,7 @@ from bstcad.tolerance.perturbations import trials
 from bstcad.tolerance.study import StudySettings, TargetPictures, gram, principal_axes, product, run_locally
 from tests.conftest import quick_effort
 
-TUBES, FULL = 257, 40
+TUBES, FEW_TUBES, FULL = 257, 129, 40
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def test_adjusting_the_screen_never_makes_it_worse(found):
 def test_the_screen_can_be_adjusted_where_it_is_no_error(pictures):
     """A lens off its axis shifts the picture, and the screen follows it; the errors' own figures have no part of it."""
     decentres = tuple(p for p in pictures.perturbations if p.kind.name.startswith("lens.decentre"))
-    few = replace(pictures, perturbations=tuple(replace(p, limit=0.05) for p in decentres), tubes=129)
+    few = replace(pictures, perturbations=tuple(replace(p, limit=0.05) for p in decentres), tubes=FEW_TUBES)
     nominal = study.traced_figure(few, np.zeros(2))
     found = study.study(few, 1.02 * nominal, nominal, StudySettings(seed=3, trials=100, full=10))
     raised = found.linear[:10] > 1.05 * nominal
@@ -173,7 +173,7 @@ def studied(small_design, tmp_path_factory):
     folder = shutil.copytree(small_design.folder, tmp_path_factory.mktemp("studied") / "small")
     said, quick = io.StringIO(), tolerancing.tolerance
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
-        few = {"tubes": TUBES, "full": 10, "trials": 500}
+        few = {"tubes": FEW_TUBES, "full": 10, "trials": 200}
         patch.setattr(tolerancing, "tolerance", lambda folder, settings: quick(folder, replace(settings, **few)))
         assert cli.run(["tolerance", str(folder), "--yield", "90", "--grade", "moulded"]) == 0
     return folder, said.getvalue()
@@ -231,7 +231,7 @@ def facts_of(folder):
 
 def test_no_bit_depends_on_how_many_workers_trace(pictures):
     """Threads of this process here; processes of their own, one of them killed, in the benchmark."""
-    few = replace(pictures, perturbations=pictures.perturbations[::5])
+    few = replace(pictures, perturbations=pictures.perturbations[::5], tubes=FEW_TUBES)
     threads = {"n_workers": 3, "threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
     with distributed.LocalCluster(**threads) as local, Cluster(local.scheduler_address) as cluster:
         there = study.study(few, 1.0, 0.0, StudySettings(seed=3, trials=50, full=6, spread=cluster.spread))

@@ -11,6 +11,7 @@ import re
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from scipy.interpolate import BSpline
 from scipy.spatial import cKDTree
 
@@ -165,6 +166,8 @@ def test_a_ball_that_is_too_large_is_said_where_it_does_not_reach():
     assert 2 < expected < 30 and float(fraction) == pytest.approx(expected, rel=0.25)
     assert float(left) == pytest.approx(1e3 * found.max(), rel=0.05)
     assert -found.min() < 1e-3
+    picture = np.asarray(Image.open(io.BytesIO(files["toolpath-raster-unreached.png"])).convert("RGB"), float)
+    assert (np.abs(picture - (213, 94, 0)).sum(-1) < 60).sum() > 200  # the line around the groove
 
 
 def turned(lens, planes, spacing, **settings):

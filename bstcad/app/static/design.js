@@ -90,6 +90,8 @@ const RESULTS = {
   tolerance: () => [[`/design/${name}/files/report.html`, "the report's section on tolerances"], [`/design/${name}/files/tolerance.json`, "tolerance.json"]],
   tradeoff: (state) => [[`/design/${state.folder}/files/tradeoff.html`, "time against accuracy"], [`/design/${state.folder}/files/tradeoff.csv`, "tradeoff.csv"]],
   measured: () => [[`/design/${name}/files/measured/cloud/report.html`, "the part's report"]],
+  compensate: (state) => [[`/design/${name}/files/production.html`, "the page to sign"], [`/design/${name}/files/compensated/${state.folder}/lens.step?download`, "lens.step to cut next"]],
+  retailor: (state) => [[`/design/${state.folder}`, "the new design"]],
 };
 
 function show(form, state) {
@@ -137,7 +139,7 @@ for (const form of document.querySelectorAll("form.job")) {
     try {
       if (cloud && !cloud.size) throw new Error("Choose the file of measured points first.");
       const number = (key) => (fields.get(key) ?? "").trim().replace(",", ".");
-      await ask(`${at}/${kind}`, cloud || { grade: fields.get("grade"), yield: number("yield"), budget: number("budget") });
+      await ask(`${at}/${kind}`, cloud || { grade: fields.get("grade"), yield: number("yield"), budget: number("budget"), thickness: number("thickness"), index: number("index") });
       form.next = 0;
       form.began = new Map();
       followJob(form);
