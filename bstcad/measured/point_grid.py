@@ -117,7 +117,7 @@ def _read_x3p(data: bytes) -> MeasuredPoints:
     if info.feature_type is x3pio.FeatureType.PROFILE:
         raise _NotAMap(f"has a profile of {math.prod(info.shape)} points; measure the area of the back face")
     file = x3pio.X3pFile.loads(data, verify=False)
-    layer: Any = file.layers[0]  # of a surface or a point cloud
+    layer: Any = file.layers[0]  # layer of a surface or a point cloud
     states_origin = not file.placement.is_identity or layer.x is not None or layer.y is not None
     if states_origin:
         points = layer.points(coordinate_system=x3pio.CoordinateSystem.GLOBAL)

@@ -157,7 +157,7 @@ def _landings(
     start = finished[0] if finished else len(faces)
     for face in faces[first:start]:
         rays = cross(rays, face).rays
-    met = [_meet(rays, face) for face in faces[start : start + 1]]  # the same for all phases
+    met = [_meet(rays, face) for face in faces[start : start + 1]]  # rays at the faces, equal for all phases
     for number in numbers:
         light = rays
         for k, face in enumerate(faces[start:]):
