@@ -152,5 +152,6 @@ def _lines(channels: Sequence[Channel]) -> list[list[int]]:
 
 def weighted_sum(channels: Sequence[Channel], values: Iterable[Any]) -> Any:
     """Return Σ_k w_k v_k of values v_k (tensors or numbers), one per channel; exactly v_1 if there is one channel."""
-    first, *others = (channel.weight * value for channel, value in zip(channels, values, strict=True))
+    pairs = zip(channels, values, strict=True)
+    first, *others = (value if channel.weight == 1 else channel.weight * value for channel, value in pairs)
     return sum(others, first)

@@ -8,6 +8,7 @@ verification).  They sum in float64: float32 sums stop growing at 2^24 rays.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics import ops
-from bstcad.optics.kernels.reductions import total
+from bstcad.optics.kernels.reductions import quotient, total
 from bstcad.optics.motion import Motion
 from bstcad.optics.rays import Landed, Status, axes, clocked, clocking_of, tilt_of
 from bstcad.optics.receivers import LevelPlane, Receiver, TiltedPlane
@@ -66,6 +67,10 @@ class Screen:
             return replace(self, x=x, y=y, z=z)
         e_x, e_y, n = map(motion.direction, clocked(axes(self.tilt or (0.0, 0.0)), self.clocking))
         return replace(self, x=x, y=y, z=z, tilt=tilt_of(n), clocking=clocking_of((e_x, e_y, n)))
+
+    def divided(self, cells: int) -> Screen:
+        """Return the screen with `cells` x `cells` cells in the place of each pixel."""
+        return replace(self, pixels=(cells * self.columns, cells * self.rows))
 
     @property
     def columns(self) -> int:
@@ -175,10 +180,60 @@ def box(rays: Landed, screen: Screen) -> Tensor:
     return image.view(screen.shape)
 
 
+def joined_cells(picture: Tensor, count: int) -> Tensor:
+    """Return the sums of count x count neighbouring cells; cells beyond the last row and column count as zero."""
+    if count == 1:
+        return picture
+    rows, columns = (-(-side // count) for side in picture.shape)
+    if (rows * count, columns * count) != tuple(picture.shape):
+        whole = picture.new_zeros((rows * count, columns * count))
+        whole[: picture.shape[0], : picture.shape[1]] = picture
+        picture = whole
+    by_row = sum(picture.view(rows, count, -1).unbind(1)[1:], picture.view(rows, count, -1)[:, 0])
+    return sum(by_row.view(rows, columns, count).unbind(2)[1:], by_row.view(rows, columns, count)[..., 0])
+
+
 def rrmsd(irradiance: Tensor, target: Tensor) -> Tensor:
     """Return sqrt(Σ |E_s - E|² / Σ E²), E_s: irradiance scaled to the sum of target E (Wang et al. 2023, Eq. 15)."""
     scaled = irradiance * (total(target) / total(irradiance))
     return torch.sqrt(total((scaled - target) ** 2) / total(target**2))
+
+
+@dataclass(frozen=True, eq=False)
+class CellTarget:
+    """Target picture on cells, and the weights of the errors on pixels and on ever smaller cells in `picture_error`."""
+
+    picture: Tensor  # target T (k rows, k columns) on the smallest cells, k = 2^(levels - 1) along each side of a pixel
+    weights: tuple[float, ...]  # weights s_l / Σ T_l² of Σ D_l², for pixels (l = 0) to the smallest cells
+    size: float  # Σ T² of the smallest cells
+
+    @classmethod
+    def of(cls, picture: Tensor, shares: Sequence[float] = (1.0,)) -> CellTarget:
+        """Make the target of a picture on cells; shares: shares s_l of the squared errors, of the sum 1."""
+        finest = 1 << (len(shares) - 1)
+        sizes = [float(total(joined_cells(picture, finest >> level) ** 2)) for level in range(len(shares))]
+        weights = tuple(share / size for share, size in zip(shares, sizes, strict=True))
+        return cls(picture.T.contiguous().T, weights, sizes[-1])  # by columns, as `tubes.collect` makes pictures
+
+
+def picture_error(image: Tensor, flux: Tensor, target: CellTarget) -> tuple[Tensor, Tensor]:
+    """Return (error of a picture on all scales, its RRMSD on the smallest cells after scaling to the sum of the target).
+
+    With d = image / flux - T on the smallest cells and D_l the sums of d over cells of 2^-l pixels, the error is
+
+        Σ_l s_l Σ D_l² / Σ T_l²    (weighted squares of Wang et al. 2023, Eq. 15, on ever finer grids),
+
+    differentiable in image (k rows, k columns) and flux (0-d), float64.  The RRMSD has no gradient.
+    """
+    if image.dtype == torch.float64 and (fast := ops.kernel("irradiance.picture_error", image, target.picture)):
+        return fast(image, flux, target)
+    d, last = quotient(image, flux) - target.picture, len(target.weights) - 1
+    error = sum(
+        (weight * total(joined_cells(d, 1 << (last - level)) ** 2) for level, weight in enumerate(target.weights)),
+        torch.zeros_like(flux),
+    )
+    shape = image.detach() / total(image.detach())
+    return error, (total((shape - target.picture) ** 2) / target.size).sqrt()
 
 
 @dataclass(frozen=True)

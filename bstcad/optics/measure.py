@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,8 +30,8 @@ from torch import Tensor
 
 from bstcad.optics import tubes
 from bstcad.optics.channels import Channel, Draw, points_per_line, source_numbers, weighted_sum
-from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import LEDGER_OF_GIVEN_RAYS, Leak, Screen, efficiency, leak, leaving, rrmsd
+from bstcad.optics.goal import Goal, interpolated
+from bstcad.optics.irradiance import LEDGER_OF_GIVEN_RAYS, Leak, Screen, efficiency, joined_cells, leak, leaving, rrmsd
 from bstcad.optics.kernels.reductions import dot, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.rays import Landed
@@ -50,6 +50,9 @@ SMOOTHING_WIDTHS = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # standard de
 SIDE_EXPONENT = 0.5
 RAYS_PER_POINT = 1 << 13  # number of rays of each set per point of an extended source
 MIN_SOURCE_POINTS, MAX_SOURCE_POINTS = 8, 1024  # limits of the number of source points of each set
+# Sizes of the cells, in pixels, on which a verification measures the RRMSD; the smallest is 1 / FINEST_CELLS.
+COARSER_CELLS, FINEST_CELLS = (4, 2), 4
+MAX_CELLS = 1 << 22  # largest number of cells of a picture, for the memory: 34 MB for each of SETS pictures and of sums
 MIN_TUBES = 513  # minimum tubes per side (`tubes_of`): fewer do not resolve pixels
 COARSE_SHEET = 64  # tubes per side of the grid from which finer ones are interpolated, with 1e-6 of the light misplaced
 PASS_SEEDS = 1 << 20  # difference between the seeds of successive passes of rays from an extended source
@@ -67,6 +70,7 @@ class Effort:
     accuracy: float = 0.005  # relative standard error of the RRMSD at which tracing ends; 0: all rays are traced
     seconds: float = math.inf  # time limit (s): no sets of rays are started that would end later
     witness: bool = True  # True: flux tubes give a second picture, except in the cases of `Light.witness`
+    cells: int = FINEST_CELLS  # cells along each side of a pixel to which the RRMSD is measured; 1: pixels alone
 
 
 FULL = Effort()
@@ -82,6 +86,15 @@ class Witness:
     difference: float  # RRMSD between the pictures by tubes and by rays, without bias
     limit: float  # largest difference allowed: tolerance and noise in quadrature, or the error of the tubes if larger
     tubes: int  # number of tubes per side
+
+
+@dataclass(frozen=True)
+class CellError:
+    """RRMSD of a picture on cells of another size than its pixels."""
+
+    cell: float  # side of a cell (pixels): a power of two
+    rrmsd: float  # RRMSD from the target drawn on these cells, without bias
+    standard_error: float  # standard error of the RRMSD
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +115,15 @@ class Light:
     # pictures of the independent sets, each (rows, columns) with the target's sum; (): no light, or no longer needed
     sets: tuple[Tensor, ...] = field(default=(), repr=False)
     on_screen: float = 0.0  # flux on the screen, ghosts included, as a fraction of the source's
-    peak: float = 0.0  # flux per mm² or sr in the brightest pixel / flux on the screen, without bias
+    peak: float = 0.0  # flux per mm² or sr in the brightest cell of half a pixel / flux on the screen, without bias
+    peak_error: float = 0.0  # standard error of `peak`
+    peak_cell: float = 1.0  # side of the cell of `peak` (pixels); 1: the cells were not measured
+    by_cell: tuple[CellError, ...] = ()  # RRMSDs by size of the cells, the largest first; (): not measured
+
+    @property
+    def half(self) -> CellError | None:
+        """RRMSD on cells half as wide as a pixel; None: not measured."""
+        return next((each for each in self.by_cell if each.cell == 0.5), None)
 
     @property
     def leaving(self) -> float:
@@ -155,7 +176,7 @@ def measure_goals(
     draw: Draw | None,
 ) -> list[Light]:  # fmt: skip
     """Measure the light on the receivers of several goals, with the same rays for all (see `measure_goal`)."""
-    setups = _setups(lens, channels, goals, draw)
+    setups = _setups(lens, channels, goals, draw, effort.cells)
     if ghost:
         n = round(side_factor(channels) * effort.rays / GHOST_DIVISOR)
         ghosts = [ghost(lens, channels, setup.screen, n, effort.seed) for setup in setups]
@@ -186,7 +207,8 @@ def _light(setup: _Setup, goal: Goal, channels: Sequence[Channel], rays: _Rays, 
         ghost=None if ghost_image is None else (ghost_image.picture.cpu() * (total(target) / rays.on_screen)).numpy(),
         leak=leak((sum(rays.boxes, torch.zeros_like(target)) / SETS).numpy(), goal.picture),
         rrmsd_whole=None if goal.whole is None else _value(rays.boxes, torch.from_numpy(goal.whole))[0],
-        sets=rays.boxes, on_screen=rays.on_screen, peak=_peak(rays.boxes, screen),
+        sets=rays.boxes, on_screen=rays.on_screen, by_cell=tuple(_by_cell(rays, goal)),
+        **_peak_figures(rays, screen),
     )  # fmt: skip
 
 
@@ -215,6 +237,7 @@ class _Rays:
     count: int  # number of rays
     on_screen: float  # flux on the screen, as a fraction of the source's
     weight: float = 1.0  # weight of the pictures in a mean: inverse variance of their noise, on any scale
+    cells: tuple[Tensor, ...] = ()  # pictures of each set on cells (k rows, k columns), float32, as `boxes`; (): k = 1
 
     def joined(self, other: _Rays) -> _Rays:
         """Return each set i averaged, by weight, with set i of `other`; the averaged sets stay independent."""
@@ -227,7 +250,8 @@ class _Rays:
         boxes, tents = (tuple(map(mean, *each)) for each in ((self.boxes, other.boxes), (self.tents, other.tents)))
         flux = {line: mean(part, other.flux[line]) for line, part in self.flux.items()}
         on_screen = mean(self.on_screen, other.on_screen)
-        return _Rays(boxes, tents, flux, self.count + other.count, on_screen=on_screen, weight=weight)
+        cells = tuple(map(mean, self.cells, other.cells)) or self.cells or other.cells
+        return _Rays(boxes, tents, flux, self.count + other.count, on_screen=on_screen, weight=weight, cells=cells)
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,6 +263,7 @@ class _Setup:
     screen: Screen
     target: Tensor  # (rows, columns), row 0 = y max, of any sum
     ghost: GhostImage | None = None
+    cells: int = 1  # number k of cells along each side of a pixel in which rays are counted
 
     def rays(self, sets: Sequence[Simulation], side: int) -> _Rays:
         """Return the pictures and the ledger of SETS sets, each of about side x side rays per spectral line."""
@@ -246,33 +271,56 @@ class _Setup:
         if self.ghost is not None:
             flux |= {line: flux.get(line, 0.0) + more for line, more in self.ghost.flux.items()}
         count = sum(part.rays for part in sets)
-        sums = [[self.with_ghost(getattr(part, kind)) for part in sets] for kind in ("box", "tent")]
-        on_screen = math.fsum(float(total(box)) for box in sums[0]) / SETS
-        if not all(float(total(box)) > 0 for box in sums[0]):
+        boxes, tents = ([self.with_ghost(getattr(part, kind)) for part in sets] for kind in ("box", "tent"))
+        counted = sets[0].cells.shape[0] // sets[0].tent.shape[0]
+        on_screen = math.fsum(float(total(box)) for box in boxes) / SETS
+        if not all(float(total(box)) > 0 for box in boxes):
             return _Rays((), (), flux, count, on_screen=0.0)
-        boxes, tents = (tuple(p * (total(self.target) / total(p)) for p in pictures) for pictures in sums)
-        return _Rays(boxes, tents, flux, count, on_screen=on_screen, weight=float(side) ** 3)
+        scales = [total(self.target) / total(box) for box in boxes]
+        cells = () if counted == 1 else tuple(
+            self.with_ghost(part.cells).float().mul_(scale) for scale, part in zip(scales, sets, strict=True)
+        )  # fmt: skip
+        return _Rays(
+            tuple(scale * box for scale, box in zip(scales, boxes, strict=True)),
+            tuple(tent * (total(self.target) / total(tent)) for tent in tents),
+            flux, count, on_screen=on_screen, weight=float(side) ** 3, cells=cells,
+        )  # fmt: skip
 
     def with_ghost(self, picture: Tensor) -> Tensor:
-        """Return the picture on the CPU, plus that of the ghost if one is traced."""
-        return picture.cpu() if self.ghost is None else picture.cpu() + self.ghost.picture.cpu()
+        """Return the picture of pixels or cells on the CPU, plus that of the ghost if one is traced."""
+        if self.ghost is None:
+            return picture.cpu()
+        ghost, cells = self.ghost.picture.cpu(), picture.shape[0] // self.screen.rows
+        if cells > 1:
+            ghost = torch.from_numpy(interpolated(ghost.numpy(), cells))
+        return picture.cpu() + ghost
 
 
-def _setups(lens: Lens, channels: Sequence[Channel], goals: Sequence[Goal], draw: Draw | None) -> list[_Setup]:
-    """Return the measurements of one lens and light on the receivers of all goals; draw: as in `measure`."""
+def _setups(
+    lens: Lens, channels: Sequence[Channel], goals: Sequence[Goal], draw: Draw | None, cells: int = 1
+) -> list[_Setup]:
+    """Return the measurements of one lens and light on the receivers of all goals; draw: as in `measure`.
+
+    cells: wanted number of cells along each side of a pixel, reduced by halves to at most MAX_CELLS per picture.
+    """
     if not isinstance(draw, Draw):  # a function of a script, or none
         draw = Draw(draw or (lambda count, seed: channels))
-    return [_Setup(lens, draw, goal.receiver, torch.from_numpy(goal.picture)) for goal in goals]
+    while cells > 1 and max(goal.picture.size for goal in goals) * cells**2 > MAX_CELLS:
+        cells //= 2
+    return [_Setup(lens, draw, goal.receiver, torch.from_numpy(goal.picture), cells=cells) for goal in goals]
 
 
-def _trace(setups: Sequence[_Setup], side: int, seed: int) -> list[_Rays]:
-    """Trace SETS sets, each of about side x side rays per spectral line, to the screens of all `setups` of one lens."""
-    sets, screens = [], [setup.screen for setup in setups]
+def _trace(setups: Sequence[_Setup], side: int, seed: int, counts_cells: bool = True) -> list[_Rays]:
+    """Trace SETS sets, each of about side x side rays per spectral line, to the screens of all `setups` of one lens.
+
+    counts_cells: False: the light is counted in pixels alone.
+    """
+    sets, screens, cells = [], [setup.screen for setup in setups], setups[0].cells if counts_cells else 1
     count = min(max(side**2 // RAYS_PER_POINT, MIN_SOURCE_POINTS), MAX_SOURCE_POINTS)
     for i in range(SETS):
         channels = setups[0].draw(count, seed + i)
         n = max(1, round(side_factor(channels) * side))
-        sets.append(simulated(setups[0].lens, channels, screens, n, seed=seed + i))
+        sets.append(simulated(setups[0].lens, channels, screens, n, seed=seed + i, cells=cells))
     return [setup.rays(parts, side) for setup, parts in zip(setups, zip(*sets, strict=True), strict=True)]
 
 
@@ -314,17 +362,45 @@ def squared_distance(pictures: Sequence[Tensor], other: Tensor) -> tuple[float, 
     return float(mean), math.sqrt(max(jackknife - 4 * pairs / (m * (m - 2)) + least, least))
 
 
-def _peak(pictures: Sequence[Tensor], screen: Screen) -> float:
-    """Return the largest flux per mm² or sr of a pixel, as a fraction of the flux of all pixels.
+def _by_cell(rays: _Rays, goal: Goal) -> Iterator[CellError]:
+    """Yield the RRMSDs on cells of COARSER_CELLS pixels, on pixels, and on each finer cell that was counted."""
+    if not rays.cells:
+        return
+    pixels, finest = torch.from_numpy(goal.picture), rays.cells[0].shape[0] // goal.receiver.rows
+    for size in COARSER_CELLS:
+        pictures = [joined_cells(box, size) for box in rays.boxes]
+        yield CellError(float(size), *_value(pictures, joined_cells(pixels, size)))
+    yield CellError(1.0, *_value(rays.boxes, pixels))
+    count = 2
+    while count <= finest:
+        target = torch.from_numpy(goal.on_cells(count).picture).float()
+        pictures = [joined_cells(cells, finest // count) for cells in rays.cells]
+        yield CellError(1 / count, *_value(pictures, target))
+        count *= 2
 
-    One half of the pictures finds the pixel and the other half measures it, so that noise does not make it too large.
+
+def _peak_figures(rays: _Rays, screen: Screen) -> dict[str, float]:
+    """Return peak, peak_error and peak_cell of `Light`, on cells of half a pixel if they were counted."""
+    if not rays.cells:
+        value, error = _peak(rays.boxes, screen)
+        return {"peak": value, "peak_error": error}
+    finer = rays.cells[0].shape[0] // screen.rows // 2
+    value, error = _peak([joined_cells(cells, finer).double() for cells in rays.cells], screen.divided(2))
+    return {"peak": value, "peak_error": error, "peak_cell": 0.5}
+
+
+def _peak(pictures: Sequence[Tensor], screen: Screen) -> tuple[float, float]:
+    """Return (largest flux per mm² or sr of a cell, as a fraction of the flux of all cells; its standard error).
+
+    One half of the pictures finds the cell and the other half measures it, so that noise does not make it too large.
     """
     sizes = torch.from_numpy(np.ascontiguousarray(screen.cell_sizes))
-    found = []
+    found: list[float] = []  # density of each picture in the cell that the other half of them has found
     for one, other in ((pictures[::2], pictures[1::2]), (pictures[1::2], pictures[::2])):
-        seek, measured = (sum(half, torch.zeros_like(half[0])) / sizes for half in (one, other))
-        found.append(float(measured.reshape(-1)[int(seek.argmax())] / sum(float(total(part)) for part in other)))
-    return sum(found) / 2
+        brightest = int((sum(one, torch.zeros_like(one[0])) / sizes).argmax())
+        size = float(sizes.reshape(-1)[brightest])
+        found += (float(part.reshape(-1)[brightest]) / size / float(total(part)) for part in other)
+    return float(np.mean(found)), float(np.std(found, ddof=1)) / math.sqrt(len(found))
 
 
 def _noise(pictures: Sequence[Tensor], target: Tensor) -> float:
@@ -386,7 +462,7 @@ def _sample(setups: Sequence[_Setup], effort: Effort, max_noise: float = math.in
 
     while True:
         start = time.perf_counter()
-        more = _trace(setups, side, effort.seed)
+        more = _trace(setups, side, effort.seed, counts_cells=rays is not None or side >= most)  # not the few first
         if not all(each.boxes for each in more):
             return more
         rays = _joined(rays, more)
@@ -427,7 +503,7 @@ def _sample_source(setups: Sequence[_Setup], effort: Effort, max_noise: float) -
     while True:
         start = time.perf_counter()
         seed = effort.seed + number * PASS_SEEDS  # passes with equal numbers of rays must not repeat them
-        more = _trace(setups, side, seed)
+        more = _trace(setups, side, seed, counts_cells=rays is not None or side >= most)
         if not all(each.boxes for each in more):
             return more
         rays = _joined(rays, [replace(each, weight=float(side) ** 2) for each in more])
@@ -561,15 +637,16 @@ def spectral_lines(lens: Lens, channels: Sequence[Channel], goal: Goal, n: int) 
 
 
 def simulated(
-    lens: Lens, channels: Sequence[Channel], screens: Sequence[Screen], n: int, seed: int, splits_missed: bool = True
-) -> tuple[Simulation, ...]:
+    lens: Lens, channels: Sequence[Channel], screens: Sequence[Screen], n: int, seed: int, splits_missed: bool = True,
+    cells: int = 1,
+) -> tuple[Simulation, ...]:  # fmt: skip
     """Simulate pictures and ledgers by n x n stratified rays per channel, with another seed for each source point.
 
-    splits_missed: see `simulate`.
+    splits_missed, cells: see `simulate`.
     """
     pairs = zip(channels, source_numbers(channels), strict=True)
     lights = [(c.weight, c.source, c.through(lens), seed + SETS * k) for c, k in pairs]
-    return simulate(lights, screens, n, splits_missed=splits_missed)
+    return simulate(lights, screens, n, splits_missed=splits_missed, cells=cells)
 
 
 def side_factor(channels: Sequence[Channel]) -> float:

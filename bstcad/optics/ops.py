@@ -24,6 +24,7 @@ KERNELS: dict[str, dict[str, str | Callable[..., Any]]] = {
     "bspline.evaluate": {"cpu": "spline.BSplineSag.apply"},
     "bspline.net_gradient": {"cpu": "spline.net_gradient"},
     "irradiance.collect": {"cpu": "splat.Splat.apply"},
+    "irradiance.picture_error": {"cpu": "picture_error.PictureError.apply"},
     "trace.behind bspline": {"cpu": "crossing.behind"},
     "trace.behind radial": {"cpu": "dome.behind"},
     "trace.through bspline": {"cpu": "crossing.landed"},

@@ -201,7 +201,9 @@ class Scene(Record):
     def goals(self) -> tuple[Goal, ...]:
         """One Goal per target: key, screen, picture and weight."""
         pairs = zip(self.target_keys, self.targets, strict=True)
-        return tuple(Goal(key, target.screen, target.irradiance(), target.weight) for key, target in pairs)
+        return tuple(
+            Goal(key, target.screen, target.irradiance(), target.weight, draw=target.irradiance) for key, target in pairs
+        )
 
     def single_target_scenes(self) -> tuple[Self, ...]:
         """Return one scene per target, with only this target and no wavefront; for one target, the scene itself."""

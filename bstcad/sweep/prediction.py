@@ -45,7 +45,7 @@ PILOT_LIMITS = 128, 193, 512  # maximum pixels (unless MIN_PILOT_POINTS needs mo
 MIN_PILOT_POINTS = 65  # minimum control points per side of a pilot, unless its scene has fewer
 MIN_PILOT_TUBES = 16  # minimum tubes per side of a pilot
 PILOT_CELLS = (16, 256)  # minimum and maximum cells per side of the transport of a pilot
-PILOT_EFFORT = Effort(rays=2048, accuracy=0.02, witness=False)  # effort of the measurement of a pilot's RRMSD
+PILOT_EFFORT = Effort(rays=2048, accuracy=0.02, witness=False, cells=1)  # effort of the measurement of a pilot's RRMSD
 SEARCH_STAGES = ("stage 2", "stage 3")  # beginnings of the names of stages that use the minimiser
 COARSE_ROUND_TEXT = " pixels, "  # text in the names of rounds with few pixels, whose sizes do not depend on the scene
 

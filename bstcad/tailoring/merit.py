@@ -57,6 +57,7 @@ from bstcad.optics.channels import Channel, weighted_sum
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
 from bstcad.optics.interfaces import Law, Refract
+from bstcad.optics.irradiance import CellTarget, picture_error
 from bstcad.optics.kernels.reductions import elementary, quotient, total
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import RayTubes
@@ -111,6 +112,7 @@ class Merit:
     picture_error: PictureError | None = None  # error to minimise; None: RRMSD²
     blurs: tuple[tuple[BlurOperator, ...], ...] = ()  # blur by goal and channel; (): the source is a point
     blur_errors: tuple[Tensor, ...] = ()  # error of each blurred picture, (rows, columns); (): not measured
+    shares: tuple[float, ...] = (1.0,)  # shares of the errors on pixels and on ever smaller cells: `CellTarget.of`
 
     @classmethod
     def of(
@@ -144,10 +146,11 @@ class Merit:
         return len(self.goals) * sum(sheet.flux.numel() for sheet in self.light.sheets)
 
     @cached_property
-    def targets(self) -> tuple[Tensor, ...]:
-        """Target pictures (rows, columns), one per goal, on the light's device; that of an only goal has the sum 1."""
+    def targets(self) -> tuple[CellTarget, ...]:
+        """Target pictures on cells, one per goal, on the light's device; that of an only goal has the sum 1."""
         pictures = tuple(torch.from_numpy(goal.picture).to(self.light.sheets[0].flux.device) for goal in self.goals)
-        return tuple(picture / total(picture) for picture in pictures) if self._is_one else pictures
+        pictures = tuple(picture / total(picture) for picture in pictures) if self._is_one else pictures
+        return tuple(CellTarget.of(picture, self.shares) for picture in pictures)
 
     @property
     def _is_one(self) -> bool:
@@ -178,8 +181,11 @@ class Merit:
             merit = merit + self.wave.weight / weights * self._wavefront_error(*landings.behind)
         return merit, worst
 
-    def picture(self, k: int, landed: Sequence[Landed]) -> tuple[Tensor, Tensor]:
-        """Return the picture of goal k and the penalty on light outside it, each divided by the transmitted flux."""
+    def picture(self, k: int, landed: Sequence[Landed]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return (picture of goal k, flux by which it has to be divided, penalty on light outside the picture).
+
+        This flux is the transmitted flux, or 1 if the picture is already divided.
+        """
         channels, screen = self.light.channels, self.goals[k].receiver
         pairs = list(zip(self.light.sheets, landed, strict=True))
         # flux after the losses at faces and in the glass, so that they do not change the merit
@@ -188,25 +194,24 @@ class Merit:
         images, penalties = zip(*(sheet.collect(corners, wider) for sheet, corners in pairs), strict=True)
         outside = weighted_sum(channels, penalties)
         if not self.blurs:
-            return quotient(weighted_sum(channels, images), flux), self.overshoot * outside / flux
+            return weighted_sum(channels, images), flux, self.overshoot * outside / flux
         smooth = (blurred(image / flux, blur) for image, blur in zip(images, self.blurs[k], strict=True))
-        return weighted_sum(channels, smooth), self.overshoot * (outside / flux)
+        return weighted_sum(channels, smooth), torch.ones_like(flux), self.overshoot * (outside / flux)
 
     def _goal_terms(self, k: int, landed: Sequence[Landed]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return (RRMSD² or `picture_error`, penalty, fraction lost, RRMSD of the scaled picture) of goal k."""
+        """Return (squared error or `picture_error`, penalty, fraction lost, RRMSD of the scaled picture) of goal k."""
         channels, sheets, target = self.light.channels, self.light.sheets, self.targets[k]
-        image, penalty = self.picture(k, landed)
+        image, flux, penalty = self.picture(k, landed)
         if self.blur_errors:
             image = image + self.blur_errors[k]
-        size = total(target**2)
-        own_error = self.picture_error
-        error = total((image - target) ** 2) / size if own_error is None else own_error(image, target)
+        error, rrmsd = picture_error(image, flux, target)
+        if self.picture_error is not None:
+            error = self.picture_error(quotient(image, flux), target.picture)
         pairs = zip(sheets, landed, strict=True)
         arrived = weighted_sum(channels, (total(arriving_flux(sheet.flux, corners)) for sheet, corners in pairs))
         # the lost light has no gradient, but without this term a lens that loses light could have a lower merit
         lost = 1 - arrived / weighted_sum(channels, (total(sheet.flux) for sheet in sheets))
-        normalised = image.detach() / total(image.detach())
-        return error, penalty, lost, (total((normalised - target) ** 2) / size).sqrt()
+        return error, penalty, lost, rrmsd
 
     def _wavefront_error(self, rays: Rays, path: Tensor) -> Tensor:
         """Return (RMS / λ)² of the optical path differences without piston, weighted by the flux around each corner."""

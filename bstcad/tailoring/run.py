@@ -82,10 +82,10 @@ RRMSD_SECONDS = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
 # Rays for the RRMSD of a lens between the stages, accurate to some 5 % for STAGE_EFFORT_PIXELS pixels per side.  RRMSD²
 # is estimated from products of two pictures (measure.py).  With n² stratified rays per picture its error varies as
 # (p / n)³ / p, so a target of p pixels per side needs (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays per side.
-STAGE_EFFORT, STAGE_EFFORT_PIXELS = Effort(rays=724, accuracy=0, witness=False), 512
+STAGE_EFFORT, STAGE_EFFORT_PIXELS = Effort(rays=724, accuracy=0, witness=False, cells=1), 512
 ROUGH_RAYS = 0.5  # rays per side of `Task.stage_effort`, relative to STAGE_EFFORT, for an RRMSD known to some 15 %
-FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False)  # rays in scenes with accuracy or bounds, and in `better`
-FLUX_EFFORT = Effort(rays=128, accuracy=1.0, witness=False)  # rays for the flux on the target alone
+FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False, cells=1)  # rays in scenes with accuracy or bounds, and in `better`
+FLUX_EFFORT = Effort(rays=128, accuracy=1.0, witness=False, cells=1)  # rays for the flux on the target alone
 
 Progress = Callable[[str, int, int, str], None]  # called with stage, units done, units in total, text
 LensCallback = Callable[[Callable[[], Lens]], None]  # called with a function that returns the best lens so far

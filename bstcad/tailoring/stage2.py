@@ -108,6 +108,13 @@ class TubeRound:
     plateau: Plateau = PLATEAU  # plateau at which the round ends
     resolved: bool = False  # True if the tubes resolve the net's shortest waves (`resolves_net`)
     ends_distorted: bool = False  # True if the round ends at DISTORTION_RATIO
+    # shares of the squared errors on pixels, half pixels, quarters … in the merit; their sum is 1
+    shares: tuple[float, ...] = (1.0,)
+
+    @property
+    def cells(self) -> int:
+        """Number of the smallest cells along each side of a pixel on which the picture is rated."""
+        return 1 << (len(self.shares) - 1)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -120,7 +127,7 @@ class TubeRound:
 
         For waves above it the merit grows no faster, since a pixel averages over them.
         """
-        pixels = max(math.sqrt(math.prod(goal.receiver.shape)) for goal in self.task.goals)
+        pixels = self.cells * max(math.sqrt(math.prod(goal.receiver.shape)) for goal in self.task.goals)
         return FOUR_POINTS * max(1.0, pixels / self.task.knobs.side) ** 2 if self.resolved else math.inf
 
     def takes_over(self, before: TubeRound) -> bool:
@@ -140,9 +147,10 @@ class TubeRound:
     def merit(self, lens: Lens) -> Merit:
         """Return the merit of this round, with tubes launched for `lens`."""
         task = self.task if self.pixels is None else with_pixels(self.task, self.pixels)
-        overshoot = _overshoot_weight(task, lens)
-        merit = Merit.of(self.channels, lens, self.tubes, task.goals, overshoot=overshoot, wave=task.wave)
-        merit = replace(merit, picture_error=task.merit)
+        overshoot = _overshoot_weight(task, lens) / self.cells**2  # per cell²
+        goals = tuple(goal.on_cells(self.cells) for goal in task.goals)
+        merit = Merit.of(self.channels, lens, self.tubes, goals, overshoot=overshoot, wave=task.wave)
+        merit = replace(merit, picture_error=task.merit, shares=self.shares)
         if self.source is None:
             return merit
         return merit.with_blur(self.source, lens, seed=None if task.preview else task.knobs.seed)

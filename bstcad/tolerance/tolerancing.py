@@ -90,7 +90,7 @@ def _pictures(scene: Scene, nominal: Nominal, settings: StudySettings) -> tuple[
 
 
 def _rrmsd(nominal: Nominal, pictures: TargetPictures) -> float:
-    screen, effort = pictures.setup.screen, nominal.effort(Effort(witness=False))
+    screen, effort = pictures.setup.screen, nominal.effort(Effort(witness=False, cells=1))
     lens, channels, draw = nominal.lens, nominal.channels, nominal.scene.draw
     return measure(lens, channels, screen, pictures.target, effort=effort, draw=draw).rrmsd
 

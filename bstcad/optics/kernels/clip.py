@@ -359,6 +359,32 @@ def _clip(corner, scale, flux, thinnest, sums, touched, far):
             _add_end(sums[c], corner, scale, last, upper)
 
 
+@compiled(parallel=True)
+def _running_sums(sums, touched, image):
+    """Set image (columns, rows) to the running sums down the columns of the sum of all parts, added in their order."""
+    columns, rows = image.shape
+    for i in prange(columns):
+        image[i, :] = 0.0
+        for c in range(sums.shape[0]):
+            if touched[c, 0] <= i < touched[c, 1]:
+                for j in range(rows):
+                    image[i, j] += sums[c, i, j]
+        for j in range(1, rows):
+            image[i, j] += image[i, j - 1]
+
+
+@compiled(parallel=True)
+def _sums_below(g, below):
+    """Set below[i, j] to the sum of g[i, j:], for j up to the number of rows."""
+    columns, rows = g.shape
+    for i in prange(columns):
+        whole = 0.0
+        below[i, rows] = whole
+        for j in range(rows - 1, -1, -1):
+            whole += g[i, j]
+            below[i, j] = whole
+
+
 # --- the adjoint ------------------------------------------------------------------------------------------------------
 
 
@@ -549,17 +575,18 @@ class Clip(torch.autograd.Function):
         ctx.scale, ctx.thinnest = scale, thinnest
         (sums, touched), far = reductions.buffers(count, columns, rows + 1), np.zeros(count)
         _clip(_array(corner), scale, _array(flux), thinnest, sums, touched, far)
-        image = reductions.merged(sums, touched).cumsum(1)[:, :rows]
-        return torch.from_numpy(image.T.copy()), torch.tensor(far.sum())
+        image = np.empty((columns, rows))
+        _running_sums(sums, touched, image)
+        return torch.from_numpy(image).T, torch.tensor(far.sum())
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, g: Tensor, g_far: Tensor) -> Any:  # noqa: D102
         corner, flux = ctx.saved_tensors
-        by_column = g.numpy().T.copy()
+        by_column = np.ascontiguousarray(g.numpy().T)
         columns, rows = by_column.shape
-        below = np.zeros((columns, rows + 1))
-        below[:, :-1] = by_column[:, ::-1].cumsum(1)[:, ::-1]
+        below = np.empty((columns, rows + 1))
+        _sums_below(by_column, below)
         d_corner = torch.zeros(corner.shape, dtype=torch.float64)
         d_flux = torch.empty(flux.shape if ctx.needs_input_grad[1] else (0, 0), dtype=torch.float64)
         tubes, adjoints = (_array(corner), ctx.scale, _array(flux), ctx.thinnest), (d_corner.numpy(), d_flux.numpy())

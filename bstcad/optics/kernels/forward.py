@@ -311,6 +311,7 @@ def to_screen(faces, throw, tilted, count, work):
 LINES = 9
 BESIDE, COUNT, BY_FACES, BY_GLASS = 5, 6, 7, 8  # indices in the ledger; 5 is free, since no ray is BLOCKED
 RAY_PARTS = 8  # number of partial sums of the rays; each has its own pictures, which take time to clear and to add
+FEW_RAY_PARTS, MANY_PIXELS = 4, 1 << 21  # partial sums for pictures of more than MANY_PIXELS cells, for their memory
 
 
 @njit(error_model="numpy")
@@ -501,8 +502,12 @@ def _trace(net, beam, faces, tilted, losses, count, work, active):
 
 @njit(error_model="numpy")
 def count_rays(pixels, count, work, box, tent, lines):
-    """Add rays to box picture, tent picture and ledger, as `irradiance.box`, `tent` and `ledger` do."""
-    rows, columns = box.shape
+    """Add rays to box picture, tent picture and ledger, as `irradiance.box`, `tent` and `ledger` do.
+
+    box may have several cells along each side of a pixel of `tent`.
+    """
+    (rows, columns), (fine_rows, fine_columns) = tent.shape, box.shape
+    cells = fine_rows // rows
     for r in range(count):
         f = work[FLUX + r]
         if not f > 0.0:
@@ -516,7 +521,7 @@ def count_rays(pixels, count, work, box, tent, lines):
         x, y = (x - pixels.left) * pixels.per_x, (pixels.top - y) * pixels.per_y
         if on_screen:
             lines[0] += f
-            box[min(int(y), rows - 1), min(int(x), columns - 1)] += f
+            box[min(int(cells * y), fine_rows - 1), min(int(cells * x), fine_columns - 1)] += f
         else:
             lines[BESIDE] += f
         x -= 0.5
@@ -621,15 +626,17 @@ SeededLight = tuple[float, Emitter, Lens, int, Rectangle]  # weight, source, len
 
 
 def simulate(
-    lights: Sequence[SeededLight], screen: Screen, n: int, form: Form | None = None
+    lights: Sequence[SeededLight], screen: Screen, n: int, form: Form | None = None, cells: int = 1
 ) -> tuple[Tensor, Tensor, dict[str, float], int]:
     """Return (box picture, tent picture, ledger, number of rays) from n x n stratified rays of each light.
 
-    Flux is a fraction of the flux of all sources, whose weights sum to 1.  form: None for heights.
+    Flux is a fraction of the flux of all sources, whose weights sum to 1.  form: None for heights.  cells: number of
+    cells of the box picture along each side of a pixel.
     """
     form = form or HEIGHTS
-    count = RAY_PARTS
-    box, tent, lines = (np.zeros((count, *shape)) for shape in (screen.shape, screen.shape, (LINES,)))
+    fine = screen.divided(cells)
+    count = RAY_PARTS if math.prod(fine.shape) <= MANY_PIXELS else FEW_RAY_PARTS
+    box, tent, lines = (np.zeros((count, *shape)) for shape in (fine.shape, screen.shape, (LINES,)))
     pixels = kernel_arguments.pixels(screen)
     many = len(lights) >= count  # True: a part traces whole lights; False: some rows of each light
 
