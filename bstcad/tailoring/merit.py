@@ -77,7 +77,7 @@ COARSE_LAPLACIAN_POWER = 0.75  # power of the Laplacian in `CoarseVariable`, who
 TARGET_BLUR = 1.0  # standard deviation (pixels) of the blur of the target before the local weight is computed
 WEIGHT_SMOOTHING = 1.5  # standard deviation (control points) of the smoothing of the weight's logarithm
 MAX_WEIGHT_POINTS = 513  # largest number of points per side at which the local weight is computed; linear between
-MAX_LOCAL_WEIGHT = 4.0  # largest local weight; the smallest is 1 / MAX_LOCAL_WEIGHT, before division by the leverage
+MAX_LOCAL_WEIGHT = 2.8  # largest local weight; the smallest is 1 / MAX_LOCAL_WEIGHT, before division by the leverage
 # Range of the leverage / median in which the weight is proportional to 1 / leverage.
 MIN_LEVERAGE, MAX_LEVERAGE = 3.0, 96.0
 LEVERAGE_STEP = 1e-6  # shift of target points t / their largest distance from the lens, for quotients of p(b, t)

@@ -52,7 +52,7 @@ DENSE_ROUNDS, DENSE_TUBES = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08)), 2.5
 # at most SHORT_EVALUATIONS.  The last round corrects what the others distort between the tubes; these end on the
 # plateau FEW_TUBES.  (RRMSD 0.0225 of letters after 73 evaluations and 0.0439 of a portrait after 58; 0.0227 and 0.0447
 # after 98 in DENSE_ROUNDS.  With 300 evaluations, as in fine quality, short rounds end at 0.0168 instead of 0.0148.)
-SHORT_ROUNDS, FEW_TUBES, SHORT_EVALUATIONS = ((1 / 2, 0.37), (2 / 3, 0.21), (1.0, 0.16)), Plateau(5, 0.05), 150
+SHORT_ROUNDS, FEW_TUBES, SHORT_EVALUATIONS = ((5 / 12, 0.47), (5 / 8, 0.23), (0.91, 0.12)), Plateau(5, 0.03), 150
 # Rounds if the last one has fewer than DENSE_TUBES tubes per cell.  The first rounds then distort the net between the
 # tubes, and the last one has to correct this, with MAX_TUBES tubes per side or fewer, since more need much memory; if
 # these are too few, with as many as the settings state.  (1025 control points, portrait: RRMSD 0.0175 after 54
@@ -84,6 +84,13 @@ IMAGE_POSITIONS, SECOND_MOMENT_POINTS = 16, 8  # cells per side of the back, sou
 # Evaluations of the only round that refines an earlier lens, as a fraction of those of the stage.  (Letters, thickness
 # 50 µm and index 3e-4 off: RRMSD 0.0222, as designed; docs/how-to/blank-as-built.md.)
 REFINING_SHARE = 0.1
+# The merit: cells per control point along a side in the last round, less than a power of two by a factor of at most
+# 2^CELL_MARGIN; most cells of a picture, for its memory.
+CELLS_PER_POINT, CELL_MARGIN, MAX_CELLS = 4.0, 0.25, 1 << 22
+# Share in the squared error of the errors on cells smaller than a pixel, for one control point per lit pixel; power by
+# which it falls with their number, since more points correct the light inside a pixel more easily; share of the errors
+# on cells smaller than each further size in the rest.
+CELL_SHARE, CELL_SHARE_POWER, FINER_SHARE = 0.21, 0.15, 0.2
 MIN_EVALUATIONS = 30  # evaluations below which stage 2 has a single round and stage 3 gets twice as many
 COMPARED_NET = 65  # largest number of control points per side in `compare_precisions`, for speed
 COMPARED_TUBES = 128  # tubes per side in `compare_precisions`
@@ -123,12 +130,13 @@ class TubeRound:
 
     @property
     def level(self) -> float:
-        """Level λ_0 of the variables: the eigenvalue of waves of four pixels, or four points; infinite if not resolved.
+        """Level λ_0 of the variables: of waves of four half pixels, or four points; infinite if not resolved.
 
-        For waves above it the merit grows no faster, since a pixel averages over them.
+        For waves above it the merit hardly grows faster, since a pixel averages over them.
         """
-        pixels = self.cells * max(math.sqrt(math.prod(goal.receiver.shape)) for goal in self.task.goals)
-        return FOUR_POINTS * max(1.0, pixels / self.task.knobs.side) ** 2 if self.resolved else math.inf
+        if not self.resolved:
+            return math.inf
+        return FOUR_POINTS * max(1.0, min(finest_cells(self.task), 2) * pixels_of(self.task) / self.task.knobs.side) ** 2
 
     def takes_over(self, before: TubeRound) -> bool:
         """Return True if L-BFGS keeps the steps stored by the round before: it has nearly the same merit and variables.
@@ -238,7 +246,40 @@ def _fine_round(task: Task, tubes: int, evaluations: int, is_last: bool) -> Tube
     return TubeRound(
         task, tubes, evaluations, plateau=FEW_TUBES if ends_early else PLATEAU, resolved=resolved,
         ends_distorted=len(task.goals) > 1 and not task.preview and not is_last,
+        shares=shares_on_cells(task, is_last=is_last),
     )  # fmt: skip
+
+
+def pixels_of(task: Task) -> float:
+    """Return the pixels per side of the square with as many pixels as the largest target."""
+    return max(math.sqrt(math.prod(goal.receiver.shape)) for goal in task.goals)
+
+
+def finest_cells(task: Task) -> int:
+    """Return the cells along each side of a pixel that the last round rates, a power of two.
+
+    They are about a quarter as wide as the cells of the net, if the light were spread evenly.  Where a picture is
+    bright, its pixels have more cells of the net: ten for letters.
+    """
+    if task.merit is not None or task.preview:
+        return 1
+    wanted = math.log2(CELLS_PER_POINT * task.knobs.side / pixels_of(task))
+    most = math.log2(MAX_CELLS / max(math.prod(goal.receiver.shape) for goal in task.goals)) / 2
+    return 1 << max(0, math.floor(min(wanted + CELL_MARGIN, most)))
+
+
+def shares_on_cells(task: Task, *, is_last: bool) -> tuple[float, ...]:
+    """Return `TubeRound.shares`: of pixels, half pixels … `finest_cells`; of fewer than these before the last round."""
+    levels = finest_cells(task).bit_length() - 1
+    if not is_last and levels > 1:
+        levels -= 1
+    lit = max(float(goal.picture.sum() ** 2 / (goal.picture**2).sum()) for goal in task.goals)  # pixels, if even
+    share = CELL_SHARE * max(1.0, task.knobs.side**2 / lit) ** -CELL_SHARE_POWER
+    shares, rest = [], 1.0
+    for level in range(levels):
+        shares.append(rest * (1 - (share if level == 0 else FINER_SHARE)))
+        rest -= shares[-1]
+    return (*shares, rest)
 
 
 def coarse_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
