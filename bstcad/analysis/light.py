@@ -281,7 +281,7 @@ def blur(
     if not found.flux.any():
         return None
     width = found.width()
-    return Blur(width * _pixel(screen), width, found.deviation(target), screen.plane.unit)
+    return Blur(width * screen.pixel_side, width, found.deviation(target), screen.plane.unit)
 
 
 @dataclass(frozen=True)
@@ -291,7 +291,8 @@ class FinestDetail:
     w = √(D² + 4/3 p²), where D is the diameter of the image of the source and p the side of a pixel
     (optics.source_images.detail_width).  D is proportional to the distance L from the lens to the target: D = 2 L
     tan(δ / 2) for collimated light of divergence δ through a thin plate, and D = d L / l for a source of diameter d at
-    the distance l before the plate.  At a distance L' it is D L' / L.  The resolution of the net is not included.
+    the distance l before the plate.  At a distance L' it is D L' / L.  The resolution of the net is not included, but
+    w is never below the side of the smallest cell on which the light is right (analysis.cell_errors).
     """
 
     width: float  # width w of a point of the picture, in `unit`
@@ -305,20 +306,20 @@ class FinestDetail:
     unit: str = "mm"  # unit of the receiver
 
 
-def finest_detail(source_image: float, lens: Lens, screen: Screen, of: str, assumed: bool = False) -> FinestDetail:
-    """Return the finest detail on a target; source_image: diameter (pixels); of, assumed: as in FinestDetail."""
-    distance, pixel = abs(image_from_lens(lens, screen).throw(lens.back.z)), _pixel(screen)
+def finest_detail(
+    source_image: float, lens: Lens, screen: Screen, of: str, assumed: bool = False, least: float = 0.0
+) -> FinestDetail:
+    """Return the finest detail on a target; source_image: diameter (pixels); of, assumed: as in FinestDetail.
+
+    least: side of the smallest cell on which the light is right, in the unit of the receiver; no width is below it.
+    """
+    distance, pixel = abs(image_from_lens(lens, screen).throw(lens.back.z)), screen.pixel_side
     grows = distance == abs(per_radian(lens, screen))  # False for an image over angles, which keeps its width
     sizes = (*(2 * half for half in lens.plan.half_extent), *(high - low for low, high in (screen.x, screen.y)))
     nearer, image = MIN_DISTANCE_RATIO * max(sizes), source_image * pixel
-    width, narrower = (detail_width(image * scale, pixel) for scale in (1.0, nearer / distance))
+    width, narrower = (max(detail_width(image * scale, pixel), least) for scale in (1.0, nearer / distance))
     gains = narrower < MAX_NEARER_RATIO * width and grows and not lens.behind
     gain, unit = (nearer, narrower) if gains else (None, None), screen.plane.unit
     return FinestDetail(
         width, image, pixel, distance, nearer_distance=gain[0], nearer_width=gain[1], of=of, assumed=assumed, unit=unit
     )
-
-
-def _pixel(screen: Screen) -> float:
-    """Return the side of a square with the area of a pixel, in the unit of the receiver."""
-    return 1 / math.sqrt(math.prod(screen.per_unit))

@@ -39,7 +39,7 @@ from bstcad.app.preview_desk import STAGES, PreviewDesk, PreviewRequest
 from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
 from bstcad.report import manual, record
 from bstcad.report.light_figures import View, dark_triptych
-from bstcad.report.report import VIEWER, counts, doubts
+from bstcad.report.report import VIEWER, cell_sentences, counts, doubts
 from bstcad.runs import files
 from bstcad.runs.files import SentenceError
 from bstcad.scene import new_scene, scene_file
@@ -222,6 +222,8 @@ class Workbench:
         result = {"rrmsd": record.rrmsds(known) if known else "", "doubts": doubts(known) if known else ()}
         result |= {"report": known, "files": names, "has_light": "figures/irradiance.png" in names}
         result["counts"] = counts(known.checks) if known else ""
+        measured = [goal for goal in known.goals if goal.on_cells(0.5)] if known else []
+        result["by_cell"] = [sentence for goal in measured for sentence in cell_sentences(goal)]
         jobs = {kind: self._news(Run(folder, kind)) for kind in STUDIES}
         return self._page("design.html.j2", title=name, name=name, run=self._news(run), jobs=jobs, **result)
 

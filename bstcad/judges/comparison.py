@@ -34,7 +34,9 @@ from bstcad.verify.verdict import Check
 JUDGES = {"batoid": "bstcad.judges.batoid", "mitsuba": "bstcad.judges.mitsuba"}
 JUDGE_RAYS = 1 << 24  # total number of rays that a judge traces for one target
 MAX_COMPARED_PIXELS = 128  # largest number of pixels along the longer side of the compared pictures
-OWN_EFFORT = Effort(accuracy=0.0, witness=False, cells=1)  # effort of bstcad's picture: all rays, no picture by flux tubes
+OWN_EFFORT = Effort(
+    accuracy=0.0, witness=False, cells=1
+)  # effort of bstcad's picture: all rays, no picture by flux tubes
 OWN_SEED_OFFSET = 500_009  # difference between the seeds of bstcad's and the judge's rays
 AGREEMENT_FACTOR = 1.5  # limit of the pictures' difference / its noise for many pixels; for N: 1 + 3 / sqrt(N) times it
 MIN_NOISE = 1e-9  # lower bound of the noise, relative to the target's RMS

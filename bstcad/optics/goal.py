@@ -26,6 +26,7 @@ class Goal:
     # function of a number k that returns the picture of cells, k along each side of a pixel, of sum 1 and before
     # `restricted`; None: `interpolated`
     draw: Callable[[int], np.ndarray] | None = None
+    is_shape: bool = False  # True for a profile, a uniform target or an intensity, which have no fine detail
 
     @property
     def suffix(self) -> str:
@@ -50,12 +51,12 @@ class Goal:
         picture = self.picture if self.whole is None else self.whole
         fine = interpolated(picture, cells) if self.draw is None else self.draw(cells) * picture.sum()
         part = self.reachable
-        goal = Goal(self.key, self.receiver.divided(cells), fine, self.weight)
+        goal = Goal(self.key, self.receiver.divided(cells), fine, self.weight, is_shape=self.is_shape)
         return goal.restricted(None if part is None else np.kron(part, np.ones((cells, cells), dtype=bool)))
 
 
 def interpolated(picture: np.ndarray, cells: int) -> np.ndarray:
-    """Return the flux (k rows, k columns) in k x k = `cells` x `cells` cells of each pixel of a picture (rows, columns).
+    """Return the flux (k rows, k columns) in k x k cells, k = `cells`, of each pixel of a picture (rows, columns).
 
     Along each axis the density is linear in a pixel, with the monotonised central slope (van Leer 1977): the sum of the
     cells of a pixel is the flux of the pixel, no value is negative, and black pixels stay black.

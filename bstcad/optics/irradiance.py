@@ -93,6 +93,12 @@ class Screen:
         return self.columns / (self.x[1] - self.x[0]), self.rows / (self.y[1] - self.y[0])
 
     @property
+    def pixel_side(self) -> float:
+        """Side of a square with the area of a pixel, in the unit of the receiver."""
+        per_x, per_y = self.per_unit
+        return 1 / math.sqrt(per_x * per_y)
+
+    @property
     def areas(self) -> np.ndarray | None:
         """Relative areas or solid angles of the pixels (rows, columns), of mean 1; None: all are equal."""
         return self.plane.areas(self.x, self.y, self.shape)
@@ -217,7 +223,7 @@ class CellTarget:
 
 
 def picture_error(image: Tensor, flux: Tensor, target: CellTarget) -> tuple[Tensor, Tensor]:
-    """Return (error of a picture on all scales, its RRMSD on the smallest cells after scaling to the sum of the target).
+    """Return (error of a picture on all scales, its RRMSD on the smallest cells after scaling to the target's sum).
 
     With d = image / flux - T on the smallest cells and D_l the sums of d over cells of 2^-l pixels, the error is
 

@@ -53,6 +53,7 @@ MIN_SOURCE_POINTS, MAX_SOURCE_POINTS = 8, 1024  # limits of the number of source
 # Sizes of the cells, in pixels, on which a verification measures the RRMSD; the smallest is 1 / FINEST_CELLS.
 COARSER_CELLS, FINEST_CELLS = (4, 2), 4
 MAX_CELLS = 1 << 22  # largest number of cells of a picture, for the memory: 34 MB for each of SETS pictures and of sums
+BLUR_MARGIN = 4.0  # dark margin around a picture that is blurred, in standard deviations of the blur
 MIN_TUBES = 513  # minimum tubes per side (`tubes_of`): fewer do not resolve pixels
 COARSE_SHEET = 64  # tubes per side of the grid from which finer ones are interpolated, with 1e-6 of the light misplaced
 PASS_SEEDS = 1 << 20  # difference between the seeds of successive passes of rays from an extended source
@@ -95,6 +96,13 @@ class CellError:
     cell: float  # side of a cell (pixels): a power of two
     rrmsd: float  # RRMSD from the target drawn on these cells, without bias
     standard_error: float  # standard error of the RRMSD
+    # RRMSD of the light blurred by the image of the real source, without bias; None: narrower than a cell, or simulated
+    blurred: float | None = None
+
+    @property
+    def counted(self) -> float:
+        """RRMSD that counts on these cells: with the size of the real source, if its image is wider than a cell."""
+        return self.rrmsd if self.blurred is None else self.blurred
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,10 +181,15 @@ def measure_goal(
 
 def measure_goals(
     lens: Lens, channels: Sequence[Channel], goals: Sequence[Goal], effort: Effort, *, ghost: GhostTracer | None,
-    draw: Draw | None,
+    draw: Draw | None, images: Sequence[float] = (),
 ) -> list[Light]:  # fmt: skip
-    """Measure the light on the receivers of several goals, with the same rays for all (see `measure_goal`)."""
-    setups = _setups(lens, channels, goals, draw, effort.cells)
+    """Measure the light on the receivers of several goals, with the same rays for all (see `measure_goal`).
+
+    images: diameter (pixels) of the image of the real source on each receiver, if the channels have no size.
+    """
+    setups = _setups(lens, channels, goals, draw, cells=effort.cells)
+    if images:
+        setups = [replace(setup, image=image) for setup, image in zip(setups, images, strict=True)]
     if ghost:
         n = round(side_factor(channels) * effort.rays / GHOST_DIVISOR)
         ghosts = [ghost(lens, channels, setup.screen, n, effort.seed) for setup in setups]
@@ -207,7 +220,7 @@ def _light(setup: _Setup, goal: Goal, channels: Sequence[Channel], rays: _Rays, 
         ghost=None if ghost_image is None else (ghost_image.picture.cpu() * (total(target) / rays.on_screen)).numpy(),
         leak=leak((sum(rays.boxes, torch.zeros_like(target)) / SETS).numpy(), goal.picture),
         rrmsd_whole=None if goal.whole is None else _value(rays.boxes, torch.from_numpy(goal.whole))[0],
-        sets=rays.boxes, on_screen=rays.on_screen, by_cell=tuple(_by_cell(rays, goal)),
+        sets=rays.boxes, on_screen=rays.on_screen, by_cell=tuple(_by_cell(rays, goal, setup.image)),
         **_peak_figures(rays, screen),
     )  # fmt: skip
 
@@ -264,6 +277,7 @@ class _Setup:
     target: Tensor  # (rows, columns), row 0 = y max, of any sum
     ghost: GhostImage | None = None
     cells: int = 1  # number k of cells along each side of a pixel in which rays are counted
+    image: float = 0.0  # diameter (pixels) of the image of the real source, whose size the rays do not have; 0: none
 
     def rays(self, sets: Sequence[Simulation], side: int) -> _Rays:
         """Return the pictures and the ledger of SETS sets, each of about side x side rays per spectral line."""
@@ -362,21 +376,58 @@ def squared_distance(pictures: Sequence[Tensor], other: Tensor) -> tuple[float, 
     return float(mean), math.sqrt(max(jackknife - 4 * pairs / (m * (m - 2)) + least, least))
 
 
-def _by_cell(rays: _Rays, goal: Goal) -> Iterator[CellError]:
-    """Yield the RRMSDs on cells of COARSER_CELLS pixels, on pixels, and on each finer cell that was counted."""
+def _by_cell(rays: _Rays, goal: Goal, image: float) -> Iterator[CellError]:
+    """Yield the RRMSDs on cells of COARSER_CELLS pixels, on pixels, and on each finer cell that was counted.
+
+    image: diameter (pixels) of the image of the real source.
+    """
     if not rays.cells:
         return
     pixels, finest = torch.from_numpy(goal.picture), rays.cells[0].shape[0] // goal.receiver.rows
     for size in COARSER_CELLS:
         pictures = [joined_cells(box, size) for box in rays.boxes]
-        yield CellError(float(size), *_value(pictures, joined_cells(pixels, size)))
-    yield CellError(1.0, *_value(rays.boxes, pixels))
+        yield _cell_error(float(size), pictures, joined_cells(pixels, size), image)
+    yield _cell_error(1.0, rays.boxes, pixels, image)
     count = 2
     while count <= finest:
         target = torch.from_numpy(goal.on_cells(count).picture).float()
         pictures = [joined_cells(cells, finest // count) for cells in rays.cells]
-        yield CellError(1 / count, *_value(pictures, target))
+        yield _cell_error(1 / count, pictures, target, image)
         count *= 2
+
+
+def _cell_error(cell: float, pictures: Sequence[Tensor], target: Tensor, image: float) -> CellError:
+    """Return the RRMSD on cells of side `cell` (pixels); image: diameter (pixels) of the image of the real source.
+
+    A blur G by the source is linear, so that E <(G A_i - T) (G A_j - T)> = <(G A - T)²> for means A_i of disjoint sets.
+    """
+    blurred = None
+    if image > cell:
+        pairs = [(one + other) / 2 for one, other in zip(*[iter(pictures)] * 2, strict=True)]
+        blurred = _value([_blurred(each, target, image / cell) for each in pairs], target)[0]
+    return CellError(cell, *_value(pictures, target), blurred)
+
+
+def _blurred(picture: Tensor, target: Tensor, image: float) -> Tensor:
+    """Return a picture convolved with the image of a source, with the target's sum; light beyond its edges is lost.
+
+    image: diameter (cells) of the uniform disc with the second moment of the image, σ² = image² / 16 along each axis.
+    The convolution is with the Gaussian of integers (Lindeberg 1990), which has this moment exactly and is nowhere
+    negative; its spectrum is exp(-σ² (1 - cos 2πf)).  A dark margin of BLUR_MARGIN σ surrounds the picture.
+    """
+    import scipy.fft  # not loaded by the import of bstcad
+
+    sigma = image / 4
+    margins = (min(math.ceil(BLUR_MARGIN * sigma), side) for side in picture.shape)
+    rows, columns = (scipy.fft.next_fast_len(n + more, True) for n, more in zip(picture.shape, margins, strict=True))
+    down, across = np.fft.fftfreq(rows), np.fft.rfftfreq(columns)  # cycles per cell
+    along = [np.exp(-(sigma**2) * (1 - np.cos(2 * np.pi * f))).astype(picture.numpy().dtype) for f in (down, across)]
+    waves = scipy.fft.rfft2(picture.numpy(), (rows, columns))
+    waves *= along[0][:, None]
+    waves *= along[1]
+    found = scipy.fft.irfft2(waves, (rows, columns))[: picture.shape[0], : picture.shape[1]]
+    blurred = torch.from_numpy(np.ascontiguousarray(found))
+    return blurred * (total(target) / total(blurred))
 
 
 def _peak_figures(rays: _Rays, screen: Screen) -> dict[str, float]:

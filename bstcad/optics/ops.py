@@ -35,6 +35,7 @@ KERNELS: dict[str, dict[str, str | Callable[..., Any]]] = {
     "trace.land radial": {"cpu": "dome.land"},
     "tubes.search": {"cpu": "search.search"},  # rays of sources through a front to given points
     "tubes.collect": {"cpu": "clip.Clip.apply"},
+    "folds.penalty": {"cpu": "overturned.Folds.apply"},
     "reductions.dot": {"cpu": "reductions.dot_of_arrays"},
 }
 DTYPES = (torch.float32, torch.float64)  # precisions that the kernels support

@@ -264,138 +264,8 @@ def simulate_plain(
     )
 
 
-@functools.lru_cache(maxsize=4096)
-@torch.no_grad()
-def _useful(
-    source: Emitter, before: tuple[Interface, ...], faces: tuple[Interface, ...], area: Rectangle, n: int = WINDOW_CELLS
-) -> Rectangle:
-    """Return the rectangle in `area`, on the plane of the first vertex, with all light that meets a plane of `faces`.
-
-    Two n x n grids of rays are traced; the second covers only the rectangle found with the first.
-    """
-    z = before[0].surface.z
-    for _ in range(2):
-        x, y = sampling.grid(area, n)
-        rays = across(source.rays_through(x, y, z, 1.0), before)
-        meets = torch.stack([cross(rays, face).rays.alive for face in faces]).any(0)
-        area = _around(area, (x, y), n, meets & (source.irradiance(x, y, z) > 0))
-    return area
-
-
-def _around(area: Rectangle, points: tuple[Tensor, ...], n: int, useful: Tensor) -> Rectangle:
-    """Return the rectangle about the axis with all useful points of an n x n grid, and a margin of two cells."""
-    if not bool(useful.any()):
-        return area
-    sides = zip(points, (area.width, area.height), strict=True)
-    half_x, half_y = (min(float(p.abs()[useful].max()) + 2.5 * size / n, size / 2) for p, size in sides)
-    return Rectangle(2 * half_x, 2 * half_y)
-
-
-@torch.no_grad()
-def clear_window(source: Emitter, lens: Lens, n: int = 256) -> Rectangle:
-    """Return the part of `window` whose light passes all faces, with a margin of two cells of an n x n grid.
-
-    Light outside this part counts as lost, and need not be traced during tailoring.
-    """
-    area = window(source, lens)
-    x, y = (p.to(lens.like) for p in sampling.grid(area, n))
-    through = is_transmitted(source.rays_through(x, y, lens.entrance.z, 1.0), lens)
-    through &= source.irradiance(x, y, lens.entrance.z) > 0
-    return _around(area, (x, y), n, through)
-
-
-def launch_strips(source: Emitter, lens: Lens, n: int, seed: int, area: Rectangle | None = None) -> Iterator[Rays]:
-    """Yield those of n x n stratified rays over `area` (default: `window`) that carry flux, a strip at a time.
-
-    The rays of a file are drawn from the file.
-    """
-    if isinstance(source, RayBundle):
-        yield from source.launched(lens, n, seed)
-        return
-    area, like = area or window(source, lens), lens.like
-    for x, y in sampling.stratified_strips(area, n, seed):
-        lit = source.irradiance(x, y, lens.entrance.z) > 0
-        whole = bool(lit.all())
-        x, y = (p.reshape(-1) if whole else p[lit] for p in (x, y))
-        yield source.rays_through(x.to(like), y.to(like), lens.entrance.z, area.area / n**2)
-
-
-@dataclass(frozen=True)
-class Simulation:
-    """Simulated light of one set of rays behind a lens."""
-
-    cells: Tensor  # flux in each cell (k rows, k columns), as a fraction of the source's, row 0 = y max
-    tent: Tensor  # flux in each pixel (rows, columns) by linear (tent) binning
-    flux: dict[str, float]  # ledger of the flux by fate, as fractions of the source's; the lines sum to 1
-    rays: int  # number of rays launched
-
-    @property
-    def box(self) -> Tensor:
-        """Flux in each pixel (rows, columns), as a fraction of the source's, row 0 = y max."""
-        return joined_cells(self.cells, self.cells.shape[0] // self.tent.shape[0])
-
-
-Lights = Sequence[tuple[float, Emitter, Lens, int]]  # (weight, source, lens at this wavelength, seed) per light
-
-
-@torch.no_grad()
-def simulate(
-    lights: Lights, screens: Sequence[Screen], n: int, *, splits_missed: bool = True, cells: int = 1
-) -> tuple[Simulation, ...]:
-    """Simulate the weighted sum of lights on each screen by n x n stratified rays each, the same rays for all screens.
-
-    cells: number k of cells along each side of a pixel in which the light is counted.
-    splits_missed: True: light on the underside has a line of its own; False: it stays in the line "missed the lens",
-    which saves a search per source point.
-
-    The fused kernel is used if it supports all lights; it and the plain form trace the same rays and agree to rounding.
-    """
-    tables = n >= MIN_RAYS_FOR_TABLE and len(lights) <= MAX_LIGHT_TABLES
-    kernels = [
-        whole_kernel("trace.simulate", source, lens, screen.plane, tables=tables)
-        for _, source, lens, _ in lights
-        for screen in screens
-    ]
-    if all(kernels) and (fast := kernels[0]):
-        whole = [(*light, window(light[1], light[2])) for light in lights]
-        given = (fast(whole, screen, n, cells=cells) for screen in screens)
-        return tuple(_as_fractions(lights, *sums, splits_missed=splits_missed) for sums in given)
-    return simulate_plain(lights, screens, n, splits_missed=splits_missed, cells=cells)
-
-
-@torch.no_grad()
-def simulate_plain(
-    lights: Lights, screens: Sequence[Screen], n: int, *, splits_missed: bool = True, cells: int = 1
-) -> tuple[Simulation, ...]:
-    """Simulate as `simulate` does, but in plain torch, with one strip of rays (`launch_strips`) at a time."""
-    like, count = lights[0][2].like, 0
-    fine = [screen.divided(cells) for screen in screens]
-    pictures = [
-        tuple(torch.zeros(each.shape, dtype=torch.float64, device=like.device) for each in pair)
-        for pair in zip(fine, screens, strict=True)
-    ]
-    ledgers: list[dict[str, float]] = [{} for _ in screens]
-    for weight, source, lens, seed in lights:
-        for rays in launch_strips(source, lens, n, seed):
-            landings = from_first_net_to_each(to_first_net(rays, lens), lens, [screen.plane for screen in screens])
-            given = zip(screens, fine, landings, pictures, ledgers, strict=True)
-            for screen, finer, landed, (box, tent), flux in given:
-                box += weight * irradiance.box(landed, finer)
-                tent += weight * irradiance.tent(landed, screen)
-                lines = irradiance.ledger(landed, screen, given=source.is_given)
-                if lens.behind:
-                    lines[BLOCKED] = float(total(landed.flux[landed.status == int(Status.BLOCKED)].double()))
-                for line, value in lines.items():
-                    flux[line] = flux.get(line, 0.0) + weight * value
-            count += rays.flux.numel()
-    return tuple(
-        _as_fractions(lights, box, tent, flux=flux, count=count, splits_missed=splits_missed)
-        for (box, tent), flux in zip(pictures, ledgers, strict=True)
-    )
-
-
 def _as_fractions(
-    lights: Lights, box: Tensor, tent: Tensor, flux: dict[str, float], count: int, *, splits_missed: bool
+    lights: Lights, cells: Tensor, tent: Tensor, flux: dict[str, float], count: int, *, splits_missed: bool
 ) -> Simulation:
     """Return the sums as fractions of the source's light; light not launched missed the lens or met its underside."""
     launched = sum(flux.values())
@@ -404,7 +274,7 @@ def _as_fractions(
     flux["missed the lens"] += 1.0 - launched / whole
     first = lights[0][2]
     if any(source.is_given for _, source, _, _ in lights):  # its rays are counted by where they start
-        return Simulation(box / whole, tent / whole, flux, count)
+        return Simulation(cells / whole, tent / whole, flux, count)
     underside_lit = first.front.outline is not None and first.passes.sense > 0 and not first.before
     if underside_lit and splits_missed:
         stopped = sum(
@@ -414,7 +284,7 @@ def _as_fractions(
         )
         flux[UNDERSIDE] = max(min(stopped, flux["missed the lens"]), 0.0)
         flux["missed the lens"] -= flux[UNDERSIDE]
-    return Simulation(box / whole, tent / whole, flux, count)
+    return Simulation(cells / whole, tent / whole, flux, count)
 
 
 @functools.lru_cache(maxsize=4096)  # independent of the back, which changes in tailoring

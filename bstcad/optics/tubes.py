@@ -461,7 +461,7 @@ def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int], scale: S
     off = sum((p - p.clamp(0, size)) ** 2 for p, size in zip(corner, reversed(shape), strict=True))
     outside = total(flux * middle(off))
     rows, columns = shape
-    first, second, third = _triangles(corner)
+    first, second, third = triangles(corner)
     flux = torch.cat([flux.reshape(-1) / 2] * 2)
     area = ((second - first)[0] * (third - first)[1] - (third - first)[0] * (second - first)[1]) / 2
     cell = torch.stack([p.detach().floor() for p in (first, second, third)])
@@ -491,7 +491,7 @@ def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int], scale: S
     return sums.view(rows, columns + 1).cumsum(1)[:, :columns], outside
 
 
-def _triangles(corner: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def triangles(corner: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the three corners (2, 2 n m) of the two triangles of each quad; the diagonal alternates between quads."""
     p0, p1, p2, p3 = corner[:, :-1, :-1], corner[:, 1:, :-1], corner[:, 1:, 1:], corner[:, :-1, 1:]
     i, j = (torch.arange(k, device=corner.device) for k in p0.shape[1:])

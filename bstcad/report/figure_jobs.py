@@ -149,12 +149,14 @@ def draw_transport(source: Emitter, lens: Lens, screen: Screen, view: View) -> P
 
 
 def draw_light(target: np.ndarray, light: Light, lines: Sequence[SpectralLine], view: View) -> Pngs:
-    """Return the figures of the irradiance and, if there are any, of the ghost and of the spectral lines."""
+    """Return the figures of the irradiance, of the RRMSD by size of the cells, of the ghost and of spectral lines."""
     found, view = light.picture, view.with_flux(target, light.on_screen)
     pictures = {
         "irradiance": light_figures.irradiance_triptych(target, found, view),
         "cross_section": light_figures.cross_section(target, found, view),
     }
+    if light.by_cell:
+        pictures["cell_error"] = light_figures.cell_error(light.by_cell, target.shape, view)
     if light.ghost is not None:
         pictures["ghost"] = light_figures.ghost_picture(target, light.ghost, view)
     if lines:

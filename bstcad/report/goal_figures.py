@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from pydantic import Field
 
+from bstcad.analysis.cell_errors import is_right, right_down_to
 from bstcad.analysis.top_hat import FLAT_LEVEL, FlatTop
 from bstcad.optics.goal import Goal, suffix_of, words_of
 from bstcad.optics.irradiance import Screen
-from bstcad.optics.measure import RESOLVED, Light
+from bstcad.optics.measure import RESOLVED, CellError, Light
 from bstcad.optics.wavefront_error import WavefrontError
 from bstcad.scene.effects import reflection_of
 from bstcad.scene.scene import Scene
@@ -24,6 +25,31 @@ from bstcad.verify.light_limits import PER_LX
 Fraction = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]  # number from 0 to 1, with the rounding error of a sum
 Size = Annotated[float, Field(ge=0, le=1e12)]  # number from 0 to 1e12
 Rrmsd = Annotated[float, Field(gt=0, le=1e3)]
+CELL_WORDS = {1.0: "pixels", 0.5: "half pixels", 0.25: "quarter pixels"}  # side of a cell (pixels): name of the cells
+
+
+@dataclass(frozen=True)
+class CellFigures:
+    """RRMSD of the light on cells of one size, by which each pixel is divided, or pixels are joined."""
+
+    cell: Size  # side of a cell, the geometric mean of width and height, in `unit`
+    unit: str  # unit of the receiver: mm, or degrees for a target over directions
+    pixels: Size  # side of a cell in pixels of the target: 4, 2, 1, 0.5 or 0.25
+    rrmsd: Rrmsd  # RRMSD from the target as it is meant on these cells, without bias by noise
+    standard_error: Annotated[float, Field(ge=0, le=1e3)]  # standard error of rrmsd
+    # RRMSD of the light blurred by the image of the real source, which counts on these cells; None: the size of the
+    # source is simulated, or its image is narrower than a cell
+    blurred: Rrmsd | None = None
+
+    @property
+    def counted(self) -> float:
+        """RRMSD that counts on these cells: `blurred` if it is known."""
+        return self.rrmsd if self.blurred is None else self.blurred
+
+    @property
+    def words(self) -> str:
+        """Name of the cells in a sentence."""
+        return CELL_WORDS.get(self.pixels, f"cells of {self.pixels:g} pixels")
 
 
 @dataclass(frozen=True)
@@ -41,6 +67,20 @@ class GoalFigures:
     leak: Fraction | None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
     contrast: Size | None  # mean irradiance of lit divided by dark pixels; None: no dark pixels, or no leak
     unit: str = "mm"  # unit of x and y on the receiver
+    rrmsd_by_cell: Annotated[tuple[CellFigures, ...], Field(max_length=20)] = ()  # RRMSDs by size of the cells
+    # side of the smallest cell, in `unit`, such that on it and on all larger cells the RRMSD is at most 1.5 times that
+    # on pixels, or at most 0.03; None: not measured, or no cell is as good
+    right_down_to: Size | None = None
+
+    def on_cells(self, pixels: float) -> CellFigures | None:
+        """Return the figures on cells of a side in pixels; None: not measured."""
+        return next((each for each in self.rrmsd_by_cell if each.pixels == pixels), None)
+
+    @property
+    def uneven_in_pixels(self) -> bool:
+        """True if the RRMSD on half pixels is too large for that on pixels, both with the real source if known."""
+        pixel, half = self.on_cells(1.0), self.on_cells(0.5)
+        return pixel is not None and half is not None and not is_right(half.counted, pixel.counted)
 
     @property
     def resolved(self) -> bool:
@@ -86,6 +126,7 @@ class WavefrontFigures:
 
 def figures_of(goals: Sequence[Goal], lights: Sequence[Light]) -> tuple[GoalFigures, ...]:
     """Return the figures of the light on each target."""
+    finest = [right_down_to(light.by_cell) for light in lights]
     return tuple(
         GoalFigures(
             goal.key,
@@ -99,9 +140,20 @@ def figures_of(goals: Sequence[Goal], lights: Sequence[Light]) -> tuple[GoalFigu
             leak=light.leak and light.leak.share,
             contrast=light.leak and light.leak.contrast,
             unit=goal.receiver.plane.unit,
+            rrmsd_by_cell=tuple(_cell_figures(light.by_cell, goal.receiver)),
+            right_down_to=None if smallest is None else smallest * goal.receiver.pixel_side,
         )
-        for goal, light in zip(goals, lights, strict=True)
+        for goal, light, smallest in zip(goals, lights, finest, strict=True)
     )
+
+
+def _cell_figures(errors: Sequence[CellError], screen: Screen) -> Iterator[CellFigures]:
+    """Yield the figures of cells of each size on a screen."""
+    for each in errors:
+        yield CellFigures(
+            each.cell * screen.pixel_side, screen.plane.unit, each.cell,
+            rrmsd=each.rrmsd, standard_error=each.standard_error, blurred=each.blurred,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -113,12 +165,19 @@ class Photometry:
     lumens: Size  # luminous flux on the target (lm)
     unit: str | None  # unit of mean and peak: lx on planes, cd over directions; None: a receiver of a script
     mean: Size | None  # mean illuminance or intensity over the whole target
-    peak: Size | None  # illuminance or intensity of the brightest pixel
+    peak: Size | None  # illuminance or intensity of the brightest cell
     output_ratio: Fraction  # light output ratio: flux that leaves the last surface / flux of the source
     reflection: bool  # True if losses by reflection at the faces are simulated
     # mean luminance of the back (cd/m²), its outline projected, in the direction of the peak; None: not a target over
     # directions
     luminance: Size | None = None
+    peak_error: Size | None = None  # standard error of peak; None: unknown
+    peak_cell: Size = 1.0  # side (pixels) of the cells of which peak is the brightest
+
+    @property
+    def peak_words(self) -> str:
+        """Name of the cell of the peak in a sentence."""
+        return "pixel" if self.peak_cell == 1 else f"cell of {self.peak_cell:g} pixels"
 
 
 def photometry(scene: Scene, proof: Proof) -> Iterator[Photometry]:
@@ -127,18 +186,19 @@ def photometry(scene: Scene, proof: Proof) -> Iterator[Photometry]:
     for key, target, light in zip(scene.target_keys, scene.targets, proof.lights, strict=True) if lumens else ():
         screen, on_target = target.screen, lumens * light.on_screen
         unit = screen.plane.photometric_unit
-        mean = peak = luminance = None
+        mean = peak = error = luminance = None
         if unit is not None and light.picture.any():
             sizes = screen.cell_sizes
             scale = on_target / light.picture.sum() * (PER_LX if unit == "lx" else 1.0)
             values = scale * light.picture / sizes
             row, column = (int(each) for each in np.unravel_index(values.argmax(), values.shape))
             mean = float(scale * light.picture.sum() / sizes.sum())
-            peak = on_target * light.peak * (PER_LX if unit == "lx" else 1.0)
+            whole = on_target * (PER_LX if unit == "lx" else 1.0)
+            peak, error = whole * light.peak, whole * light.peak_error
             luminance = _luminance(proof, screen, peak, at=(row, column)) if unit == "cd" else None
         yield Photometry(
             key, lumens, on_target, unit, mean=mean, peak=peak, output_ratio=light.leaving, luminance=luminance,
-            reflection=reflection_of(scene.effects) is not None,
+            reflection=reflection_of(scene.effects) is not None, peak_error=error, peak_cell=light.peak_cell,
         )  # fmt: skip
 
 

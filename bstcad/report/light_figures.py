@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bstcad.optics.measure import SpectralLine
+from bstcad.analysis.cell_errors import MAX_GROWTH, SMALL_RRMSD
+from bstcad.optics.irradiance import Screen
+from bstcad.optics.measure import CellError, SpectralLine
 from bstcad.optics.receivers import LevelPlane, Receiver
 from bstcad.report.drawing import (
     BLUE,
@@ -388,6 +390,40 @@ def cross_section(target: np.ndarray, irradiance: np.ndarray, view: View) -> Fig
     panels[0][0].set_ylim(bottom=0.0)
     figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
     view.note(figure)
+    return figure
+
+
+@styled
+def cell_error(errors: Sequence[CellError], shape: tuple[int, int], view: View) -> Figure:
+    """Draw the RRMSD against the size of the cells, both logarithmic, with a ring at the pixel.
+
+    shape: rows and columns of the target.  A dotted line is the largest RRMSD at which the light counts as right.
+    """
+    from matplotlib.ticker import NullLocator
+
+    side = Screen(0.0, view.x, view.y, shape[::-1]).pixel_side
+    of_pixel = next(each.rrmsd for each in errors if each.cell == 1)
+    limit = max(MAX_GROWTH * of_pixel, SMALL_RRMSD)
+    figure = new_figure(4.6, 3.0)
+    axes = figure.subplots()
+    sizes = np.array([side * each.cell for each in errors])
+    values, bars = np.array([(each.rrmsd, each.standard_error) for each in errors]).T
+    low = np.minimum(bars, 0.9 * values)
+    axes.errorbar(sizes, values, [low, bars], color=BLUE, marker="o", markersize=3.5, label="as simulated")
+    if real := [(side * each.cell, each.blurred) for each in errors if each.blurred is not None]:
+        style = {"color": VERMILION, "marker": "s", "markersize": 3.5, "linestyle": "--"}
+        axes.plot(*zip(*real, strict=True), **style, label="with the size of the real source")
+    ring = {"marker": "o", "markersize": 10, "markerfacecolor": "none", "markeredgecolor": GREY, "linestyle": ""}
+    axes.plot(side, of_pixel, **ring, label=f"1 pixel, {quantity(side, view.receiver.unit)}", gid="pixel")
+    axes.axhline(limit, color=GREY, linestyle=":", linewidth=0.9, label="largest that counts as right")
+    drawn = [*values, limit, *(value for _, value in real)]
+    ends = (0.8 * min(drawn), 1.25 * max(drawn))
+    axes.set(xscale="log", yscale="log", xlabel=f"size of the cell ({view.receiver.unit})", ylabel="RRMSD", ylim=ends)
+    plain_ticks(axes.yaxis, *ends)
+    axes.xaxis.set_ticks(sizes, [number(size) for size in sizes])
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.grid(axis="y")
+    figure.legend(loc="outside lower center", ncols=2, fontsize=7.5)
     return figure
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from bstcad.optics.goal import suffix_of
 from bstcad.optics.sides import size_text
+from bstcad.report.goal_figures import GoalFigures
 from bstcad.report.prescription import LIGHT_DIRECTIONS, order_rows
 from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, bounds, changes
 from bstcad.report.units import Remark, Rows, about, bound, environment, paragraphs, quantity, tables
@@ -66,6 +67,11 @@ def doubts(report: Contents | Examined) -> list[Remark]:
     if isinstance(report, Examined):
         return []
     return written("verdict.txt.j2", "doubts", report=report)
+
+
+def cell_sentences(goal: GoalFigures) -> list[str]:
+    """Return sentences on the cells down to which the light on a target is right; goal: measured on half pixels."""
+    return paragraphs("cells.txt.j2", "sentence", goal=goal)
 
 
 def check_line(check: Check) -> str:

@@ -76,6 +76,10 @@ class Accept(Record):
     """Limits of the checks in the report; with None the check only states its value."""
 
     rrmsd: Annotated[float | None, Key("Maximum RRMSD of light on a target.", "", 1e-6, 10.0, of_light=True)] = None
+    rrmsd_half: Annotated[
+        float | None,
+        Key("Maximum RRMSD of light on a target, on half pixels.", "", 1e-6, 10.0, example=0.1, of_light=True),
+    ] = None
     form: Annotated[float, Key("Maximum deviation of lens.step from the tailored faces.", "mm", 1e-12, 1.0)] = 1e-6
     efficiency: Annotated[
         float | None, Key("Minimum flux on target / flux behind the lens.", "", 0.0, 1.0, example=0.9, of_light=True)

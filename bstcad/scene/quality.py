@@ -16,7 +16,7 @@ COMMON_PRESET = {"method": "least-squares", "transport_iterations": 40, "stage1_
 OWN_PRESET = COMMON_PRESET | {"overshoot": 0.03, "precision": "float64"}  # settings of bstcad's own qualities
 # Settings of each quality; a setting that the scene states has priority.
 PRESETS: dict[str, dict[str, Any]] = {
-    "draft": OWN_PRESET | {"transport_grid": 256, "rays": 512, "stage2_iterations": 8, "source_points": 16},
+    "draft": OWN_PRESET | {"transport_grid": 256, "rays": 512, "stage2_iterations": 12, "source_points": 16},
     "standard": OWN_PRESET | {"transport_grid": 512, "rays": 1536, "stage2_iterations": 98, "source_points": 64},
     "fine": OWN_PRESET | {"transport_grid": 512, "rays": 2048, "stage2_iterations": 300, "source_points": 128},
     "paper": COMMON_PRESET  # the procedure of Wang et al. 2023: Adam, no penalty

@@ -202,7 +202,15 @@ class Scene(Record):
         """One Goal per target: key, screen, picture and weight."""
         pairs = zip(self.target_keys, self.targets, strict=True)
         return tuple(
-            Goal(key, target.screen, target.irradiance(), target.weight, draw=target.irradiance) for key, target in pairs
+            Goal(
+                key,
+                target.screen,
+                target.irradiance(),
+                target.weight,
+                draw=target.irradiance,
+                is_shape=target.photo is None and target.text is None,
+            )
+            for key, target in pairs
         )
 
     def single_target_scenes(self) -> tuple[Self, ...]:

@@ -22,11 +22,13 @@ from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle
 from bstcad.optics.profiles import pair_of
 from bstcad.optics.sides import as_pair
 from bstcad.report.record import DesignCourse, LeftOut
 from bstcad.scene.effects import Absorption, Effect, Fresnel, Ghost, find_effect, losses, reflection_of
+from bstcad.scene.real_source import DEFAULT_DIAMETER as DEFAULT_DIAMETER
+from bstcad.scene.real_source import DEFAULT_DIVERGENCE as DEFAULT_DIVERGENCE
+from bstcad.scene.real_source import real_size
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.slope_fit import Fit
@@ -87,12 +89,7 @@ def _central_channel(scene: Scene, *more: Effect) -> Channel:
 VISIBLE_BAND = (400.0, 700.0)  # band of white light, nm
 SUN_ANGLES = (0.5, 0.56)  # range of full divergence angles (degrees) treated as sunlight; the sun's mean is 0.53
 LINE_WIDTH = 10.0  # assumed width (nm) of a spectral line; LEDs have 20 to 40, lasers less than 1
-DEFAULT_DIAMETER = 0.1  # assumed diameter of a point source, mm
-DEFAULT_DIVERGENCE = 0.1  # assumed divergence of parallel light, degrees
-# Assumed sizes for each Emitter.size_key: (size, shape, unit).
-DEFAULT_SIZES = {"diameter": (DEFAULT_DIAMETER, "disc", "mm"), "divergence": (DEFAULT_DIVERGENCE, "cone", "degrees")}
 LINE_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # (offset / half width of the band, weight)
-DISC_POINTS = tuple((x, y, 1 / 4) for x in (-0.5, 0.5) for y in (-0.5, 0.5))  # points (x, y, weight) in the unit disc
 FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"  # TOML for scenes
 
 
@@ -185,16 +182,9 @@ def band(scene: Scene) -> tuple[float, float]:
 
 
 def _source_size(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
-    if scene.source.extent is not None or (key := scene.source.size_key) is None:
-        return
-    stated, (default, shape, unit) = getattr(scene.source, f"real_{key}"), DEFAULT_SIZES[key]
-    wide = reference.channel.source.resized(key, stated or default)
-    assert isinstance(wide.extent, Circle)  # the size is a diameter or an angle
-    radius = wide.extent.radius
-    points = ((wide.element(radius * u, radius * v), weight) for u, v, weight in DISC_POINTS)
-    channels = [replace(reference.channel, source=source, weight=weight) for source, weight in points]
-    words = f"source.real_{key} = {stated:g} {unit}" if stated else f"a {shape} of {default:g} {unit}"
-    yield _entry("source size", reference.change(channels), words, f"source.{key}", assumed=not stated)
+    if (size := real_size(scene.source)) is not None:
+        change = reference.change(size.channels(reference.channel))
+        yield _entry("source size", change, size.words, f"source.{size.key}", assumed=size.assumed)
 
 
 def _entry(kind: str, change: Change | None, detail: str = "", simulate_by: str = "", assumed: bool = False) -> LeftOut:

@@ -121,7 +121,9 @@ def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
     rows, columns = (max(round(n / shrunk), 1) for n in screen.shape)
     size = screen.columns, screen.rows
     small = average(lambda b: picture[b[1] : b[3], b[0] : b[2]], size, (0.0, 0.0, *size), (columns, rows))
-    return replace(goal, receiver=replace(screen, pixels=(columns, rows)), picture=small, reachable=None, whole=None)
+    return replace(
+        goal, receiver=replace(screen, pixels=(columns, rows)), picture=small, reachable=None, whole=None, draw=None
+    )
 
 
 def reach_from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver, law: Law, grazing: float) -> Tensor:

@@ -84,7 +84,8 @@ RRMSD_SECONDS = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
 # (p / n)³ / p, so a target of p pixels per side needs (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays per side.
 STAGE_EFFORT, STAGE_EFFORT_PIXELS = Effort(rays=724, accuracy=0, witness=False, cells=1), 512
 ROUGH_RAYS = 0.5  # rays per side of `Task.stage_effort`, relative to STAGE_EFFORT, for an RRMSD known to some 15 %
-FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False, cells=1)  # rays in scenes with accuracy or bounds, and in `better`
+# Rays in scenes with accuracy or bounds, and in `better`.
+FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False, cells=1)
 FLUX_EFFORT = Effort(rays=128, accuracy=1.0, witness=False, cells=1)  # rays for the flux on the target alone
 
 Progress = Callable[[str, int, int, str], None]  # called with stage, units done, units in total, text

@@ -36,6 +36,7 @@ from bstcad.optics.sides import as_pair, coarser
 from bstcad.optics.source_images import images
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import ResolvedTailoring
+from bstcad.tailoring.folds import peak_without_folds
 from bstcad.tailoring.grazing import Grazing
 from bstcad.tailoring.machinability import active_bounds, excess, round_weight
 from bstcad.tailoring.merit import FOUR_POINTS, CoarseVariable, Merit, SobolevVariable, local_weight
@@ -136,7 +137,8 @@ class TubeRound:
         """
         if not self.resolved:
             return math.inf
-        return FOUR_POINTS * max(1.0, min(finest_cells(self.task), 2) * pixels_of(self.task) / self.task.knobs.side) ** 2
+        cells = min(finest_cells(self.task), 2) * pixels_of(self.task)  # per side
+        return FOUR_POINTS * max(1.0, cells / self.task.knobs.side) ** 2
 
     def takes_over(self, before: TubeRound) -> bool:
         """Return True if L-BFGS keeps the steps stored by the round before: it has nearly the same merit and variables.
@@ -159,6 +161,9 @@ class TubeRound:
         goals = tuple(goal.on_cells(self.cells) for goal in task.goals)
         merit = Merit.of(self.channels, lens, self.tubes, goals, overshoot=overshoot, wave=task.wave)
         merit = replace(merit, picture_error=task.merit, shares=self.shares)
+        if task.merit is None and not task.preview:
+            peaks = (peak_without_folds(goal) for goal in task.goals)
+            merit = replace(merit, peaks=tuple(peak and peak / self.cells**2 for peak in peaks))
         if self.source is None:
             return merit
         return merit.with_blur(self.source, lens, seed=None if task.preview else task.knobs.seed)

@@ -33,6 +33,7 @@ from bstcad.scene.accept import Accept
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.errors import SceneError
 from bstcad.scene.mount import Part, as_cut
+from bstcad.scene.real_source import image_diameters, real_size
 from bstcad.scene.scene import Scene
 from bstcad.step_text import part21
 from bstcad.step_text.part21 import StepText
@@ -95,7 +96,16 @@ class Nominal:
 
     def lights(self, lens: Lens, goals: Sequence[Goal], effort: Effort) -> list[Light]:
         """Return the light of a lens on each target, by the same rays."""
-        return measure_goals(lens, self.channels, goals, effort, ghost=self.scene.ghost, draw=self.scene.draw)
+        images = self._source_images(lens, goals) if effort.cells > 1 else ()
+        ghost, draw = self.scene.ghost, self.scene.draw
+        return measure_goals(lens, self.channels, goals, effort, ghost=ghost, draw=draw, images=images)
+
+    def _source_images(self, lens: Lens, goals: Sequence[Goal]) -> Sequence[float]:
+        """Return the diameter (pixels) of the image of the real source on each target; () if its size is simulated."""
+        if (size := real_size(self.scene.source)) is None:
+            return ()
+        centre = replace(self.heaviest, source=self.heaviest.source.central, weight=1.0)
+        return image_diameters(size, centre, lens, [goal.receiver for goal in goals])
 
 
 @dataclass(frozen=True)
@@ -440,6 +450,7 @@ def _light_checks(light: Light, accept: Accept, optic: str = "lens", of: str = "
         Check.at_least(on_target, light.used, accept.light_on_target, where=why, id="light-on-target"),
         Check.at_least(aimed, light.efficiency, accept.efficiency, where=why, id="efficiency"),
         Check.at_most(f"flux ledger: difference of its sum from 1{of}", closure, 1e-12, id="ledger"),
+        *_half_cell_checks(light, accept, of=of, why=why),
     ]
     if tubes is not None:
         name = f"picture by flux tubes: difference from the picture by rays{of}"
@@ -448,6 +459,17 @@ def _light_checks(light: Light, accept: Accept, optic: str = "lens", of: str = "
         name = f"light on dark pixels of the target, as a fraction of the light on the target{of}"
         checks.append(Check.at_most(name, light.leak.share, accept.leak, id="leak"))
     return checks
+
+
+def _half_cell_checks(light: Light, accept: Accept, of: str, why: str) -> list[Check]:
+    """Check the RRMSD on cells of half a pixel; empty if it was neither measured nor limited."""
+    if light.half is None and accept.rrmsd_half is None:
+        return []
+    if light.half is None:
+        why = "cells smaller than the pixels were not measured; set fewer target.pixels, or remove accept.rrmsd_half"
+    value = math.nan if light.half is None else light.half.rrmsd
+    name = f"RRMSD of the light on cells of half a pixel{of}"
+    return [Check.at_most(name, value, accept.rrmsd_half, where=why, id="rrmsd-half")]
 
 
 def _wavefront_checks(lens: Lens, nominal: Nominal) -> tuple[WavefrontError | None, list[Check]]:

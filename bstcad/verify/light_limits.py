@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from bstcad.analysis.far_field import RAYS, SEED, FarField
+from bstcad.analysis.far_field import ANGLE_STEP, PLANE_STEP, RAYS, SEED, FarField
 from bstcad.analysis.light_values import GLARE_ANGLES, Estimate, LightSets, glare
 from bstcad.optics.channels import Channel
 from bstcad.optics.goal import Goal
@@ -93,7 +93,8 @@ def light_values(
         largest = glare([field.table(lens, RAYS // 3) for field in fields])
         found += [
             LightValue.of(
-                f"largest intensity at {angle:g} degrees from the axis, per 1000 lm behind the lens",
+                f"largest intensity at {angle:g} degrees from the axis, means over cells of {PLANE_STEP:g} by "
+                f"{ANGLE_STEP:g} degrees, per 1000 lm behind the lens",
                 value, None, limit, unit="cd/klm", id="glare",
             )
             for angle, value, limit in zip(GLARE_ANGLES, largest, accept.glare, strict=True)

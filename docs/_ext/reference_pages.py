@@ -18,7 +18,7 @@ PAGES = ROOT / "docs" / "reference"
 RECORDS = {  # JSON file: (module, names of its records), with the record of the file first
     "report.json": [
         ("report/record.py", ["Contents", "StageRecord", "CurvePoint", "PrecisionTest", "LineFigures", "LeftOut"]),
-        ("report/goal_figures.py", ["GoalFigures", "WavefrontFigures", "Photometry"]),
+        ("report/goal_figures.py", ["GoalFigures", "CellFigures", "WavefrontFigures", "Photometry"]),
         ("analysis/top_hat.py", ["FlatTop"]),
         ("analysis/cost.py", ["ConvergenceEnd"]),
         ("verify/verdict.py", ["Check"]),

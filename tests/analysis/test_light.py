@@ -237,3 +237,10 @@ class TestBlur:
         assert found.nearer_distance == 100.0
         there = self.of(self.disc(1.0), np.ones(small.shape), screen=replace(small, z=self.BACK + 100.0))
         assert found.nearer_width == pytest.approx(math.sqrt(there.width**2 + 4 / 3), rel=0.01)
+
+    def test_the_finest_detail_is_never_below_the_cells_on_which_the_light_is_right(self):
+        """A nearer target does not make the light right on smaller cells."""
+        small = replace(self.SCREEN, x=(-20.0, 20.0), y=(-20.0, 20.0), pixels=40)
+        free, bound = (finest_detail(10.0, self.plate(), small, "a source", least=least) for least in (0.0, 12.0))
+        assert free.nearer_width < free.width < 12.0
+        assert (bound.width, bound.nearer_width, bound.source_image) == (12.0, None, free.source_image)

@@ -200,6 +200,16 @@ def test_the_figure_of_a_design_follows_dark_mode(own, small_design):
         assert 'media="(prefers-color-scheme: dark)"' in own.ask(page).text
 
 
+def test_the_page_of_a_design_says_down_to_which_cell_its_light_is_right(own, small_design):
+    """A design whose light was measured on pixels alone has no such part."""
+    shutil.copytree(small_design.folder, own.folder / "real")
+    page, bare = own.ask("/design/real").text, own.ask("/design/made").text
+    assert "The light on the target is right" in page and "on half pixels" in page
+    assert own.ask("/design/real/files/figures/cell_error.png").body.startswith(b"\x89PNG")
+    assert 'src="/design/real/files/figures/cell_error.png" alt="RRMSD against' in page
+    assert "cell_error" not in bare and "half pixels" not in bare
+
+
 @pytest.mark.parametrize("stage", ["preview", "effects"])
 def test_a_preview_that_fails_is_told_without_folders(own, monkeypatch, stage):
     fault = FileNotFoundError(2, "No such file or directory", str(own.folder / "pictures/x.png"))

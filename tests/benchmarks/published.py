@@ -32,6 +32,7 @@ from tests import markdown
 from tests.benchmarks import accuracy
 from tests.benchmarks.cold import ROOT, TEMPLATES, generate
 from tests.benchmarks.independent import judge
+from tests.benchmarks.judged_cells import HALF, finer_targets, stated_by_cell
 
 RECORDED, PAGE, PICTURES = (ROOT / "docs" / name for name in ("published.json", "published.md", "published"))
 TEXT, SCENES = Path(__file__).with_name("published.md.j2"), Path(__file__).with_name("published_scenes")
@@ -74,13 +75,15 @@ def designed(name: str, sun: Path | None) -> dict[str, Any]:
             scene = Path(shutil.copy(scene, place))
             bordered(sun).save(scene.with_suffix(".png"))
         run = generate(scene, Path(place) / "design")
-        report, judged = run.report(), judge(run.folder)
+        report, judged = run.report(), judge(run.folder, finer_targets=finer_targets(run.folder)[0])
         with np.load(run.folder / "design.npz") as kept:
             target = kept["target"].astype(float)
         seen = View.of(read_nominal(run.folder)[0])
     files.put(PICTURES / f"{name}.png", side_by_side(seen.picture(target), seen.picture(judged.picture)))
+    half, half_error = judged.by_cell[HALF]
     return {
         "rrmsd": judged.rrmsd, "error": judged.error, "stated": report["rrmsd"], "on_target": judged.flux["on target"],
+        "rrmsd_half": half, "error_half": half_error, "stated_half": stated_by_cell(report).get(HALF, (None,))[0],
         "ssim": structural_similarity(target, judged.picture, data_range=float(target.max())),
         "whole": report.get("rrmsd_whole"),
         "failed": [check["name"] for check in report["checks"] if not check["passed"]],
@@ -110,11 +113,12 @@ def known() -> dict[str, Any]:
 
 
 def page(recorded: Mapping[str, Any], others: Mapping[str, Any]) -> str:
-    """Return the page from the records, and from accuracy.json Mitsuba's run."""
+    """Return the page from the records, and from accuracy.json Mitsuba's run and the paper's procedure."""
     when = {json.dumps(found["recorded"]): found["recorded"] for found in recorded.values()}
     return markdown.page(
         TEXT, {}, found=recorded, rays=max(found["rays"] for found in recorded.values()),
-        mitsuba=others["mitsuba"]["points"][-1], titles={name: title for name, (title, _) in CASES.items()},
+        mitsuba=others["mitsuba"]["points"][-1], paper=others["designs"]["thu"]["paper"],
+        titles={name: title for name, (title, _) in CASES.items()},
         records=sorted(when.values(), key=lambda each: each["date"]),
     )  # fmt: skip
 

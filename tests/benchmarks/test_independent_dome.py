@@ -1,8 +1,6 @@
 """The independent judge of domes: its reader and B-splines beside other programs, and its pictures beside bstcad's."""
 
 import math
-import re
-from pathlib import Path
 
 import cadquery as cq
 import numpy as np
@@ -28,12 +26,11 @@ from bstcad.optics.surfaces import Sphere
 from tests.benchmarks import independent_dome, judged_dome
 from tests.benchmarks.cold import generate
 from tests.benchmarks.independent import Conic
-from tests.benchmarks.test_independent import FLUX, SIGMAS, judged
+from tests.benchmarks.test_independent import FLUX, SIGMAS, SMALL, judged
 
 R, INNER, N, Z, HALF = 15.0, 8.0, 1.4936, 3.0, math.radians(80.0)
 CHART = SphereChart(R)
 RIM = CHART.length(HALF)
-DOCS = Path(__file__).parents[2] / "docs"
 MISFIT = 0.8  # largest RMS difference in units of the noise of random rays; Sobol points have less
 PIXELS, RAYS = 24, 1 << 16
 
@@ -142,12 +139,10 @@ def test_the_judge_of_folders_meets_a_front_where_its_equation_holds(conic):
 
 
 @pytest.mark.bench
-@pytest.mark.parametrize("changes", [(), ("source.width=0.6", "source.height=0.4", "effects=[{kind='fresnel'}]")])
+@pytest.mark.parametrize("changes", [(), ("source.width=0.12", "source.height=0.08", "effects=[{kind='fresnel'}]")])
 def test_a_folder_of_a_dome_is_judged_independently(changes, tmp_path):
-    """The scene of the how-to, as a point without losses and as a small chip with Fresnel's reflections."""
-    text = re.search(r"```toml\n(.*?)```", (DOCS / "how-to" / "domes.md").read_text(), re.DOTALL).group(1)
-    (tmp_path / "dome.toml").write_text(text)
-    done = generate(tmp_path / "dome.toml", tmp_path / "out", *changes, "tailoring.quality=draft")
+    """A small template's dome, of a point without losses and of a small chip with Fresnel's reflections."""
+    done = generate("dome_letters", tmp_path / "out", *SMALL, *changes, "tailoring.quality=draft")
     assert done.code in (0, 1), done.said
     report, found = judged(tmp_path / "out", SIGMAS)
     for line in ("on target", "off target", "missed the lens"):

@@ -130,3 +130,44 @@ def test_the_lines_of_a_spectrum_apart_sum_to_the_light_of_all():
         np.testing.assert_allclose(line.picture, alone * (target().sum() / alone.sum()), rtol=0, atol=1e-12)
     assert np.abs(lines[0].picture - lines[1].picture).max() > 1e-3 * target().max()  # dispersion
     assert spectral_lines(LENS, channels[:1], Goal("target", SCREEN, target()), 64) == ()
+
+
+class TestRealSource:
+    """The light blurred by the image of a source that the rays do not have."""
+
+    def test_a_blur_has_the_second_moment_of_the_source_and_keeps_the_light(self):
+        point = torch.zeros(65, 65, dtype=torch.float64)
+        point[32, 32] = 1.0
+        for diameter in (3.0, 12.0):
+            found = measuring._blurred(point, point, diameter).numpy()
+            across = np.arange(65) - 32.0
+            assert found.sum() == pytest.approx(1.0)
+            assert [found.sum(k) @ across**2 for k in (0, 1)] == pytest.approx([diameter**2 / 16] * 2, rel=0.01)
+
+    def test_light_beyond_the_edges_is_lost(self):
+        """Even light: the corners keep a quarter, and the middle keeps all, before it is scaled to the target's sum."""
+        even = torch.ones(64, 64)
+        found = measuring._blurred(even, even, 8.0)
+        assert float(found[0, 0] / found[32, 32]) == pytest.approx(0.25 * (1 + 0.5 / (2.0 * 1.2533)) ** 2, rel=0.02)
+
+    def test_noise_does_not_bias_the_error_of_the_blurred_light(self):
+        """Stripes of 20 % and a noise of 50 %: without noise the blurred light has the same RRMSD."""
+        random, stripes = np.random.default_rng(5), 1 + 0.2 * (-1.0) ** np.arange(96) * np.ones((96, 1))
+        noisy = [torch.from_numpy(stripes + 0.5 * random.standard_normal((96, 96))) for _ in range(measuring.SETS)]
+        target = torch.full((96, 96), float(stripes.mean()), dtype=torch.float64)
+        noiseless = measuring._blurred(torch.from_numpy(stripes), target, 2.0)
+        wanted = float(((noiseless - target) ** 2).sum() / (target**2).sum()) ** 0.5
+        found = measuring._cell_error(0.5, noisy, target, image=1.0)
+        assert found.rrmsd == pytest.approx(0.2, rel=0.02) and found.blurred == pytest.approx(wanted, rel=0.1)
+        assert found.counted == found.blurred < 0.2
+
+    def test_only_cells_narrower_than_the_image_are_blurred(self):
+        goal, channels = Goal("target", SCREEN, target()), (Channel(BEAM, 1.5),)
+        sharp, wide = (
+            measuring.measure_goals(LENS, channels, [goal], EFFORT, ghost=None, draw=None, images=images)[0]
+            for images in ((), (0.8,))
+        )
+        assert [each.blurred for each in sharp.by_cell] == [None] * 5
+        assert [each.cell for each in wide.by_cell if each.blurred is not None] == [0.5, 0.25]
+        assert [each.rrmsd for each in wide.by_cell] == [each.rrmsd for each in sharp.by_cell]
+        assert all(each.blurred < each.rrmsd for each in wide.by_cell[3:])  # a random target, far from the light

@@ -14,7 +14,7 @@ from bstcad.analysis.shape import describe, survey
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import SpectralLine
+from bstcad.optics.measure import CellError, SpectralLine
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Plane, Sphere
 from bstcad.report import drawing, figure_jobs, light_figures
@@ -256,3 +256,17 @@ def test_the_figure_has_a_picture_of_all_lines_and_one_of_each(count):
     figure = spectral_lines(target, 1.02 * target, lines, LENS)
     shown = [axes.get_title(loc="left") for axes in figure.axes if axes.get_visible()]
     assert len(shown) == count + 1 and shown[0] == "All lines" and "450 nm" in shown[1]
+
+
+def test_the_error_by_cell_is_drawn_with_its_pixel_marked():
+    """Pixels of 400 / 20 by 300 / 15 mm; the real source counts on half pixels alone."""
+    found = [CellError(2.0, 0.02, 1e-4), CellError(1.0, 0.03, 1e-4), CellError(0.5, 0.2, 1e-3, blurred=0.05)]
+    figure = light_figures.cell_error(found, (15, 20), BEHIND)
+    [axes] = figure.axes
+    assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+    lines = {line.get_gid() or line.get_label(): line.get_xydata() for line in axes.lines}
+    assert lines["pixel"] == pytest.approx(np.array([[20.0, 0.03]]))
+    assert lines["with the size of the real source"] == pytest.approx(np.array([[10.0, 0.05]]))
+    curve = next(line.get_xydata() for line in axes.lines if len(line.get_xydata()) == 3)
+    assert curve == pytest.approx(np.array([[40.0, 0.02], [20.0, 0.03], [10.0, 0.2]]))
+    assert png(figure)[:4] == b"\x89PNG"

@@ -38,6 +38,21 @@ def test_a_written_report_is_kept_whole(small_design):
     assert found.history and found.stages and found.making.twins == found.twins
 
 
+def test_figures_on_cells_are_kept_for_the_worst_target_and_for_each(small_design):
+    """The lists are empty, and not in the file, if nothing was measured inside the pixels (a golden file above)."""
+    facts = json.loads((small_design.folder / "report.json").read_text())
+    found = of_json(json.dumps(facts))
+    [goal] = found.goals
+    assert facts["rrmsd_by_cell"] == facts["goals"][0]["rrmsd_by_cell"] and found.rrmsd_by_cell == goal.rrmsd_by_cell
+    assert [each.pixels for each in goal.rrmsd_by_cell] == [4, 2, 1, 0.5, 0.25]
+    assert goal.on_cells(1.0).rrmsd == found.rrmsd and found.right_down_to == goal.right_down_to
+    pixel = math.sqrt(60 / 64 * 50 / 48)  # mm
+    assert [each.cell for each in goal.rrmsd_by_cell] == pytest.approx([pixel * k for k in (4, 2, 1, 0.5, 0.25)])
+    real = [each.pixels for each in goal.rrmsd_by_cell if each.blurred is not None]
+    assert real == [0.5, 0.25]  # an assumed lamp of 0.1 mm has an image of 0.58 mm, 0.58 pixels
+    assert not {"rrmsd_by_cell", "right_down_to"} & {*CONTENTS.facts(), *CONTENTS.facts()["goals"][0]}
+
+
 WRONG = {  # key of report.json: values that are none of ours
     "seconds_total": ["1", True, -1.0, 1e10, None],
     "stages": [{}, [1], [{"name": "a\nb", "seconds": 1.0, "rrmsd": None}], [[]] * 101, [{"name": "a"}]],
@@ -50,6 +65,8 @@ WRONG = {  # key of report.json: values that are none of ours
     "verdict": ["fine"],
     "order": [{"file": "lens.step"}],
     "blur": [{"width": 3.0, "pixels": 1.0, "rrmsd": 0.1, "more": 1}],
+    "rrmsd_by_cell": [None, [{"cell": 1.0}], [{"cell": 1, "unit": 1, "pixels": 1, "rrmsd": 0.1, "standard_error": 0}]],
+    "right_down_to": [-1.0, "1 mm"],
     "more": [1],  # a key that there is not
 }
 

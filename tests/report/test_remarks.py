@@ -9,6 +9,7 @@ import pytest
 from bstcad.analysis.light import Blur, FinestDetail
 from bstcad.optics.goal import Goal
 from bstcad.optics.irradiance import Screen
+from bstcad.report.goal_figures import CellFigures
 from bstcad.report.record import LeftOut, remarks
 from bstcad.report.report import doubts
 from bstcad.report.units import remarks as written
@@ -101,7 +102,7 @@ def scene():
     return load("templates/disk.toml")
 
 
-def said(scene, changes=None, target=None, found=None):
+def said(scene, changes=None, target=None, found=None, cells=()):
     facts = copy.deepcopy(FACTS)
     for key, value in (changes or {}).items():
         table, _, name = key.partition(".")
@@ -111,9 +112,30 @@ def said(scene, changes=None, target=None, found=None):
             facts[key] = value
     target = np.full((8, 8), 1 / 64) if target is None else target
     figures = {key: facts[key] for key in ("rrmsd", "efficiency") if key in facts}
-    contents = replace(CONTENTS, **facts, goals=(replace(CONTENTS.goals[0], **figures),))
+    contents = replace(CONTENTS, **facts, goals=(replace(CONTENTS.goals[0], **figures, rrmsd_by_cell=cells),))
     goal = Goal("target", Screen(500.0, (-200.0, 200.0), (-200.0, 200.0), 8), target)
     return remarks(contents, scene, [goal], [target if found is None else found])
+
+
+def on_cells(pixel, half, blurred=None):
+    """Return the figures on pixels and half pixels; blurred: those with the real source."""
+    pairs = zip((1.0, 0.5), (pixel, half), blurred or (None, None), strict=True)
+    return tuple(CellFigures(0.8 * size, "mm", size, rrmsd, 1e-4, blurred=real) for size, rrmsd, real in pairs)
+
+
+@pytest.mark.parametrize(("cells", "words"), [
+    ((), None),
+    (on_cells(0.03, 0.044), None),  # 1.5 times
+    (on_cells(0.03, 0.232), ["0.03 on pixels", "0.232 on half pixels", "more target.pixels", "narrower than half"]),
+    (on_cells(0.005, 0.029), None),
+    (on_cells(0.005, 0.031), ["0.005", "0.031"]),
+    (on_cells(0.03, 0.232, (0.1, 0.12)), None),  # the real source blurs the stripes
+    (on_cells(0.03, 0.232, (None, 0.06)), ["0.232 on half pixels, and 0.06 on half pixels with the size of the real"]),
+])  # fmt: skip
+def test_light_that_varies_inside_pixels_is_said(scene, cells, words):
+    found = {id: text for id, text in said(scene, cells=cells)}
+    assert list(found) == ([] if words is None else ["inside-pixels"])
+    assert [each for each in words or () if each not in found["inside-pixels"]] == []
 
 
 @pytest.mark.parametrize(("changes", "asked", "expected"), SAID)

@@ -121,6 +121,36 @@ def test_each_fact_has_its_words_on_the_page_and_first_figures_on_the_terminal(c
     assert not any(words in text for text in bare)
 
 
+CELLS = [
+    {"cell": 0.8 * k, "unit": "mm", "pixels": k, "rrmsd": rrmsd, "standard_error": 1e-4, "blurred": blurred}
+    for k, rrmsd, blurred in ((2.0, 0.02, None), (1.0, 0.0284, None), (0.5, 0.232, None), (0.25, 0.34, 0.0821))
+]
+
+
+def with_cells(right_down_to):
+    report = copy.deepcopy(REPORT)
+    report["goals"][0] |= {"rrmsd_by_cell": CELLS, "right_down_to": right_down_to}
+    return report | {"rrmsd_by_cell": CELLS, "right_down_to": right_down_to}
+
+
+@pytest.mark.parametrize(("smallest", "words"), [(0.8, "0.8 mm"), (None, "no measured size")])
+def test_terminal_and_page_say_down_to_which_cell_the_light_is_right(smallest, words):
+    figures = "RRMSD 0.0284 on pixels, 0.232 on half pixels; 0.0821 on quarter pixels with the size of the real source"
+    report = with_cells(smallest)
+    [line] = [line for line in printed(report).splitlines() if line.startswith("Light right down to")]
+    assert words in line and figures in line
+    page = " ".join(html.unescape(page_of(report, {"cell_error": PNG})).split())
+    assert figures in page and words.split()[0] in page and "RRMSD against the size of the cells" in page
+    bare = page_of(REPORT, {"cell_error": PNG})
+    assert "Error against size" not in bare and "right down to" not in printed(REPORT)
+
+
+def test_the_finest_detail_names_the_light_if_this_limits_it():
+    report = with_cells(8.0) | {"finest_detail": DETAIL | ALONE | {"width": 8.0}}
+    assert "limited by the light, which is right down to cells of this size" in printed(report)
+    assert "limited by the image" in printed(with_cells(0.8) | {"finest_detail": DETAIL})
+
+
 class TestHtml:
     def test_a_page_runs_one_script_of_ours_or_none(self):
         """The browser's own rule tells scripts apart by their hashes."""

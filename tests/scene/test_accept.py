@@ -104,3 +104,13 @@ def test_the_page_adds_a_point(disk):
     assert {"accept.point[0].at", "accept.point[0].unit", "accept.uniformity.min_to_mean"} <= known.keys()
     written = tomllib.loads(text_changed(TEXT, "accept.point[0]", dict(addition.value)))
     assert written["accept"] == data["accept"]
+
+
+def test_a_limit_on_half_pixels_is_a_limit_on_the_light_and_goes_through_the_file(disk, tmp_path):
+    free = disk.changed({"accept": {}})
+    made = free.changed({"accept.rrmsd_half": 0.1})
+    (tmp_path / "scene.toml").write_text(made.toml(), encoding="utf-8")
+    assert load(tmp_path / "scene.toml").accept.rrmsd_half == 0.1
+    assert made.limits_light and not free.limits_light
+    with pytest.raises(SceneError, match="accept.rrmsd_half"):
+        disk.changed({"accept.rrmsd_half": -1.0})

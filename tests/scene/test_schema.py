@@ -67,7 +67,7 @@ def test_the_keys_are_those_of_the_models(capsys):
 
 @pytest.mark.parametrize(("asked", "first", "count"), [
     ("lens.tool_radius", "lens.tool_radius\tmm\t1e-06 to 1e+09\t\tRadius of the tool: ", 1),
-    ("accept", "accept\tnone\ttable\t\tThe limits", 28),
+    ("accept", "accept\tnone\ttable\t\tThe limits", 29),
     ("effects[0].coating", "effects[].coating\tnone\ttable\t\tfresnel: ", 3),
     ("lens.front.curvature", "lens.front.curvature\t1/mm\t-1000 to 1000\t0.0\tsphere, conic: ", 1),
 ])  # fmt: skip

@@ -20,7 +20,7 @@ from bstcad.cad import mesh as meshes
 from bstcad.cad import step_reading
 from bstcad.folder import read_nominal
 from bstcad.optics import measure
-from bstcad.optics.measure import Effort, Light
+from bstcad.optics.measure import CellError, Effort, Light
 from bstcad.scene.accept import Accept
 from bstcad.verify import checks, step_checks
 from bstcad.verify.checks import Check
@@ -58,8 +58,8 @@ def nominal(small_design, few):
 
 
 def with_picture(nominal, picture, **changes):
-    """Return the nominal with another picture, which is stored as well."""
-    goals = tuple(replace(goal, picture=picture, **changes) for goal in nominal.goals)
+    """Return the nominal with another picture, which is stored as well, and interpolated on cells."""
+    goals = tuple(replace(goal, picture=picture, draw=None, **changes) for goal in nominal.goals)
     return replace(nominal, goals=goals, stored=(picture,))
 
 
@@ -373,6 +373,31 @@ def test_noise_fails_where_neither_figure_nor_verdict_is_sure(rrmsd, error, aske
     assert noise.passed is passes and noise.value == 5 * error
 
 
+HALVES = [  # RRMSD on half pixels (None: not measured), accept.rrmsd_half, does its check pass (None: no check)?
+    (0.2, None, True),
+    (0.2, 0.25, True),
+    (0.2, 0.15, False),
+    (None, None, None),
+    (None, 0.15, False),
+]
+
+
+@pytest.mark.parametrize(("half", "asked", "passes"), HALVES)
+def test_the_rrmsd_on_half_pixels_has_a_limit_of_its_own(half, asked, passes):
+    by_cell = () if half is None else (CellError(1.0, 0.02, 1e-4), CellError(0.5, half, 1e-4, blurred=0.01))
+    light = Light(np.ones((2, 2)), 0.02, 1e-4, rays=1, flux={"on target": 1.0, "missed the lens": 0.0}, by_cell=by_cell)
+    found = [c for c in checks._light_checks(light, Accept(rrmsd_half=asked)) if c.id == "rrmsd-half"]
+    assert [(c.passed, c.value, c.limit) for c in found] == ([] if passes is None else [(passes, half, asked)])
+    assert passes is not False or half is not None or "target.pixels" in found[0].where
+
+
+def test_light_on_half_pixels_fails_by_its_own_limit(folder, nominal):
+    """The board of 8 % of the fixture's target is even within pixels, too."""
+    proof = checks.verify(folder, other_limits(nominal, rrmsd_half=0.01))
+    assert failing(proof) == {"rrmsd-half"}
+    assert failing(checks.verify(folder, other_limits(nominal, rrmsd_half=0.5))) == set()
+
+
 def test_a_scene_that_asks_for_nothing_is_judged_by_no_limit_on_the_light(folder, nominal):
     """30 % of "rrmsd" and a fifth of the light pass where nobody asked for more; a limit of either fails by name."""
     board = (-1.0) ** np.add.outer(np.arange(12), np.arange(16))
@@ -412,7 +437,8 @@ def test_rays_that_do_not_see_what_the_tubes_see_fail(folder, nominal, monkeypat
 
     def moved(*arguments, **options):
         [found] = simulate(*arguments, **options)
-        return (replace(found, box=found.box + 0.33 * (found.box.roll(1, 0) - found.box)),)
+        pixel = found.cells.shape[0] // found.tent.shape[0]  # cells along a side
+        return (replace(found, cells=found.cells + 0.33 * (found.cells.roll(pixel, 0) - found.cells)),)
 
     effort = replace(FEW, rays=512)
     assert "tubes" not in failing(checks.verify(folder, nominal, effort=effort))

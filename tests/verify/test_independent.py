@@ -4,8 +4,12 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
-from tests.benchmarks.independent import faces, judge, net_of, paired
+from bstcad.optics import goal
+from bstcad.optics.irradiance import joined_cells
+from tests.benchmarks.independent import faces, interpolated, joined, judge, net_of, paired
+from tests.benchmarks.judged_cells import finer_targets, stated_by_cell
 
 SIGMAS = 3
 
@@ -13,7 +17,7 @@ SIGMAS = 3
 @pytest.fixture(scope="module")
 def judged(small_design):
     """The judge's figures of the small design: two million rays."""
-    return judge(small_design.folder, points=1 << 18)
+    return judge(small_design.folder, points=1 << 18, finer_targets=finer_targets(small_design.folder)[0])
 
 
 def test_a_design_states_the_rrmsd_of_an_independent_monte_carlo(small_design, judged):
@@ -21,6 +25,14 @@ def test_a_design_states_the_rrmsd_of_an_independent_monte_carlo(small_design, j
     error = math.hypot(stated["rrmsd_noise"], judged.error)
     assert error < 3e-4  # RRMSD; a seventeenth of what the design ends at
     assert abs(stated["rrmsd"] - judged.rrmsd) < SIGMAS * error
+
+
+def test_a_design_states_the_rrmsd_of_an_independent_monte_carlo_on_cells_of_each_size(small_design, judged):
+    stated = stated_by_cell(small_design.report)
+    assert judged.by_cell[1.0] == pytest.approx((judged.rrmsd, judged.error))
+    for size, (rrmsd, error) in stated.items():
+        own, own_error = judged.by_cell[size]
+        assert abs(rrmsd - own) < max(0.03 * own, SIGMAS * math.hypot(error, own_error)), size
 
 
 def test_a_design_states_the_flux_of_an_independent_monte_carlo(small_design, judged):
@@ -50,3 +62,15 @@ def test_pairs_of_pictures_have_no_noise_in_their_mean():
     pattern = 0.1 * np.where(np.arange(target.size) % 2, 1, -1)
     pictures = target + pattern + 0.3 * np.random.default_rng(5).standard_normal((8, target.size))
     assert paired(pictures, target) == pytest.approx(0.1, rel=0.02)
+
+
+def test_the_judge_interpolates_and_joins_cells_as_bstcad_does():
+    """Two forms of the same mathematics: means over pixels are kept, and no cell is negative."""
+    picture = np.random.default_rng(7).random((7, 10)) ** 4
+    for count in (2, 4):
+        fine = interpolated(picture, count)
+        np.testing.assert_allclose(fine, goal.interpolated(picture, count), rtol=0, atol=1e-15)
+        np.testing.assert_allclose(joined(fine, count), picture, rtol=0, atol=1e-15)
+        assert fine.min() >= 0
+    for count in (2, 4):  # the sides are not multiples of these
+        np.testing.assert_allclose(joined(picture, count), joined_cells(torch.from_numpy(picture), count), atol=1e-15)
