@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from bstcad.optics.irradiance import Screen  # a type only: the module loads torch
 
 
+SUM_ROUNDING = 1e-9  # largest deviation from 1 of the sum of a picture that counts as rounding
+
+
 @dataclass(frozen=True, eq=False)
 class Goal:
     """A picture on a receiver."""
@@ -49,7 +52,9 @@ class Goal:
         if cells == 1:
             return self
         picture = self.picture if self.whole is None else self.whole
-        fine = interpolated(picture, cells) if self.draw is None else self.draw(cells) * picture.sum()
+        fine = interpolated(picture, cells) if self.draw is None else self.draw(cells)
+        if abs(picture.sum() - 1) > SUM_ROUNDING and self.draw is not None:
+            fine = fine * picture.sum()
         part = self.reachable
         goal = Goal(self.key, self.receiver.divided(cells), fine, self.weight, is_shape=self.is_shape)
         return goal.restricted(None if part is None else np.kron(part, np.ones((cells, cells), dtype=bool)))

@@ -211,7 +211,7 @@ class CellTarget:
 
     picture: Tensor  # target T (k rows, k columns) on the smallest cells, k = 2^(levels - 1) along each side of a pixel
     weights: tuple[float, ...]  # weights s_l / Σ T_l² of Σ D_l², for pixels (l = 0) to the smallest cells
-    size: float  # Σ T² of the smallest cells
+    size: float  # Σ T_0² of the pixels
 
     @classmethod
     def of(cls, picture: Tensor, shares: Sequence[float] = (1.0,)) -> CellTarget:
@@ -219,11 +219,11 @@ class CellTarget:
         finest = 1 << (len(shares) - 1)
         sizes = [float(total(joined_cells(picture, finest >> level) ** 2)) for level in range(len(shares))]
         weights = tuple(share / size for share, size in zip(shares, sizes, strict=True))
-        return cls(picture.T.contiguous().T, weights, sizes[-1])  # by columns, as `tubes.collect` makes pictures
+        return cls(picture.T.contiguous().T, weights, sizes[0])  # by columns, as `tubes.collect` makes pictures
 
 
 def picture_error(image: Tensor, flux: Tensor, target: CellTarget) -> tuple[Tensor, Tensor]:
-    """Return (error of a picture on all scales, its RRMSD on the smallest cells after scaling to the target's sum).
+    """Return (error of a picture on all scales, its RRMSD on pixels after scaling to the sum of the target).
 
     With d = image / flux - T on the smallest cells and D_l the sums of d over cells of 2^-l pixels, the error is
 
@@ -238,8 +238,8 @@ def picture_error(image: Tensor, flux: Tensor, target: CellTarget) -> tuple[Tens
         (weight * total(joined_cells(d, 1 << (last - level)) ** 2) for level, weight in enumerate(target.weights)),
         torch.zeros_like(flux),
     )
-    shape = image.detach() / total(image.detach())
-    return error, (total((shape - target.picture) ** 2) / target.size).sqrt()
+    off = joined_cells(image.detach() / total(image.detach()) - target.picture, 1 << last)
+    return error, (total(off**2) / target.size).sqrt()
 
 
 @dataclass(frozen=True)

@@ -286,14 +286,12 @@ class _Setup:
             flux |= {line: flux.get(line, 0.0) + more for line, more in self.ghost.flux.items()}
         count = sum(part.rays for part in sets)
         boxes, tents = ([self.with_ghost(getattr(part, kind)) for part in sets] for kind in ("box", "tent"))
-        counted = sets[0].cells.shape[0] // sets[0].tent.shape[0]
         on_screen = math.fsum(float(total(box)) for box in boxes) / SETS
         if not all(float(total(box)) > 0 for box in boxes):
             return _Rays((), (), flux, count, on_screen=0.0)
         scales = [total(self.target) / total(box) for box in boxes]
-        cells = () if counted == 1 else tuple(
-            self.with_ghost(part.cells).float().mul_(scale) for scale, part in zip(scales, sets, strict=True)
-        )  # fmt: skip
+        pairs = zip(scales, sets, strict=True)
+        cells = tuple(self.with_ghost(part.cells).mul_(scale) for scale, part in pairs if part.cells is not None)
         return _Rays(
             tuple(scale * box for scale, box in zip(scales, boxes, strict=True)),
             tuple(tent * (total(self.target) / total(tent)) for tent in tents),
@@ -306,7 +304,7 @@ class _Setup:
             return picture.cpu()
         ghost, cells = self.ghost.picture.cpu(), picture.shape[0] // self.screen.rows
         if cells > 1:
-            ghost = torch.from_numpy(interpolated(ghost.numpy(), cells))
+            ghost = torch.from_numpy(interpolated(ghost.numpy(), cells)).to(picture.dtype)
         return picture.cpu() + ghost
 
 

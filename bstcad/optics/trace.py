@@ -194,15 +194,11 @@ def launch_strips(source: Emitter, lens: Lens, n: int, seed: int, area: Rectangl
 class Simulation:
     """Simulated light of one set of rays behind a lens."""
 
-    cells: Tensor  # flux in each cell (k rows, k columns), as a fraction of the source's, row 0 = y max
-    tent: Tensor  # flux in each pixel (rows, columns) by linear (tent) binning
+    box: Tensor  # flux in each pixel (rows, columns), as a fraction of the source's, row 0 = y max
+    tent: Tensor  # flux in each pixel by linear (tent) binning; shape and unit as for `box`
     flux: dict[str, float]  # ledger of the flux by fate, as fractions of the source's; the lines sum to 1
     rays: int  # number of rays launched
-
-    @functools.cached_property
-    def box(self) -> Tensor:
-        """Flux in each pixel (rows, columns), as a fraction of the source's, row 0 = y max."""
-        return joined_cells(self.cells, self.cells.shape[0] // self.tent.shape[0])
+    cells: Tensor | None = None  # flux in each cell (k rows, k columns), float32 for the memory; None: k = 1
 
 
 Lights = Sequence[tuple[float, Emitter, Lens, int]]  # (weight, source, lens at this wavelength, seed) per light
@@ -239,18 +235,18 @@ def simulate_plain(
 ) -> tuple[Simulation, ...]:
     """Simulate as `simulate` does, but in plain torch, with one strip of rays (`launch_strips`) at a time."""
     like, count = lights[0][2].like, 0
-    fine = [screen.divided(cells) for screen in screens]
     pictures = [
-        tuple(torch.zeros(each.shape, dtype=torch.float64, device=like.device) for each in pair)
-        for pair in zip(fine, screens, strict=True)
+        tuple(
+            torch.zeros(each.shape, dtype=torch.float64, device=like.device) for each in (screen.divided(cells), screen)
+        )
+        for screen in screens
     ]
     ledgers: list[dict[str, float]] = [{} for _ in screens]
     for weight, source, lens, seed in lights:
         for rays in launch_strips(source, lens, n, seed):
             landings = from_first_net_to_each(to_first_net(rays, lens), lens, [screen.plane for screen in screens])
-            given = zip(screens, fine, landings, pictures, ledgers, strict=True)
-            for screen, finer, landed, (box, tent), flux in given:
-                box += weight * irradiance.box(landed, finer)
+            for screen, landed, (box, tent), flux in zip(screens, landings, pictures, ledgers, strict=True):
+                box += weight * irradiance.box(landed, screen.divided(cells))
                 tent += weight * irradiance.tent(landed, screen)
                 lines = irradiance.ledger(landed, screen, given=source.is_given)
                 if lens.behind:
@@ -270,11 +266,14 @@ def _as_fractions(
     """Return the sums as fractions of the source's light; light not launched missed the lens or met its underside."""
     launched = sum(flux.values())
     whole = max(launched, 1.0)  # the sum may exceed 1 slightly: a cell at the rim of a beam counts whole
+    cells = cells.div_(whole)
+    box = joined_cells(cells, cells.shape[0] // tent.shape[0])
+    fine = None if box is cells else cells.float()
     flux = {line: value / whole for line, value in flux.items()}
     flux["missed the lens"] += 1.0 - launched / whole
     first = lights[0][2]
     if any(source.is_given for _, source, _, _ in lights):  # its rays are counted by where they start
-        return Simulation(cells / whole, tent / whole, flux, count)
+        return Simulation(box, tent / whole, flux, count, cells=fine)
     underside_lit = first.front.outline is not None and first.passes.sense > 0 and not first.before
     if underside_lit and splits_missed:
         stopped = sum(
@@ -284,7 +283,7 @@ def _as_fractions(
         )
         flux[UNDERSIDE] = max(min(stopped, flux["missed the lens"]), 0.0)
         flux["missed the lens"] -= flux[UNDERSIDE]
-    return Simulation(cells / whole, tent / whole, flux, count)
+    return Simulation(box, tent / whole, flux, count, cells=fine)
 
 
 @functools.lru_cache(maxsize=4096)  # independent of the back, which changes in tailoring

@@ -196,8 +196,11 @@ class Target(Record):
 
         Seen from the lens, along +z with y up, x increases to the left: the last column (x max) is on the left there.
         cells: number of cells along each side of a pixel; a photograph is interpolated (`interpolated`), other pictures
-        are drawn anew.
+        are drawn anew.  The array is read-only if it has more cells than pixels.
         """
+        return self._drawn_flux(1) if cells == 1 else _flux_on_cells(self, cells)
+
+    def _drawn_flux(self, cells: int) -> np.ndarray:
         seen = drawing(self, cells).light
         flux = seen[:, ::-1] if self.seen_from == "lens" else seen
         screen = self.screen.divided(cells)
@@ -476,13 +479,25 @@ def drawing(target: Target, cells: int = 1) -> Drawing:
 
     cells: number of cells along each side of a pixel.
     """
-    return _drawing(target.model_copy(update=IRRELEVANT), cells)
+    alike = target.model_copy(update=IRRELEVANT)
+    return _drawing(alike) if cells == 1 else _draw(alike, cells)
 
 
-@functools.lru_cache(maxsize=8)  # a photograph takes half a second, and is needed for the check and for the design
-def _drawing(target: Target, cells: int) -> Drawing:
+@functools.lru_cache(maxsize=4)  # a photograph takes half a second, and is needed for the check and for the design
+def _drawing(target: Target) -> Drawing:
+    return _draw(target, 1)
+
+
+@functools.lru_cache(maxsize=4)  # 34 MB for 2048 cells per side; the rounds of a design and its proof need two sizes
+def _flux_on_cells(target: Target, cells: int) -> np.ndarray:
+    flux = np.asfortranarray(target._drawn_flux(cells))  # by columns, as `tubes.collect` makes pictures
+    flux.flags.writeable = False
+    return flux
+
+
+def _draw(target: Target, cells: int) -> Drawing:
     if cells > 1 and target.photo is not None:
-        whole = _drawing(target, 1)
+        whole = _drawing(target)
         return replace(whole, light=cells**2 * interpolated(whole.light, cells))
     columns, rows = (n * cells for n in target.columns_rows)
     pixels, size, remarks = (columns, rows), target.size, [""]

@@ -38,7 +38,7 @@ def peak_without_folds(goal: Goal) -> float | None:
         return None
     inner = minimum_filter(lit, DETAIL_MARGIN, mode="nearest")
     detail = (picture - gaussian_filter(picture, DETAIL_BLUR, mode="nearest"))[inner]
-    if not goal.is_shape and not np.linalg.norm(detail) <= MAX_DETAIL * np.linalg.norm(picture):
+    if not goal.is_shape and not (detail**2).sum() <= MAX_DETAIL**2 * (picture**2).sum():
         return None
     return float(np.quantile(picture[lit], PEAK_QUANTILE) / picture.sum())
 
@@ -62,7 +62,7 @@ def fold_penalty(corner: Tensor, flux: Tensor, scale: Scale, peak: float) -> Ten
     whole = total(flux)
     factor = peak * float(whole) * _sense(corner, scale) * abs(scale[2] * scale[3])  # of areas in the receiver's unit
     if corner.dtype == torch.float64 and flux.dtype == torch.float64 and (fast := ops.kernel("folds.penalty", corner)):
-        return fast(corner, flux, factor, LEAST_AREA, MOST_LACK) / whole
+        return fast(corner, flux, factor, (LEAST_AREA, MOST_LACK)) / whole
     first, second, third = triangles(corner)
     area = ((second - first)[0] * (third - first)[1] - (third - first)[0] * (second - first)[1]) / 2
     half = torch.cat([flux.reshape(-1) / 2] * 2)

@@ -55,7 +55,7 @@ from torch import Tensor
 from bstcad.optics.bspline import BSplineSurface, resampling_matrix
 from bstcad.optics.channels import Channel, weighted_sum
 from bstcad.optics.emitters import Emitter
-from bstcad.optics.goal import Goal
+from bstcad.optics.goal import SUM_ROUNDING, Goal
 from bstcad.optics.interfaces import Law, Refract
 from bstcad.optics.irradiance import CellTarget, picture_error
 from bstcad.optics.kernels.reductions import elementary, quotient, total
@@ -151,8 +151,9 @@ class Merit:
     @cached_property
     def targets(self) -> tuple[CellTarget, ...]:
         """Target pictures on cells, one per goal, on the light's device; that of an only goal has the sum 1."""
-        pictures = tuple(torch.from_numpy(goal.picture).to(self.light.sheets[0].flux.device) for goal in self.goals)
-        pictures = tuple(picture / total(picture) for picture in pictures) if self._is_one else pictures
+        pictures = [torch.as_tensor(goal.picture, device=self.light.sheets[0].flux.device) for goal in self.goals]
+        if self._is_one and abs(float(total(pictures[0])) - 1) > SUM_ROUNDING:
+            pictures = [picture / total(picture) for picture in pictures]
         return tuple(CellTarget.of(picture, self.shares) for picture in pictures)
 
     @property

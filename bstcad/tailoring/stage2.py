@@ -53,7 +53,7 @@ DENSE_ROUNDS, DENSE_TUBES = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08)), 2.5
 # at most SHORT_EVALUATIONS.  The last round corrects what the others distort between the tubes; these end on the
 # plateau FEW_TUBES.  (RRMSD 0.0225 of letters after 73 evaluations and 0.0439 of a portrait after 58; 0.0227 and 0.0447
 # after 98 in DENSE_ROUNDS.  With 300 evaluations, as in fine quality, short rounds end at 0.0168 instead of 0.0148.)
-SHORT_ROUNDS, FEW_TUBES, SHORT_EVALUATIONS = ((5 / 12, 0.47), (5 / 8, 0.23), (0.91, 0.12)), Plateau(5, 0.03), 150
+SHORT_ROUNDS, FEW_TUBES, SHORT_EVALUATIONS = ((5 / 12, 0.48), (5 / 8, 0.24), (0.91, 0.12)), Plateau(5, 0.03), 150
 # Rounds if the last one has fewer than DENSE_TUBES tubes per cell.  The first rounds then distort the net between the
 # tubes, and the last one has to correct this, with MAX_TUBES tubes per side or fewer, since more need much memory; if
 # these are too few, with as many as the settings state.  (1025 control points, portrait: RRMSD 0.0175 after 54
@@ -91,7 +91,7 @@ CELLS_PER_POINT, CELL_MARGIN, MAX_CELLS = 4.0, 0.25, 1 << 22
 # Share in the squared error of the errors on cells smaller than a pixel, for one control point per lit pixel; power by
 # which it falls with their number, since more points correct the light inside a pixel more easily; share of the errors
 # on cells smaller than each further size in the rest.
-CELL_SHARE, CELL_SHARE_POWER, FINER_SHARE = 0.21, 0.15, 0.2
+CELL_SHARE, CELL_SHARE_POWER, FINER_SHARE = 0.21, 0.18, 0.2
 MIN_EVALUATIONS = 30  # evaluations below which stage 2 has a single round and stage 3 gets twice as many
 COMPARED_NET = 65  # largest number of control points per side in `compare_precisions`, for speed
 COMPARED_TUBES = 128  # tubes per side in `compare_precisions`

@@ -437,8 +437,7 @@ def test_rays_that_do_not_see_what_the_tubes_see_fail(folder, nominal, monkeypat
 
     def moved(*arguments, **options):
         [found] = simulate(*arguments, **options)
-        pixel = found.cells.shape[0] // found.tent.shape[0]  # cells along a side
-        return (replace(found, cells=found.cells + 0.33 * (found.cells.roll(pixel, 0) - found.cells)),)
+        return (replace(found, box=found.box + 0.33 * (found.box.roll(1, 0) - found.box)),)
 
     effort = replace(FEW, rays=512)
     assert "tubes" not in failing(checks.verify(folder, nominal, effort=effort))

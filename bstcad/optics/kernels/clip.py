@@ -35,6 +35,7 @@ from bstcad.optics.kernels.compiling import compiled
 
 MAX_DISTANCE = 1e15  # largest |x| + |y| of a corner (pixels); farther away, rounding approaches a pixel
 NO_BORDER = 1e300  # s of the next border of an edge that crosses no more borders along an axis
+FEW_PARTS, MANY_CELLS = 8, 1 << 21  # most partial sums of a picture of MANY_CELLS or more, for its memory
 MAX_WIDTH = 1e6  # extent in x of the corners of one part (pixels), above which rounding may reach any column
 ROWS_PER_STRIP = 16  # rows of tubes whose gradient one thread computes at a time
 
@@ -572,6 +573,8 @@ class Clip(torch.autograd.Function):
     ) -> Any:
         ctx.save_for_backward(corner, flux)
         ((rows, columns), scale), count = picture, reductions.parts(flux.numel())
+        if rows * columns >= MANY_CELLS:
+            count = min(count, FEW_PARTS)
         ctx.scale, ctx.thinnest = scale, thinnest
         (sums, touched), far = reductions.buffers(count, columns, rows + 1), np.zeros(count)
         _clip(_array(corner), scale, _array(flux), thinnest, sums, touched, far)

@@ -73,17 +73,17 @@ def _penalty(corner, flux, factor, least, most, slope, sums):
 
 
 class Folds(torch.autograd.Function):
-    """Map (corner (2, n + 1, m + 1), flux (n, m), factor, least, most) to the penalty: see `folds.fold_penalty`."""
+    """Map (corner (2, n + 1, m + 1), flux (n, m), factor, (least, most)) to the penalty: see `folds.fold_penalty`."""
 
     @staticmethod
-    def forward(ctx: Any, corner: Tensor, flux: Tensor, factor: float, least: float, most: float) -> Tensor:  # noqa: D102
+    def forward(ctx: Any, corner: Tensor, flux: Tensor, factor: float, lack: tuple[float, float]) -> Tensor:  # noqa: D102
         points, carried = (t.detach().contiguous().numpy() for t in (corner, flux))
         slope, sums = np.zeros_like(points), np.zeros(-(-flux.shape[0] // ROWS_PER_STRIP))
-        _penalty(points, carried, factor, least, most, slope, sums)
+        _penalty(points, carried, factor, *lack, slope, sums)
         ctx.slope = torch.from_numpy(slope)
         return torch.tensor(sums.sum(), dtype=torch.float64)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, g: Tensor) -> Any:  # noqa: D102
-        return g * ctx.slope, None, None, None, None
+        return g * ctx.slope, None, None, None

@@ -16,7 +16,7 @@ from bstcad.optics.irradiance import CellTarget
 from bstcad.optics.kernels import reductions
 from bstcad.optics.kernels.compiling import compiled
 
-SUMS = 4  # sums of each row of pixels: the error, and E^s, (E^s)² and E^s E of the cells
+SUMS = 4  # sums of each row of pixels: the error, and E^s, (E^s)² and E^s E of the pixels
 ERROR, LIGHT, SQUARE, PRODUCT = range(SUMS)
 
 
@@ -36,17 +36,20 @@ def _errors(image, target, flux, weights, gradient, sums):
         first = cells * row
         for column in range(n):
             left, lit = cells * column, False
+            value_of_pixel = wanted_of_pixel = 0.0
             for i in range(cells):
                 for j in range(cells):
                     value, wanted = image[first + i, left + j] * inverse, target[first + i, left + j]
                     lit |= value != 0.0 or wanted != 0.0
-                    light += value
-                    square += value * value
-                    product += value * wanted
+                    value_of_pixel += value
+                    wanted_of_pixel += wanted
                     part[levels - 1, i, j] = value - wanted
             if not lit:
                 gradient[first : first + cells, left : left + cells] = 0.0
                 continue
+            light += value_of_pixel
+            square += value_of_pixel * value_of_pixel
+            product += value_of_pixel * wanted_of_pixel
             for level in range(levels - 2, -1, -1):
                 finer = part[level + 1]
                 for i in range(1 << level):
@@ -68,7 +71,7 @@ def _errors(image, target, flux, weights, gradient, sums):
 
 
 class PictureError(torch.autograd.Function):
-    """Map (image, flux, target) to (error, RRMSD on cells): see `irradiance.picture_error`."""
+    """Map (image, flux, target) to (error, RRMSD on pixels): see `irradiance.picture_error`."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, flux: Tensor, target: CellTarget) -> Any:  # noqa: D102
