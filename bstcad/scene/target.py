@@ -196,7 +196,7 @@ class Target(Record):
 
         Seen from the lens, along +z with y up, x increases to the left: the last column (x max) is on the left there.
         cells: number of cells along each side of a pixel; a photograph is interpolated (`interpolated`), other pictures
-        are drawn anew.  The array is read-only if it has more cells than pixels.
+        are drawn anew.  An array of cells is shared: nobody may write to it.
         """
         return self._drawn_flux(1) if cells == 1 else _flux_on_cells(self, cells)
 
@@ -490,9 +490,7 @@ def _drawing(target: Target) -> Drawing:
 
 @functools.lru_cache(maxsize=4)  # 34 MB for 2048 cells per side; the rounds of a design and its proof need two sizes
 def _flux_on_cells(target: Target, cells: int) -> np.ndarray:
-    flux = np.asfortranarray(target._drawn_flux(cells))  # by columns, as `tubes.collect` makes pictures
-    flux.flags.writeable = False
-    return flux
+    return np.asfortranarray(target._drawn_flux(cells))  # by columns, as `tubes.collect` makes pictures
 
 
 def _draw(target: Target, cells: int) -> Drawing:
