@@ -91,7 +91,7 @@ def test_a_dome_is_designed_written_and_proved_from_its_files(designed):
     """The files hold the dome and its part, its light passes the checks, and the opened folder has the same lens."""
     report, folder = designed
     assert report.passed, [check for check in report.checks if not check.passed]
-    assert report.rrmsd < 0.03 and report.efficiency > 0.85
+    assert report.rrmsd < 0.05 and report.efficiency > 0.85
     assert report.flux["missed the lens"] == pytest.approx(1 / 64, abs=1e-3)  # 1 - sin² of the angle at the flange
     beside = np.cos(np.radians(75.0)) ** 2 - 1 / 64  # light between this angle and the rim of the dome
     assert report.flux["lost through the sides"] == pytest.approx(beside, abs=5e-3)

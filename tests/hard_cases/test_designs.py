@@ -31,6 +31,7 @@ ROUGH = {
     "tailoring.stage2_iterations": 10,
 }
 LEFT_OUT = "Not simulated: "
+INSIDE = "The light varies inside the pixels"  # near the limit of this remark on another machine
 
 
 def marked(name):
@@ -54,7 +55,7 @@ def test_it_comes_through(name, tmp_path, monkeypatch):
     assert all(any(words in sentence for sentence in before) for words in hard.told), before
     assert not before or [stage for stage, _ in told].index("reach") < [stage for stage, _ in told].index("stage 1")
     said = report["given_up"]
-    sure = [sentence for sentence in said if not any(words in sentence for words in (*hard.perhaps, LEFT_OUT))]
+    sure = [sentence for sentence in said if not any(words in sentence for words in (*hard.perhaps, LEFT_OUT, INSIDE))]
     changes = [entry["rrmsd_change"] or 0.0 for entry in report["estimates"]]
     outweighs = sum(change > min(report["rrmsd"], report["rrmsd_asked"] or DEFAULT_RRMSD_LIMIT) for change in changes)
     assert sum(LEFT_OUT in sentence for sentence in said) == outweighs

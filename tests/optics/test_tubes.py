@@ -38,7 +38,7 @@ def test_clipping_is_the_limit_of_many_points(form):
     u, v = torch.meshgrid(s, s, indexing="ij")
     u, v = torch.where(u + v > 1, 1 - u, u), torch.where(u + v > 1, 1 - v, v)  # folded onto one triangle
     expected = torch.zeros(SHAPE, dtype=torch.float64)
-    first, second, third = tubes._triangles(corner)
+    first, second, third = tubes.triangles(corner)
     for t in range(first.shape[1]):
         a, b, c = (p[:, t, None, None] for p in (first, second, third))
         x, y = a + u * (b - a) + v * (c - a)

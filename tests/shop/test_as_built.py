@@ -40,7 +40,7 @@ def test_the_back_is_tailored_to_the_blank(made, key):
         "curvature": AsBuilt(front=0.0035),
     }[key]
     found = as_built.retailor(made, built)
-    assert found.before > 1.5 * found.design and rrmsd(found.made) < 1.1 * rrmsd(made)
+    assert found.before > 1.5 * found.design and rrmsd(found.made) < 1.15 * rrmsd(made)
     lens = found.made.lens
     assert thickness(lens) == pytest.approx(built.thickness or thickness(made.lens), abs=1e-3)
     assert lens.index == pytest.approx(built.index or made.lens.index, abs=1e-12)

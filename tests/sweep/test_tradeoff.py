@@ -78,7 +78,7 @@ class TestKnobs:
         order = run_order(tiny, knobs(tiny))
         assert order[:2] == [(), sorted_settings({"tailoring.quality": "standard"})]  # the base is the draft
         assert order[-1] == sorted_settings({"tailoring.quality": "paper"})
-        near = [{"tailoring.rays": 91}, {"lens.back.control_points": 17}, {"tailoring.stage2_iterations": 4}]
+        near = [{"tailoring.rays": 91}, {"lens.back.control_points": 17}, {"tailoring.stage2_iterations": 6}]
         assert max(order.index(sorted_settings(each)) for each in near) < order.index(
             sorted_settings({"tailoring.rays": 64})
         )

@@ -107,7 +107,7 @@ def test_the_report_says_so_from_the_file(bound):
     ("asked", "kept_to"),
     [
         ({"lens.max_slope": 3.3}, lambda lens: steepest(lens)[0] <= math.tan(math.radians(3.3))),
-        ({"lens.tool_radius": 40.0, "lens.mould": True}, lambda lens: steepest(lens)[2] <= 1 / 40),
+        ({"lens.tool_radius": 60.0, "lens.mould": True}, lambda lens: steepest(lens)[2] <= 1 / 60),
         ({"lens.max_thickness": 9.5}, lambda lens: describe(lens)["thickness_max"] <= 9.5),
         ({"lens.edge_thickness": 9.9}, lambda lens: 9.9 <= describe(lens)["edge_thickness_min"] < 9.91),
     ],
