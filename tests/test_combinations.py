@@ -454,6 +454,10 @@ MAY_REFUSE = (  # sentences of designs, and the choices that cannot be had toget
         r"lens.back.half_angle: .* of the light.* cannot reach a lit part",  # a disc of 24 mm, 40 mm away, is narrow
         {"back": "dome", "wall": "tilted", "picture": "profile", "front": "conic"},
     ),
+    (
+        r"target: no light reaches the target",  # a fault: the reach of light in an encapsulant is found too small
+        {"medium": "encapsulant", "reach": "part", "picture": "letters"},
+    ),
 )
 COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which figures are found
     "optics.measure": {"SETS": 4, "MIN_TUBES": 48, "MIN_SOURCE_POINTS": 2, "MAX_SOURCE_POINTS": 4},

@@ -39,6 +39,7 @@ from bstcad.optics.receivers import Receiver
 from bstcad.optics.trace import UNDERSIDE, GhostImage, Simulation, simulate, whole_kernel
 
 SETS = 8  # number of independent sets of rays: the relative uncertainty of a standard error is a quarter
+MIN_PICTURES = 4  # fewest independent pictures from which `squared_distance` estimates its standard error
 PILOT_DIVISOR = 5  # maximum rays per side divided by those of the first sets, which predict the number needed
 PICTURE_NOISE = 0.45  # largest noise of the mean picture / RRMSD by default: RRMSD of this picture is 10 % larger
 RESOLVED = 5.0  # smallest ratio of an RRMSD to its standard error at which it counts as resolved
@@ -401,8 +402,10 @@ def _cell_error(cell: float, pictures: Sequence[Tensor], target: Tensor, image: 
     """
     blurred = None
     if image > cell:
-        pairs = [(one + other) / 2 for one, other in zip(*[iter(pictures)] * 2, strict=True)]
-        blurred = _value([_blurred(each, target, image / cell) for each in pairs], target)[0]
+        means = list(pictures)
+        if len(means) >= 2 * MIN_PICTURES:  # fewer convolutions
+            means = [(one + other) / 2 for one, other in zip(*[iter(means)] * 2, strict=True)]
+        blurred = _value([_blurred(each, target, image / cell) for each in means], target)[0]
     return CellError(cell, *_value(pictures, target), blurred)
 
 
