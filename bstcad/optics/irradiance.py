@@ -219,7 +219,7 @@ class CellTarget:
         finest = 1 << (len(shares) - 1)
         sizes = [float(total(joined_cells(picture, finest >> level) ** 2)) for level in range(len(shares))]
         weights = tuple(share / size for share, size in zip(shares, sizes, strict=True))
-        return cls(picture.T.contiguous().T, weights, sizes[0])  # by columns, as `tubes.collect` makes pictures
+        return cls(picture.T.contiguous().T, weights, sizes[0])  # stored by columns, as `tubes.collect` makes pictures
 
 
 def picture_error(image: Tensor, flux: Tensor, target: CellTarget) -> tuple[Tensor, Tensor]:

@@ -490,7 +490,7 @@ def _drawing(target: Target) -> Drawing:
 
 @functools.lru_cache(maxsize=4)  # 34 MB for 2048 cells per side; the rounds of a design and its proof need two sizes
 def _flux_on_cells(target: Target, cells: int) -> np.ndarray:
-    return np.asfortranarray(target._drawn_flux(cells))  # by columns, as `tubes.collect` makes pictures
+    return np.asfortranarray(target._drawn_flux(cells))  # stored by columns, as `tubes.collect` makes pictures
 
 
 def _draw(target: Target, cells: int) -> Drawing:

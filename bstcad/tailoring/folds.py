@@ -60,7 +60,7 @@ def fold_penalty(corner: Tensor, flux: Tensor, scale: Scale, peak: float) -> Ten
     of the peak to the density of the light in the triangle, negative where the triangle is overturned.
     """
     whole = total(flux)
-    factor = peak * float(whole) * _sense(corner, scale) * abs(scale[2] * scale[3])  # of areas in the receiver's unit
+    factor = peak * float(whole) * _sense(corner, scale) * abs(scale[2] * scale[3])  # areas are in the receiver's unit
     if corner.dtype == torch.float64 and flux.dtype == torch.float64 and (fast := ops.kernel("folds.penalty", corner)):
         return fast(corner, flux, factor, (LEAST_AREA, MOST_LACK)) / whole
     first, second, third = triangles(corner)
