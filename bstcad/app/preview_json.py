@@ -77,12 +77,14 @@ def of_predictions(plan: Mapping[str, Any]) -> dict[str, Any]:
     if plan["predicted"] is None:
         none = {"not_predicted": plan["not_predicted"], "notes": [], "qualities": {}}
         return none | {"verdict": plan["verdict"] if plan["verdict"]["kind"] == "blurred" else None}
-    known = {quality: quality_words(each["seconds"], each["rrmsd"]) for quality, each in plan["predicted"].items()}
+    keys = "seconds", "rrmsd", "rrmsd_half"
+    known = {name: quality_words(*(each[key] for key in keys)) for name, each in plan["predicted"].items()}
     return {"not_predicted": None, "notes": plan["notes"], "qualities": known, "verdict": plan["verdict"]}
 
 
-def quality_words(seconds: Interval, rrmsd: Interval) -> dict[str, str]:
-    """Return the predicted seconds and RRMSD of a quality in words, with their 90 % intervals."""
+def quality_words(seconds: Interval, rrmsd: Interval, half: Interval) -> dict[str, str]:
+    """Return the predicted seconds and RRMSD of a quality in words, with their 90 % intervals; half: on half pixels."""
     (least, likely, most), (low, error, high) = seconds, rrmsd
     span = f"{duration(least)} to {duration(most)}; RRMSD {number(low)} to {number(high)}"
-    return {"seconds": duration(likely), "rrmsd": number(error), "range": f"nine of ten designs: {span}"}
+    known = {"seconds": duration(likely), "rrmsd": number(error), "half": number(half[1])}
+    return known | {"range": f"nine of ten designs: {span}"}

@@ -284,9 +284,9 @@ def plan_predictions(plan: Mapping[str, Any]) -> Group:
     rows, finer = dict(plan["predicted"]), plan["finer"]
     if finer is not None:
         rows[f"standard, {size_text(finer['control_points'])} control points"] = finer["predicted"]["standard"]
-    table = _table("on this machine", "seconds", "RRMSD", "memory (GB)")
+    table = _table("on this machine", "seconds", "RRMSD on pixels", "on half pixels", "memory (GB)")
     for name, entry in rows.items():
-        intervals = (map(about, entry[key]) for key in ("seconds", "rrmsd", "memory_gb"))
+        intervals = (map(about, entry[key]) for key in ("seconds", "rrmsd", "rrmsd_half", "memory_gb"))
         cells = (Text.assemble(likely, (f" ({low} to {high})", "dim")) for low, likely, high in intervals)
         table.add_row(Text(name), *cells)
     return Group(Text(), *head, table, Text(" ".join((*plan["notes"], *paragraphs("plan.txt.j2", "intervals")))))

@@ -228,7 +228,8 @@ class ColdRun(StoredRecord):
     cost_seconds: float | None = 0.0  # time charged to the budget, including the reference and the calibration
     predicted_seconds: float | None = None  # cost_seconds as predicted before the run
     peak_memory_gb: float | None = None  # peak memory of the two processes together (GB)
-    rrmsd: float | None = None  # RRMSD by the reference; for several targets the largest
+    rrmsd: float | None = None  # RRMSD on pixels by the reference; for several targets the largest
+    rrmsd_half: float | None = None  # RRMSD on half pixels by the reference, of the same target
     rrmsd_noise: float | None = None  # standard error of rrmsd
     rays: int | None = None  # number of rays of the reference
     rrmsd_reported: float | None = None  # RRMSD by the verification of the design, on the pixels of the run
@@ -321,5 +322,5 @@ def judge_run(run: ColdRun, base: Scene, folder: Path, effort: Effort) -> ColdRu
         return run.model_copy(update={"status": FAILED, "reason": "none of its light falls on the target"})
     light = max(lights, key=lambda light: light.rrmsd)
     net = hashlib.sha256(b"".join(net.control_points().tobytes() for net in lens.nets)).hexdigest()
-    results = {"rrmsd": light.rrmsd, "rrmsd_noise": light.standard_error, "rays": light.rays, "net": net}
-    return run.model_copy(update=results)
+    errors = {"rrmsd": light.rrmsd, "rrmsd_half": light.half and light.half.rrmsd, "rrmsd_noise": light.standard_error}
+    return run.model_copy(update=errors | {"rays": light.rays, "net": net})

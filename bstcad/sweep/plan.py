@@ -69,8 +69,8 @@ def verdict(scene: Scene, entries: Mapping[str, Any]) -> dict[str, str] | None:
     """Return the verdict of a plan, {kind, sentence}; None if the present entries do not determine it.
 
     kind: "blurred" (with any lens, the blur by the source exceeds the allowed RRMSD), "within", "open" or "beyond" (the
-    interval of nine of ten designs is below, around or above the requested RRMSD), "no limit" (no RRMSD is requested),
-    or "not predicted".
+    interval of nine of ten designs is below, around or above the requested RRMSD, on pixels or half pixels, whichever is
+    harder to reach), "no limit" (no RRMSD is requested), or "not predicted".
     """
     requested = scene.accept.rrmsd
     allowed = DEFAULT_RRMSD_LIMIT if requested is None else requested
@@ -87,8 +87,13 @@ def verdict(scene: Scene, entries: Mapping[str, Any]) -> dict[str, str] | None:
         kind = "not predicted"
     else:
         quality = scene.tailoring.quality if scene.tailoring.quality in QUALITIES else "standard"
-        (low, _, high), (_, seconds, _) = (entries["predicted"][quality][key] for key in ("rrmsd", "seconds"))
-        prediction = {"quality": quality, "seconds": seconds, "rrmsd": entries["predicted"][quality]["rrmsd"]}
+        likely = entries["predicted"][quality]
+        prediction = {"quality": quality, "seconds": likely["seconds"][1]}
+        limits = [("", likely["rrmsd"], requested), ("half ", likely["rrmsd_half"], scene.accept.rrmsd_half)]
+        # the limit that is hardest to keep; without limits, that of the RRMSD on pixels
+        cells, interval, requested = max(limits, key=lambda each: 0.0 if each[2] is None else each[1][1] / each[2])
+        low, _, high = prediction["rrmsd"] = interval
+        prediction["cells"] = f"{cells}pixels"
         if requested is None:
             kind = "no limit"
         else:

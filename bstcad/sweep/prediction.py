@@ -24,7 +24,7 @@ from bstcad import pipeline
 from bstcad.analysis.light import blur
 from bstcad.analysis.steepness import Steepness
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, rrmsds_by_rays
+from bstcad.optics.measure import Effort, measure_goals
 from bstcad.optics.sides import Sides, as_pair, coarser
 from bstcad.runs.processes import Tick
 from bstcad.scene.quality import COARSEST_GRID
@@ -37,7 +37,8 @@ from bstcad.tailoring.stage2 import round_shares, sheet_sizes, stage3_sheet_size
 Interval = tuple[float, float, float]  # (low, likely, high); nine of ten designs lie between low and high
 QUALITIES = ("draft", "standard", "fine")  # qualities with a prediction
 PILOT_QUALITIES = ("draft", "standard")  # qualities with a pilot; "fine" uses the pilot of "standard"
-INTERVAL_FACTORS = {"seconds": 1.5, "rrmsd": 1.5, "memory_gb": 1.25}  # high / likely and likely / low of intervals
+# High / likely and likely / low of the intervals.
+INTERVAL_FACTORS = {"seconds": 1.5, "rrmsd": 1.5, "rrmsd_half": 1.5, "memory_gb": 1.25}
 
 # --- the pilot --------------------------------------------------------------------------------------------------------
 
@@ -45,7 +46,7 @@ PILOT_LIMITS = 128, 193, 512  # maximum pixels (unless MIN_PILOT_POINTS needs mo
 MIN_PILOT_POINTS = 65  # minimum control points per side of a pilot, unless its scene has fewer
 MIN_PILOT_TUBES = 16  # minimum tubes per side of a pilot
 PILOT_CELLS = (16, 256)  # minimum and maximum cells per side of the transport of a pilot
-PILOT_EFFORT = Effort(rays=2048, accuracy=0.02, witness=False, cells=1)  # effort of the measurement of a pilot's RRMSD
+PILOT_EFFORT = Effort(rays=2048, accuracy=0.02, witness=False, cells=2)  # effort of the measurement of a pilot's RRMSDs
 SEARCH_STAGES = ("stage 2", "stage 3")  # beginnings of the names of stages that use the minimiser
 COARSE_ROUND_TEXT = " pixels, "  # text in the names of rounds with few pixels, whose sizes do not depend on the scene
 
@@ -71,6 +72,7 @@ class Pilot:
     scene: Scene  # scene of the small design
     seconds: Seconds  # duration of each part (s)
     rrmsd: float  # largest RRMSD of all goals
+    half_ratio: float  # largest ratio of the RRMSD on half pixels to that on pixels
     factor: float  # pixels per side of the full scene / pixels per side of the pilot
     detail: float  # relative RMS of the detail of the full picture that is finer than the pilot's pixels
     blur: float  # RRMSD by blur of the source: on pixels of the full scene, minus RRMSD on pixels of the pilot
@@ -88,7 +90,9 @@ def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
     if compilations.buffer:  # the first design after an installation waits for the compiler; time another one
         finished = make_design()
     light, finer = small.channels(), factor > 1
-    rrmsd = max(rrmsds_by_rays(finished.lens, light, finished.goals, PILOT_EFFORT, draw=small.draw))
+    lights = measure_goals(finished.lens, light, finished.goals, PILOT_EFFORT, ghost=None, draw=small.draw)
+    rrmsd = max(each.rrmsd for each in lights)
+    ratios = [each.half.rrmsd / each.rrmsd for each in lights if each.half is not None and each.rrmsd > 0]
     sides = [max(goal.receiver.shape) for goal in finished.goals]
     pairs = zip(scene.single_target_scenes(), small.single_target_scenes(), strict=True)
     blurs = [blur_rrmsd(one, finished.lens) - blur_rrmsd(few, finished.lens) for one, few in pairs] if finer else [0.0]
@@ -99,7 +103,8 @@ def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
     transport: Mapping[str, Any] = finished.making.transport or {}
     steep = Steepness(transport["steep_share"], transport["steepest_deg"])
     lost = max(map(detail, (goal.picture for goal in scene.goals), sides)) if finer else 0.0
-    return Pilot(small, Seconds(**times), rrmsd, factor, detail=lost, blur=max(0.0, *blurs), steep=steep)
+    lacks = {"detail": lost, "blur": max(0.0, *blurs)}
+    return Pilot(small, Seconds(**times), rrmsd, max(ratios, default=1.0), factor, **lacks, steep=steep)
 
 
 def with_quality(scene: Scene, quality: str) -> Scene:
@@ -154,9 +159,9 @@ REMAINING_BLUR = 0.5  # fraction of the blur by an extended source that remains 
 
 
 def predict(scene: Scene, pilots: Mapping[str, Pilot], gain: float = 1.0) -> dict[str, dict[str, Interval]]:
-    """Return intervals of seconds, rrmsd and memory_gb (two processes), by quality, from pilots of PILOT_QUALITIES.
+    """Return intervals of INTERVAL_FACTORS, by quality, from pilots of PILOT_QUALITIES.
 
-    The RRMSD does not increase from a quality to the next better quality.  gain: RRMSD with the net of `scene`, divided
+    rrmsd: on pixels.  rrmsd_half: on half pixels.  memory_gb: of two processes.  The RRMSD does not increase from a quality to the next better quality.  gain: RRMSD with the net of `scene`, divided
     by the RRMSD with the net of the scene of which the pilots are small versions.
     """
     best, intervals = math.inf, {}
@@ -164,7 +169,8 @@ def predict(scene: Scene, pilots: Mapping[str, Pilot], gain: float = 1.0) -> dic
         pilot = pilots[quality if quality in PILOT_QUALITIES else PILOT_QUALITIES[-1]]
         whole = with_quality(scene, quality)
         best = min(best, gain * predicted_rrmsd(pilot, quality))
-        likely = {"seconds": predicted_seconds(whole, pilot), "rrmsd": best, "memory_gb": memory_gb(whole)}
+        errors = {"rrmsd": best, "rrmsd_half": pilot.half_ratio * best}
+        likely = {"seconds": predicted_seconds(whole, pilot), **errors, "memory_gb": memory_gb(whole)}
         wide = [(key, each, INTERVAL_FACTORS[key]) for key, each in likely.items()]
         intervals[quality] = {key: (each / factor, each, each * factor) for key, each, factor in wide}
     return intervals

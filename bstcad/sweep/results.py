@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
 MIN_FRONT_RUNS = 3  # smallest number of runs on a Pareto front to which a power law is fitted
 TRADEOFF_COLUMNS = (
-    "knobs", "settings", "status", "seconds", "cpu_seconds", "kernel_seconds", "units", "rrmsd", "rrmsd_noise",
-    "rrmsd_reported", "peak_memory_gb", "on_front", "predicted_seconds", "cost_seconds", "where", "reason",
+    "knobs", "settings", "status", "seconds", "cpu_seconds", "kernel_seconds", "units", "rrmsd", "rrmsd_half",
+    "rrmsd_noise", "rrmsd_reported", "peak_memory_gb", "on_front", "predicted_seconds", "cost_seconds", "where", "reason",
 )  # fmt: skip
 PRIVATE_FIELDS = {"allowed_seconds", "history", "machine", "versions", "version"}  # fields of ColdRun that results omit
 
@@ -227,7 +227,7 @@ def draw_runs(axes: Axes, table: TradeoffTable) -> None:
     axes.set(xscale="log", yscale="log", xlim=(left, right), ylim=(low, high))
     axes.grid(which="major")
     axes.set_xlabel("seconds, the whole command in a cold process")
-    axes.set_ylabel("RRMSD by the reference")
+    axes.set_ylabel("RRMSD on pixels, by the reference")
     axes.set_title(f"What accuracy costs in time: {table.title or table.name}", pad=12)
     plain_ticks(axes.xaxis, left, right)
     plain_ticks(axes.yaxis, low, high)
@@ -337,12 +337,13 @@ def summary(table: TradeoffTable) -> Group:
     style, headline, explanation = verdict(table)
     rows = rich.table.Table(title=table.title or table.name, title_justify="left")
     rows.add_column("run")
-    for heading in ("RRMSD",) if table.errors_alone else ("RRMSD", "seconds"):
+    for heading in ("RRMSD on pixels", "on half pixels", *(() if table.errors_alone else ("seconds",))):
         rows.add_column(heading, justify="right")
     for run in sorted(table.plotted, key=lambda run: -run.time_and_error[1]):
         if run.on_front or "quality" in run.knobs or not run.settings:
             seconds = () if table.errors_alone else (f"{run.seconds:.1f}",)
-            rows.add_row(Text(f"{run.label}{' (Pareto front)' * run.on_front}"), f"{run.rrmsd:.4f}", *seconds)
+            errors = ("–" if each is None else f"{each:.4f}" for each in (run.rrmsd, run.rrmsd_half))
+            rows.add_row(Text(f"{run.label}{' (Pareto front)' * run.on_front}"), *errors, *seconds)
     lines = [Text(f"Failed: {run.label}: {run.reason}") for run in table.failed]
     if count := len(table.not_run):
         lines.append(Text(f"Runs beyond the budget: {count}; a larger --budget continues from here"))

@@ -69,7 +69,7 @@ from bstcad.optics.tubes import Tubes, arriving_flux, rays_to
 from bstcad.optics.unfolding import image_from_last_net
 from bstcad.optics.wavefront import MM_PER_NM, Wave
 from bstcad.optics.wavefront_error import path_from_reference
-from bstcad.tailoring.folds import FOLD_WEIGHT, fold_penalty
+from bstcad.tailoring.folds import Folds
 from bstcad.tailoring.source_image import BlurOperator, ExtendedSource, blur_error, blurred, blurs, with_border
 
 LAPLACIAN_POWER = 0.5  # power of the Laplacian in `SobolevVariable`
@@ -113,8 +113,7 @@ class Merit:
     picture_error: PictureError | None = None  # error to minimise; None: RRMSD²
     blurs: tuple[tuple[BlurOperator, ...], ...] = ()  # blur by goal and channel; (): the source is a point
     blur_errors: tuple[Tensor, ...] = ()  # error of each blurred picture, (rows, columns); (): not measured
-    # peaks of goals whose light must not fold (`fold_penalty`), one per goal, in pixels of the goals; None: it may fold
-    peaks: tuple[float | None, ...] = ()
+    folds: tuple[Folds | None, ...] = ()  # penalty on folds by goal; None: its light may fold
     shares: tuple[float, ...] = (1.0,)  # shares of the errors on pixels and on ever smaller cells: `CellTarget.of`
 
     @classmethod
@@ -209,10 +208,8 @@ class Merit:
         if self.blur_errors:
             image = image + self.blur_errors[k]
         error, rrmsd = picture_error(image, flux, target)
-        if self.peaks and (peak := self.peaks[k]) is not None:
-            pairs, scale = zip(sheets, landed, strict=True), self.goals[k].receiver.scale
-            folds = (fold_penalty(each.position.double(), sheet.flux, scale, peak) for sheet, each in pairs)
-            penalty = penalty + FOLD_WEIGHT * weighted_sum(channels, folds)
+        if self.folds and (folds := self.folds[k]) is not None:
+            penalty = penalty + folds(channels, landed)
         if self.picture_error is not None:
             error = self.picture_error(quotient(image, flux), target.picture)
         pairs = zip(sheets, landed, strict=True)

@@ -36,7 +36,7 @@ from bstcad.optics.sides import as_pair, coarser
 from bstcad.optics.source_images import images
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import ResolvedTailoring
-from bstcad.tailoring.folds import peak_without_folds
+from bstcad.tailoring.folds import Folds, needs_no_folds
 from bstcad.tailoring.grazing import Grazing
 from bstcad.tailoring.machinability import active_bounds, excess, round_weight
 from bstcad.tailoring.merit import FOUR_POINTS, CoarseVariable, Merit, SobolevVariable, local_weight
@@ -90,8 +90,8 @@ REFINING_SHARE = 0.1
 # 2^CELL_MARGIN; most cells of a picture, for its memory.
 CELLS_PER_POINT, CELL_MARGIN, MAX_CELLS = 4.0, 0.25, 1 << 22
 # Share in the squared error of the errors on cells smaller than a pixel, for one control point per lit pixel; power by
-# which it falls with their number, since more points correct the light inside a pixel more easily; share of the errors
-# on cells smaller than each further size in the rest.
+# which it falls with their number for a target with detail, since more points correct the light inside a pixel more
+# easily; share of the errors on cells smaller than each further size in the rest.
 CELL_SHARE, CELL_SHARE_POWER, FINER_SHARE = 0.21, 0.18, 0.2
 MIN_EVALUATIONS = 30  # evaluations below which stage 2 has a single round and stage 3 gets twice as many
 COMPARED_NET = 65  # largest number of control points per side in `compare_precisions`, for speed
@@ -162,9 +162,13 @@ class TubeRound:
         goals = tuple(goal.on_cells(self.cells) for goal in task.goals)
         merit = Merit.of(self.channels, lens, self.tubes, goals, overshoot=overshoot, wave=task.wave)
         merit = replace(merit, picture_error=task.merit, shares=self.shares)
-        if task.merit is None and not task.preview:
-            peaks = (peak_without_folds(goal) for goal in task.goals)
-            merit = replace(merit, peaks=tuple(peak and peak / self.cells**2 for peak in peaks))
+        if task.merit is None and not task.preview and not task.extended_sources:  # the blur by a source hides folds
+            with torch.no_grad():
+                landed = merit.landing(lens).on_goals
+            pairs = zip(task.goals, landed, strict=True)
+            cell = pixels_of(task) / task.knobs.side  # side of the light of a cell of the net, if it is even (pixels)
+            folds = (Folds.of(goal, merit.light.sheets, each, cell) for goal, each in pairs)
+            merit = replace(merit, folds=tuple(folds))
         if self.source is None:
             return merit
         return merit.with_blur(self.source, lens, seed=None if task.preview else task.knobs.seed)
@@ -265,13 +269,13 @@ def finest_cells(task: Task) -> int:
     """Return the cells along each side of a pixel that the last round rates, a power of two.
 
     They are about a quarter as wide as the cells of the net, if the light were spread evenly.  Where a picture is
-    bright, its pixels have more cells of the net: ten for letters.
+    bright, its pixels have more cells of the net: ten for letters.  Half pixels are rated in any case.
     """
     if task.merit is not None or task.preview:
         return 1
     wanted = math.log2(CELLS_PER_POINT * task.knobs.side / pixels_of(task))
     most = math.log2(MAX_CELLS / max(math.prod(goal.receiver.shape) for goal in task.goals)) / 2
-    return 1 << max(0, math.floor(min(wanted + CELL_MARGIN, most)))
+    return 1 << max(0, math.floor(min(max(wanted + CELL_MARGIN, 1.0), most)))
 
 
 def shares_on_cells(task: Task, *, is_last: bool) -> tuple[float, ...]:
@@ -280,7 +284,9 @@ def shares_on_cells(task: Task, *, is_last: bool) -> tuple[float, ...]:
     if not is_last and levels > 1:
         levels -= 1
     lit = max(float(goal.picture.sum() ** 2 / (goal.picture**2).sum()) for goal in task.goals)  # pixels, if even
-    share = CELL_SHARE * max(1.0, task.knobs.side**2 / lit) ** -CELL_SHARE_POWER
+    share = CELL_SHARE
+    if not all(map(needs_no_folds, task.goals)):
+        share *= max(1.0, task.knobs.side**2 / lit) ** -CELL_SHARE_POWER
     shares, rest = [], 1.0
     for level in range(levels):
         shares.append(rest * (1 - (share if level == 0 else FINER_SHARE)))

@@ -131,7 +131,8 @@ def test_the_image_of_a_chip_is_stated_before_the_design():
 
 
 def predicted(low, likely, high):
-    figures = {"rrmsd": (low, likely, high), "seconds": (20.0, 30.0, 40.0)}
+    half = tuple(2 * value for value in (low, likely, high))
+    figures = {"rrmsd": (low, likely, high), "rrmsd_half": half, "seconds": (20.0, 30.0, 40.0)}
     return {"predicted": {"standard": figures}, "goals": [{"blur": None}]}
 
 
@@ -140,7 +141,7 @@ def blurred(rrmsd):
 
 
 VERDICTS = [
-    (0.1, predicted(0.02, 0.03, 0.04), "within", "an RRMSD of about 0.03 after about 30 s, in standard qualit"),
+    (0.1, predicted(0.02, 0.03, 0.04), "within", "an RRMSD of about 0.03 on pixels after about 30 s"),
     (0.1, predicted(0.08, 0.12, 0.15), "open", "0.1, and the result will probably lie between 0.08 and 0.15."),
     (0.1, predicted(0.2, 0.3, 0.4), "beyond", "the limit is 0.1, and the RRMSD will probably exceed it."),
     (None, predicted(0.02, 0.03, 0.04), "no limit", "designs would pass with [accept] rrmsd = 0.0"),
@@ -155,6 +156,16 @@ VERDICTS = [
 def test_a_plan_comes_to_a_verdict(asked, found, kind, words):
     told = plans.verdict(portrait(65).changed({"accept.rrmsd": asked}), found)
     assert (told and told["kind"]) == kind and (kind is None or words in told["sentence"])
+
+
+@pytest.mark.parametrize(("pixels", "half", "kind", "words"), [
+    (0.1, 0.5, "within", "about 0.03 on pixels"), (0.1, 0.07, "open", "about 0.06 on half pixels"),
+    (None, 0.03, "beyond", "the limit is 0.03"), (0.02, 0.5, "open", "about 0.03 on pixels"),
+])  # fmt: skip
+def test_the_harder_limit_decides(pixels, half, kind, words):
+    scene = portrait(65).changed({"accept.rrmsd": pixels, "accept.rrmsd_half": half})
+    told = plans.verdict(scene, predicted(0.02, 0.03, 0.04))
+    assert told["kind"] == kind and words in told["sentence"]
 
 
 def test_a_chip_that_blurs_the_picture_is_said_first(tmp_path, capsys, monkeypatch):
@@ -198,7 +209,7 @@ class TestCommand:
         found = json.loads(capsys.readouterr().out)
         assert set(found["predicted"]) == {"draft", "standard", "fine"} and found["not_predicted"] is None
         for each in (*found["predicted"].values(), *found["finer"]["predicted"].values()):
-            assert set(each) == {"seconds", "rrmsd", "memory_gb"}
+            assert set(each) == {"seconds", "rrmsd", "rrmsd_half", "memory_gb"}
             assert all(0 < low < likely < high for low, likely, high in each.values())
         assert found["finer"]["control_points"] == 129
         assert cli.run(few) == 0

@@ -40,7 +40,7 @@ def pilot(scene, *, slower=1.0, factor=4.0):
     """A pilot that took so many times as long as usual."""
     small, _ = pilot_scene(scene)
     took = typical_seconds(small)
-    return Pilot(small, Seconds(slower * took.first, slower * took.search, 0.0), 0.04, factor, 0.0, 0.0, None)
+    return Pilot(small, Seconds(slower * took.first, slower * took.search, 0.0), 0.04, 1.5, factor, 0.0, 0.0, None)
 
 
 def test_a_pilot_has_a_quarter_of_the_net_the_pixels_and_the_tubes():
@@ -64,7 +64,7 @@ def test_a_pilot_as_large_as_its_scene_predicts_itself(monkeypatch):
     disk = load("templates/disk.toml", {"tailoring.rays": 256})
     known = {quality: pilot(disk, slower=3.0, factor=1.0) for quality in prediction.PILOT_QUALITIES}
     found = predict(disk, known)["standard"]
-    assert found["rrmsd"][1] == pytest.approx(0.04)
+    assert found["rrmsd"][1] == pytest.approx(0.04) and found["rrmsd_half"][1] == pytest.approx(0.06)
     assert found["seconds"][1] == pytest.approx(
         3 * (typical_seconds(disk).first + typical_seconds(disk).search) + typical_seconds(disk).rest
     )

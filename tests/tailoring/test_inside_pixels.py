@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import tomllib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -135,9 +136,11 @@ def test_the_penalty_on_folds_and_its_gradient(monkeypatch):
     found = []
     for enabled in (True, False):
         monkeypatch.setattr(ops, "ENABLED", enabled)
-        value = folds.fold_penalty(corner, flux, (0.0, 0.0, 1.0, -1.0), peak=1 / 63)
+        value = folds.fold_penalty(corner, flux, float(flux.sum()), (0.0, 0.0, 1.0, -1.0), peak=1 / 63)
         found.append((value.detach(), *torch.autograd.grad(value, corner)))
-        assert torch.autograd.gradcheck(lambda c: folds.fold_penalty(c, flux, (0.0, 0.0, 1.0, -1.0), 1 / 63), corner)
+        assert torch.autograd.gradcheck(
+            lambda c: folds.fold_penalty(c, flux, 35.0, (0.0, 0.0, 1.0, -1.0), 1 / 63), corner
+        )
     assert found[0][0] > 0
     for fast, plain in zip(*found, strict=True):
         torch.testing.assert_close(fast, plain, rtol=1e-12, atol=1e-15)
@@ -149,14 +152,30 @@ def test_light_that_is_not_folded_has_no_penalty(mirrored):
     x, y = torch.meshgrid(torch.arange(10.0), torch.arange(8.0), indexing="ij")
     corner = torch.stack([-x if mirrored else x, y]).double()
     flux = torch.ones(9, 7, dtype=torch.float64)
-    assert float(folds.fold_penalty(corner, flux, (0.0, 0.0, 2.0, -2.0), peak=1 / 252)) == 0
+    assert float(folds.fold_penalty(corner, flux, 63.0, (0.0, 0.0, 2.0, -2.0), peak=1 / 252)) == 0
+
+
+def goal_of(name):
+    """The goal of a picture of PICTURES on the wall of RECEIVERS."""
+    return even(RECEIVERS["wall"].rpartition("\n")[0] + "\n" + PICTURES[name]).goals[0]
 
 
 def test_only_convex_targets_without_detail_are_held_from_folding():
-    held = {
-        name: folds.peak_without_folds(even(RECEIVERS["wall"].rpartition("\n")[0] + "\n" + text).goals[0])
-        for name, text in PICTURES.items()
-    }
-    assert {name for name, peak in held.items() if peak is not None} == {"profile", "uniform"}
-    assert held["uniform"] is not None
-    assert math.isclose(held["uniform"], 1 / (20 * 16))
+    assert {name for name in PICTURES if folds.needs_no_folds(goal_of(name))} == {"profile", "uniform"}
+
+
+def test_light_may_fold_at_the_border():
+    """A square of light with one overturned column of tubes, in the middle of the target or at its border."""
+    goal = goal_of("uniform")
+    (left, right), (below, above) = goal.receiver.x, goal.receiver.y
+    y = torch.linspace(below, above, 41, dtype=torch.float64)
+    found = {}
+    for place, column in (("middle", 20), ("border", 1)):
+        x = torch.linspace(left, right, 41, dtype=torch.float64)
+        x[column] = 2 * x[column + 1] - x[column]
+        corners = SimpleNamespace(position=torch.stack(torch.meshgrid(x, y, indexing="ij")))
+        sheet = SimpleNamespace(flux=torch.full((40, 40), 1 / 1600, dtype=torch.float64))
+        penalty = folds.Folds.of(goal, [sheet], [corners], 1.0)
+        assert penalty is not None and math.isclose(penalty.peak, 1 / (20 * 16))
+        found[place] = float(penalty([SimpleNamespace(weight=1.0)], [corners]))
+    assert found["middle"] > 0 == found["border"]

@@ -418,9 +418,9 @@ function showPlan(reply) {
 
 function showQuality() {
   const chosen = QUALITIES[element("quality").value], known = qualities[chosen];
-  const words = known ? `${chosen}: ${known.seconds}, RRMSD ${known.rrmsd} (${known.range})` : chosen;
+  const words = known ? `${chosen}: ${known.seconds}, RRMSD ${known.rrmsd} on pixels, ${known.half} on half pixels (${known.range})` : chosen;
   if (element("quality-says").textContent !== words) element("quality-says").textContent = words;
-  element("quality").setAttribute("aria-valuetext", known ? `${chosen}, ${known.seconds}, RRMSD ${known.rrmsd}` : chosen);
+  element("quality").setAttribute("aria-valuetext", known ? `${chosen}, ${known.seconds}, RRMSD ${known.rrmsd} on pixels` : chosen);
   for (const tr of element("predicted").tBodies[0].rows) {
     if (tr.dataset.quality === chosen) tr.setAttribute("aria-current", "true");
     else tr.removeAttribute("aria-current");
