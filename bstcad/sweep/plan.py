@@ -69,8 +69,8 @@ def verdict(scene: Scene, entries: Mapping[str, Any]) -> dict[str, str] | None:
     """Return the verdict of a plan, {kind, sentence}; None if the present entries do not determine it.
 
     kind: "blurred" (with any lens, the blur by the source exceeds the allowed RRMSD), "within", "open" or "beyond" (the
-    interval of nine of ten designs is below, around or above the requested RRMSD, on pixels or half pixels, whichever is
-    harder to reach), "no limit" (no RRMSD is requested), or "not predicted".
+    interval of nine of ten designs is below, around or above the requested RRMSD, on pixels or half pixels, whichever
+    is harder to reach), "no limit" (no RRMSD is requested), or "not predicted".
     """
     requested = scene.accept.rrmsd
     allowed = DEFAULT_RRMSD_LIMIT if requested is None else requested

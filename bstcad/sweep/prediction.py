@@ -161,8 +161,9 @@ REMAINING_BLUR = 0.5  # fraction of the blur by an extended source that remains 
 def predict(scene: Scene, pilots: Mapping[str, Pilot], gain: float = 1.0) -> dict[str, dict[str, Interval]]:
     """Return intervals of INTERVAL_FACTORS, by quality, from pilots of PILOT_QUALITIES.
 
-    rrmsd: on pixels.  rrmsd_half: on half pixels.  memory_gb: of two processes.  The RRMSD does not increase from a quality to the next better quality.  gain: RRMSD with the net of `scene`, divided
-    by the RRMSD with the net of the scene of which the pilots are small versions.
+    rrmsd: on pixels.  rrmsd_half: on half pixels.  memory_gb: of two processes.  The RRMSD does not increase from a
+    quality to the next better quality.  gain: RRMSD with the net of `scene`, divided by the RRMSD with the net of the
+    scene of which the pilots are small versions.
     """
     best, intervals = math.inf, {}
     for quality in QUALITIES:

@@ -42,7 +42,8 @@ if TYPE_CHECKING:
 MIN_FRONT_RUNS = 3  # smallest number of runs on a Pareto front to which a power law is fitted
 TRADEOFF_COLUMNS = (
     "knobs", "settings", "status", "seconds", "cpu_seconds", "kernel_seconds", "units", "rrmsd", "rrmsd_half",
-    "rrmsd_noise", "rrmsd_reported", "peak_memory_gb", "on_front", "predicted_seconds", "cost_seconds", "where", "reason",
+    "rrmsd_noise", "rrmsd_reported", "peak_memory_gb", "on_front", "predicted_seconds", "cost_seconds", "where",
+    "reason",
 )  # fmt: skip
 PRIVATE_FIELDS = {"allowed_seconds", "history", "machine", "versions", "version"}  # fields of ColdRun that results omit
 

@@ -65,8 +65,8 @@ class Folds:
         for sheet, corners in zip(sheets, landed, strict=True):
             x = scaled(corners.position.detach().double(), goal.receiver.scale)
             centre = (x[:, 1:, 1:] + x[:, :-1, 1:] + x[:, 1:, :-1] + x[:, :-1, :-1]) / 4
-            cell = torch.where(centre.isfinite(), centre, torch.full_like(centre, -1.0)).floor().add(1)
-            column, row = torch.minimum(cell.clamp(min=0), most).long()
+            pixel = torch.where(centre.isfinite(), centre, torch.full_like(centre, -1.0)).floor().add(1)
+            column, row = torch.minimum(pixel.clamp(min=0), most).long()
             fluxes.append(torch.where(padded[row, column], sheet.flux, torch.zeros_like(sheet.flux)))
         return cls(peak, goal.receiver.scale, tuple(fluxes), tuple(float(total(sheet.flux)) for sheet in sheets))
 

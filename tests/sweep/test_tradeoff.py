@@ -186,6 +186,6 @@ KEYS = """
     runs knobs front front_halving presets seeds history
 """
 OF_A_RUN = """
-    settings status reason where seconds cpu_seconds kernel_seconds cost_seconds predicted_seconds peak_memory_gb rrmsd rrmsd_half
-    rrmsd_noise rays rrmsd_reported rrmsd_noise_reported passed net stages label knobs units on_front
+    settings status reason where seconds cpu_seconds kernel_seconds cost_seconds predicted_seconds peak_memory_gb rrmsd
+    rrmsd_half rrmsd_noise rays rrmsd_reported rrmsd_noise_reported passed net stages label knobs units on_front
 """
