@@ -162,7 +162,8 @@ class TubeRound:
         goals = tuple(goal.on_cells(self.cells) for goal in task.goals)
         merit = Merit.of(self.channels, lens, self.tubes, goals, overshoot=overshoot, wave=task.wave)
         merit = replace(merit, picture_error=task.merit, shares=self.shares)
-        if task.merit is None and not task.preview and not task.extended_sources:  # the blur by a source hides folds
+        # the blur by a source hides folds; two nets that form several goals converge slowly without them
+        if not (task.merit is not None or task.preview or task.several or task.extended_sources):
             with torch.no_grad():
                 landed = merit.landing(lens).on_goals
             pairs = zip(task.goals, landed, strict=True)
@@ -250,13 +251,13 @@ def refining_evaluations(knobs: ResolvedTailoring) -> int:
 
 
 def _fine_round(task: Task, tubes: int, evaluations: int, is_last: bool) -> TubeRound:
-    resolved = resolves_net(task)
+    resolved, cells = resolves_net(task), finest_cells(task)
     few = tubes < DENSE_TUBES * task.knobs.side
     ends_early = resolved and few and task.knobs.stage2_iterations <= SHORT_EVALUATIONS
     return TubeRound(
         task, tubes, evaluations, plateau=FEW_TUBES if ends_early else PLATEAU, resolved=resolved,
         ends_distorted=len(task.goals) > 1 and not task.preview and not is_last,
-        shares=shares_on_cells(task, is_last=is_last),
+        shares=shares_on_cells(task, cells if is_last or cells <= 2 else cells // 2),
     )  # fmt: skip
 
 
@@ -278,17 +279,14 @@ def finest_cells(task: Task) -> int:
     return 1 << max(0, math.floor(min(max(wanted + CELL_MARGIN, 1.0), most)))
 
 
-def shares_on_cells(task: Task, *, is_last: bool) -> tuple[float, ...]:
-    """Return `TubeRound.shares`: of pixels, half pixels … `finest_cells`; of fewer than these before the last round."""
-    levels = finest_cells(task).bit_length() - 1
-    if not is_last and levels > 1:
-        levels -= 1
+def shares_on_cells(task: Task, cells: int) -> tuple[float, ...]:
+    """Return `TubeRound.shares`: of pixels, half pixels … cells of which `cells` lie along each side of a pixel."""
     lit = max(float(goal.picture.sum() ** 2 / (goal.picture**2).sum()) for goal in task.goals)  # pixels, if even
     share = CELL_SHARE
     if not all(map(needs_no_folds, task.goals)):
         share *= max(1.0, task.knobs.side**2 / lit) ** -CELL_SHARE_POWER
     shares, rest = [], 1.0
-    for level in range(levels):
+    for level in range(cells.bit_length() - 1):
         shares.append(rest * (1 - (share if level == 0 else FINER_SHARE)))
         rest -= shares[-1]
     return (*shares, rest)
@@ -422,14 +420,18 @@ def _overshoot_weight(task: Task, lens: Lens) -> float:
 
     Within w of the border some light falls outside with any lens, and pulling it inside would blur the edge.
     """
-    overshoot = task.knobs.overshoot
+    return task.knobs.overshoot / (1 + max(image_widths(task, lens)) ** 2)
+
+
+def image_widths(task: Task, lens: Lens) -> list[float]:
+    """Return the width (pixels) of the image of the source on the receiver of each goal; 0 without extent."""
     if points_per_line(task.channels) == 1:
-        return overshoot
+        return [0.0] * len(task.goals)
     few, light = task.channels, task.heaviest
     if task.extended_sources:
         source = replace(task.extended_sources[-1].source, wavelength=light.source.wavelength)
         few = channels_of(source, lambda _: light.index, SECOND_MOMENT_POINTS)  # with the second moments of the source
-    return overshoot / (1 + max(images(few, lens, goal.receiver, IMAGE_POSITIONS).width() for goal in task.goals) ** 2)
+    return [images(few, lens, goal.receiver, IMAGE_POSITIONS).width() for goal in task.goals]
 
 
 @dataclass(frozen=True)
@@ -529,7 +531,7 @@ def with_stage3(before: Stage | None, task: Task, lens: Lens, state: Any = None)
                 last = replace(last, rays_rrmsd=task.at_full_size.rrmsd(last.lens))
             yield replace(last, reason="")
         lens, state = last.lens, None
-    rounds = stage3_rounds(task)
+    rounds = stage3_rounds(task, lens)
     if task.refines:
         rounds = (replace(rounds[-1], evaluations=refining_evaluations(task.knobs)),)
     elif before is None:
@@ -538,8 +540,11 @@ def with_stage3(before: Stage | None, task: Task, lens: Lens, state: Any = None)
         yield replace(step, state=step.state and Stage3State(step.state))
 
 
-def stage3_rounds(task: Task) -> tuple[TubeRound, ...]:
-    """Return the rounds of stage 3, one per entry of SOURCE_SIZES; in a preview, one round."""
+def stage3_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
+    """Return the rounds of stage 3, one per entry of SOURCE_SIZES; in a preview, one round.
+
+    lens: lens at the start.  Cells narrower than half of the source's image through it are not rated: it blurs them.
+    """
     lights = [
         replace(task, channels=channels, sampled_sources=(), extended_sources=(source,))
         for channels, source in zip(task.sampled_sources, task.extended_sources, strict=True)
@@ -549,8 +554,11 @@ def stage3_rounds(task: Task) -> tuple[TubeRound, ...]:
         source = task.extended_sources[-1]
         return (TubeRound(lights[-1], knobs.rays, knobs.stage2_iterations, "stage 3", source=source),)
     counts = stage3_sheet_sizes(knobs, (max(each.columns for each in screens), max(each.rows for each in screens)))
+    widest = 2 / max(min(image_widths(lights[-1], lens)), 1e-9)  # largest number of cells along a side of a pixel
+    cells = min(finest_cells(task), 1 << max(0, math.floor(math.log2(widest))))
+    shares = shares_on_cells(task, cells)
     return tuple(
-        TubeRound(light, tubes, count, "stage 3", source=light.extended_sources[0], source_size=size)
+        TubeRound(light, tubes, count, "stage 3", source=light.extended_sources[0], source_size=size, shares=shares)
         for light, (tubes, count), (size, _) in zip(lights, counts, SOURCE_SIZES, strict=True)
     )
 

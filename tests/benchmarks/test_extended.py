@@ -111,7 +111,7 @@ def test_direct_optimisation_against_doing_nothing_and_against_feedback(diameter
     alone = task.rrmsd(point)
     before, floor = judge(scene, point)
     began = time.process_time()
-    rounds = stage2.stage3_rounds(task)
+    rounds = stage2.stage3_rounds(task, point)
     direct = driven(task.at_full_size, stage2.run_rounds(rounds, point))
     seconds = time.process_time() - began
     after, noise = judge(scene, direct)

@@ -71,8 +71,8 @@ def record(base, point):
     return ColdRun(
         settings=point, status=DONE, seconds=seconds, cpu_seconds=1.5 * seconds, peak_memory_gb=1.5, rrmsd=error,
         rrmsd_half=2 * error, rrmsd_noise=error / 9, rays=10**7, rrmsd_reported=error, rrmsd_noise_reported=error / 9,
-        passed=True, net=f"{error} {seed * adam}", cost_seconds=seconds + 2, kernel_seconds=KERNEL, units=seconds / KERNEL,
-        version="1", stages=({"name": "stage 1", "seconds": 1.0, "rrmsd": 0.2},),
+        passed=True, net=f"{error} {seed * adam}", cost_seconds=seconds + 2, kernel_seconds=KERNEL,
+        units=seconds / KERNEL, version="1", stages=({"name": "stage 1", "seconds": 1.0, "rrmsd": 0.2},),
         history=({"seconds": 1.0, "rrmsd": 0.2}, {"seconds": 2.0, "rrmsd": 0.1}) if not point else (),
         machine={"processor": "none", "cores": 2}, versions={"python": "3"},
     )  # fmt: skip

@@ -132,10 +132,10 @@ def task_of(scene):
 
 def test_no_more_tubes_than_the_net_and_the_pixels_ask_for():
     scene = load(DISK, WIDE | {"tailoring.rays": 1000})
-    [number] = {each.tubes for each in stage2.stage3_rounds(task_of(scene))}
+    [number] = {each.tubes for each in stage2.stage3_rounds(task_of(scene), scene.flat_lens(33))}
     assert number == 66  # 33 control points, 32 pixels
     few = load(DISK, WIDE | {"tailoring.rays": 40})
-    assert {each.tubes for each in stage2.stage3_rounds(task_of(few))} == {40}
+    assert {each.tubes for each in stage2.stage3_rounds(task_of(few), few.flat_lens(33))} == {40}
 
 
 @pytest.fixture(scope="module")
