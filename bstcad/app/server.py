@@ -58,7 +58,8 @@ STATIC = Path(__file__).parent / "static"  # folder of scripts and styles
 CONTENT_TYPES = {".html": "text/html", ".json": "application/json", ".png": "image/png", ".pdf": "application/pdf"}
 RRMSD = (
     "RRMSD is the error of the light: the root mean square of its difference from the picture, divided by the root "
-    "mean square of the picture. 0 would be the exact picture; lenses in publications have 0.1 to 0.4."
+    "mean square of the picture, on pixels unless other cells are named. 0 would be the exact picture; lenses in "
+    "publications have 0.1 to 0.4."
 )
 KEYS_PAGE = "reference/scene-keys"  # page of the documentation that is generated from the schema
 MAX_VALID_TEXTS = 31  # largest number of scenes, besides the current one, whose latest valid text is stored

@@ -326,7 +326,7 @@ def convergence(history: Sequence[CurvePoint], stages: Sequence[StageRecord], no
         rings = {"linestyle": "", "marker": "o", "markerfacecolor": "none", "color": VERMILION}
         axes.plot(seconds[after], values[after], **rings, label="after a stage, by new rays")
         figure.legend(loc="outside lower center", ncols=2)
-    axes.set(yscale="log", xlabel="time (s)", ylabel="RRMSD")
+    axes.set(yscale="log", xlabel="time (s)", ylabel="RRMSD on pixels")
     visible = noise > values.min() / 20  # otherwise it is far below the curve
     axes.set_ylim(0.7 * min(values.min(), noise if visible else np.inf), 1.2 * values.max())
     if visible:

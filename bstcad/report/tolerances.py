@@ -284,7 +284,7 @@ def summary(found: Tolerances) -> Group:
     from rich.table import Table
     from rich.text import Text
 
-    columns = {"words": "error", "width": "±", "change": "RRMSD by 1 σ", "share": "fraction"}
+    columns = {"words": "error", "width": "±", "change": "RRMSD on pixels by 1 σ", "share": "fraction"}
     if found.wavefront:
         columns["wavefront"] = "waves by 1 σ"
     if found.loosest:

@@ -408,7 +408,7 @@ function showPlan(reply) {
     element("notes").textContent = reply.not_predicted ? `No prediction: ${reply.not_predicted}.` : reply.notes.join(" ");
   }
   element("predicted").tBodies[0].replaceChildren(...QUALITIES.filter((quality) => qualities[quality]).map((quality) => {
-    const made = row([quality, qualities[quality].seconds, qualities[quality].rrmsd], { numbers: [1, 2] });
+    const made = row([quality, qualities[quality].seconds, qualities[quality].rrmsd, qualities[quality].half], { numbers: [1, 2, 3] });
     made.title = qualities[quality].range;
     made.dataset.quality = quality;
     return made;
