@@ -270,12 +270,14 @@ def finest_cells(task: Task) -> int:
     """Return the cells along each side of a pixel that the last round rates, a power of two.
 
     They are about a quarter as wide as the cells of the net, if the light were spread evenly.  Where a picture is
-    bright, its pixels have more cells of the net: ten for letters.  Half pixels are rated in any case.
+    bright, its pixels have more cells of the net: ten for letters.  Half pixels are rated in any case, and are the
+    smallest cells for several goals, with which two nets converge faster.
     """
     if task.merit is not None or task.preview:
         return 1
     wanted = math.log2(CELLS_PER_POINT * task.knobs.side / pixels_of(task))
     most = math.log2(MAX_CELLS / max(math.prod(goal.receiver.shape) for goal in task.goals)) / 2
+    most = min(most, 1.0) if task.several else most
     return 1 << max(0, math.floor(min(max(wanted + CELL_MARGIN, 1.0), most)))
 
 
