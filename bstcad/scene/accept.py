@@ -75,7 +75,9 @@ class CutOff(Record):
 class Accept(Record):
     """Limits of the checks in the report; with None the check only states its value."""
 
-    rrmsd: Annotated[float | None, Key("Maximum RRMSD of light on the pixels of a target.", "", 1e-6, 10.0, of_light=True)] = None
+    rrmsd: Annotated[
+        float | None, Key("Maximum RRMSD of light on the pixels of a target.", "", 1e-6, 10.0, of_light=True)
+    ] = None
     rrmsd_half: Annotated[
         float | None,
         Key("Maximum RRMSD of light on a target, on half pixels.", "", 1e-6, 10.0, example=0.1, of_light=True),

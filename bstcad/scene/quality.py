@@ -67,7 +67,9 @@ class Tailoring(Record):
         Key("For two faces and two targets: no rays (convex) or all (concave) cross between them.", example="concave"),
     ] = None
     precision: Annotated[Literal["float32", "float64"] | None, Key("Precision in tailoring.", example="float64")] = None
-    accuracy: Annotated[float | None, Key("RRMSD on pixels at which tailoring ends.", "", 1e-6, 10.0, example=0.05)] = None
+    accuracy: Annotated[float | None, Key("RRMSD on pixels at which tailoring ends.", "", 1e-6, 10.0, example=0.05)] = (
+        None
+    )
     max_time: Annotated[
         float | None, Key("Maximum time, report included; stage 1 is always completed.", "s", 1.0, 1e7, example=60.0)
     ] = None

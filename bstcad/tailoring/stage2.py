@@ -51,10 +51,10 @@ RoundFractions = tuple[tuple[float, float], ...]  # (tubes per side, evaluations
 DENSE_ROUNDS, DENSE_TUBES = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08)), 2.5
 # Rounds if, of these, the first has fewer than DENSE_TUBES tubes per cell, for a lens without bounds on its shape and
 # at most SHORT_EVALUATIONS.  The last round corrects what the others distort between the tubes; these end on the
-# plateau FEW_TUBES.  (Letters after 83 evaluations: RRMSD 0.0258 on pixels and 0.042 on half pixels; 0.0277 and 0.040
-# after 73 in rounds of 1/2, 2/3 and 1 times as many tubes, in a tenth more time.  With 300 evaluations, as in fine
+# plateau FEW_TUBES.  (Letters after 76 evaluations: RRMSD 0.0253 on pixels and 0.043 on half pixels; after 83, with a
+# power of the share of 0.18, 0.0257 and 0.042.  With 300 evaluations, as in fine
 # quality, and the merit of pixels alone, short rounds ended at 0.0168 instead of 0.0148.)
-SHORT_ROUNDS, FEW_TUBES, SHORT_EVALUATIONS = ((5 / 12, 0.48), (5 / 8, 0.24), (0.91, 0.12)), Plateau(5, 0.03), 150
+SHORT_ROUNDS, FEW_TUBES, SHORT_EVALUATIONS = ((5 / 12, 0.43), (5 / 8, 0.22), (0.91, 0.12)), Plateau(5, 0.03), 150
 # Rounds if the last one has fewer than DENSE_TUBES tubes per cell.  The first rounds then distort the net between the
 # tubes, and the last one has to correct this, with MAX_TUBES tubes per side or fewer, since more need much memory; if
 # these are too few, with as many as the settings state.  (1025 control points, portrait: RRMSD 0.0175 after 54
@@ -92,7 +92,7 @@ CELLS_PER_POINT, CELL_MARGIN, MAX_CELLS = 4.0, 0.25, 1 << 22
 # Share in the squared error of the errors on cells smaller than a pixel, for one control point per lit pixel; power by
 # which it falls with their number for a target with detail, since more points correct the light inside a pixel more
 # easily; share of the errors on cells smaller than each further size in the rest.
-CELL_SHARE, CELL_SHARE_POWER, FINER_SHARE = 0.21, 0.18, 0.2
+CELL_SHARE, CELL_SHARE_POWER, FINER_SHARE = 0.21, 0.33, 0.2
 MIN_EVALUATIONS = 30  # evaluations below which stage 2 has a single round and stage 3 gets twice as many
 COMPARED_NET = 65  # largest number of control points per side in `compare_precisions`, for speed
 COMPARED_TUBES = 128  # tubes per side in `compare_precisions`
@@ -163,7 +163,8 @@ class TubeRound:
         merit = Merit.of(self.channels, lens, self.tubes, goals, overshoot=overshoot, wave=task.wave)
         merit = replace(merit, picture_error=task.merit, shares=self.shares)
         # the blur by a source hides folds; two nets that form several goals converge slowly without them
-        if not (task.merit is not None or task.preview or task.several or task.extended_sources):
+        may_fold = task.merit is not None or task.preview or task.several or task.extended_sources
+        if not may_fold and any(map(needs_no_folds, task.goals)):
             with torch.no_grad():
                 landed = merit.landing(lens).on_goals
             pairs = zip(task.goals, landed, strict=True)
