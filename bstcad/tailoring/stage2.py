@@ -557,8 +557,9 @@ def stage3_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
         source = task.extended_sources[-1]
         return (TubeRound(lights[-1], knobs.rays, knobs.stage2_iterations, "stage 3", source=source),)
     counts = stage3_sheet_sizes(knobs, (max(each.columns for each in screens), max(each.rows for each in screens)))
-    widest = 2 / max(min(image_widths(lights[-1], lens)), 1e-9)  # largest number of cells along a side of a pixel
-    cells = min(finest_cells(task), 1 << max(0, math.floor(math.log2(widest))))
+    cells, seen = finest_cells(task), [width for width in image_widths(lights[-1], lens) if width > 0]  # else no light
+    while seen and cells > 1 and cells * min(seen) > 2:
+        cells //= 2
     shares = shares_on_cells(task, cells)
     return tuple(
         TubeRound(light, tubes, count, "stage 3", source=light.extended_sources[0], source_size=size, shares=shares)
