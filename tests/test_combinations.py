@@ -687,13 +687,13 @@ DENSE = {  # four control points per pixel along a side, and evaluations enough 
     "tailoring.transport_grid": 64,
 }  # fmt: skip
 MAX_HALF_RATIO, MAX_HALF = 2.0, 0.01  # RRMSD on half pixels: largest multiple of that on pixels, and what is added
-MAX_HALF_RATIO_OF_ALL, MAX_HALF_OF_ALL = 2.5, 0.1  # the same for every pair, after two evaluations
+MAX_HALF_RATIO_OF_ALL, MAX_HALF_OF_ALL = 2.5, 0.1  # both for every pair, after two evaluations
 
 
 @pytest.mark.parametrize(("wall", "picture"), [("square", "even"), ("directions", "letters")])
 @pytest.mark.parametrize("light", CHOICES["light"])
 def test_each_light_is_right_inside_the_pixels(light, wall, picture):
-    """With the merit on pixels alone, even light deviates by 0.05 on half pixels, and letters by 0.2."""
+    """Without cells in the merit, even light deviates by 0.05 on half pixels, and letters by 0.2."""
     scene = scene_of(PLAIN | {"light": light, "wall": wall, "picture": picture}).changed(DENSE)
     made = pipeline.design(scene, options=pipeline.DesignOptions(compare_later=True))
     effort = Effort(512, accuracy=0.0, witness=False, cells=2)

@@ -284,7 +284,8 @@ def plan_predictions(plan: Mapping[str, Any]) -> Group:
     rows, finer = dict(plan["predicted"]), plan["finer"]
     if finer is not None:
         rows[f"standard, {size_text(finer['control_points'])} control points"] = finer["predicted"]["standard"]
-    table = _table("on this machine", "seconds", "RRMSD on pixels", "on half pixels", "memory (GB)")
+    headings = "seconds", "RRMSD on pixels", "on half pixels", "memory (GB)"
+    table = _table("on this machine", *headings)
     for name, entry in rows.items():
         intervals = (map(about, entry[key]) for key in ("seconds", "rrmsd", "rrmsd_half", "memory_gb"))
         cells = (Text.assemble(likely, (f" ({low} to {high})", "dim")) for low, likely, high in intervals)

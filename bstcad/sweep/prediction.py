@@ -104,7 +104,8 @@ def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
     steep = Steepness(transport["steep_share"], transport["steepest_deg"])
     lost = max(map(detail, (goal.picture for goal in scene.goals), sides)) if finer else 0.0
     lacks = {"detail": lost, "blur": max(0.0, *blurs)}
-    return Pilot(small, Seconds(**times), rrmsd, max(ratios, default=1.0), factor, **lacks, steep=steep)
+    errors = {"rrmsd": rrmsd, "half_ratio": max(ratios, default=1.0)}
+    return Pilot(small, Seconds(**times), **errors, factor=factor, **lacks, steep=steep)
 
 
 def with_quality(scene: Scene, quality: str) -> Scene:

@@ -44,7 +44,7 @@ class Folds:
     """Penalty on folds of the light on one target."""
 
     peak: float  # peak of the target, as a fraction of its light per pixel
-    scale: Scale  # of the target's pixels
+    scale: Scale  # places and sizes of the target's pixels
     fluxes: tuple[Tensor, ...]  # flux (n, m) of each sheet's tubes that landed inside the border; 0: of other tubes
     wholes: tuple[float, ...]  # flux of all tubes of each sheet
 
@@ -74,7 +74,7 @@ class Folds:
         """Return the weighted penalty of all channels (0-d), differentiable in the landing points."""
         given = zip(landed, self.fluxes, self.wholes, strict=True)
         parts = (
-            fold_penalty(each.position.double(), flux, whole, self.scale, self.peak) for each, flux, whole in given
+            fold_penalty(each.position.double(), flux, whole, self.scale, peak=self.peak) for each, flux, whole in given
         )
         return FOLD_WEIGHT * weighted_sum(channels, parts)
 
