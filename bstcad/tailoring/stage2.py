@@ -52,8 +52,8 @@ DENSE_ROUNDS, DENSE_TUBES = ((1 / 2, 0.51), (2 / 3, 0.41), (1.0, 0.08)), 2.5
 # Rounds if, of these, the first has fewer than DENSE_TUBES tubes per cell, for a lens without bounds on its shape and
 # at most SHORT_EVALUATIONS.  The last round corrects what the others distort between the tubes; these end on the
 # plateau FEW_TUBES.  (Letters after 76 evaluations: RRMSD 0.0253 on pixels and 0.043 on half pixels; after 83, with a
-# power of the share of 0.18, 0.0257 and 0.042.  With 300 evaluations, as in fine
-# quality, and the merit of pixels alone, short rounds ended at 0.0168 instead of 0.0148.)
+# power of the share of 0.18, 0.0257 and 0.042.  With 300 evaluations, as in fine quality, and the merit of pixels
+# alone, short rounds ended at 0.0168 instead of 0.0148.)
 SHORT_ROUNDS, FEW_TUBES, SHORT_EVALUATIONS = ((5 / 12, 0.43), (5 / 8, 0.22), (0.91, 0.12)), Plateau(5, 0.03), 150
 # Rounds if the last one has fewer than DENSE_TUBES tubes per cell.  The first rounds then distort the net between the
 # tubes, and the last one has to correct this, with MAX_TUBES tubes per side or fewer, since more need much memory; if

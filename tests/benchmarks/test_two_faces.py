@@ -19,7 +19,7 @@ from tests.judges.paths import paths_apart
 pytestmark = pytest.mark.bench
 
 RRMSD = {  # largest RRMSD of each target of the template
-    "beam_shaper": (0.025, 0.025),
+    "beam_shaper": (0.01, 0.02),
     "collimated_portrait": (0.05,),
     "two_pictures": (0.05, 0.05),
 }
