@@ -48,6 +48,7 @@ from bstcad.verify.checks import Nominal
 SCENE, DESIGN, PART = "scene.toml", "design.npz", "part.step"  # names of files in a design's folder
 FRONT_KNOTS = ("front_knots_x", "front_knots_y")  # names in design.npz of the knots of a tailored front
 PROVEN = (SCENE, DESIGN, "lens.step", "lens.stl", PART, NET_FILE)  # files that a verification reads
+DISTANCES = "relative_distances"  # name in design.npz of a dome's distances
 REMEDY = "generate the design again"
 
 
@@ -278,7 +279,8 @@ def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) 
     transport_y (r,), the positions of c columns and r rows of points on the target (unit of the receiver), and
     transport_back or transport_entrance (c, r, 2), x and y (mm) of the light for each point: transport_back on the last
     tailored face (the back; the front if only the front is tailored, or for a mirror behind glass), transport_entrance
-    in the plane z = const of the first face's vertex.
+    in the plane z = const of the first face's vertex.  A dome also has relative_distances (m, n): the distances of its
+    control points from the centre minus lens.back.radius (mm), since those of the points themselves would be rounded.
     """
     lens, sent = design.lens, design.transport
     (m, n), front = lens.back_net.shape, lens.front
@@ -290,6 +292,7 @@ def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) 
         "degree": DEGREE,
         "front_curvature": 0.0,
         **_numbers(front),
+        **({DISTANCES: lens.back_net.heights.cpu().double().numpy()} if isinstance(lens.back, RadialSurface) else {}),
         **({"front_control_points": front.control_points()} if is_net(front) else {}),
         **(dict(zip(FRONT_KNOTS, map(knots, lens.front_net.shape), strict=True)) if lens.shapes("front") else {}),
         **{numbered("target", k): goal.picture for k, goal in enumerate(design.goals)},
@@ -360,6 +363,8 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
     if scene.lens.front.is_tailored:
         shapes["front_control_points"] = (*as_pair(scene.lens.nets()[1]), 3)
     names = files.names(folder / DESIGN)
+    if scene.lens.dome is not None and DISTANCES in names:  # an earlier version stored the points alone
+        shapes[DISTANCES] = as_pair(scene.lens.back.net)
     for k, target in enumerate(scene.targets):
         shapes[numbered("target", k)] = target.columns_rows[::-1]
         if (name := numbered("reachable", k)) in names:
@@ -401,7 +406,7 @@ def _arrays(folder: Path, shapes: Mapping[str, tuple[int, ...]], scene: scenes.S
     path, pixels = folder / DESIGN, sum(math.prod(target.columns_rows) for target in scene.targets)
     points = sum(math.prod(as_pair(net)) for net in scene.lens.nets())
     try:
-        found = files.arrays(path, shapes, 25 * points + 17 * pixels + 3_000_000)  # limit in bytes
+        found = files.arrays(path, shapes, 33 * points + 17 * pixels + 3_000_000)  # limit in bytes
     except Exception as error:  # numpy, zipfile, zlib and tokenize raise various errors for a damaged file
         raise SceneError(f"{path}: cannot be read ({files.first_line(error)}); {REMEDY}") from None
     for name, shape in shapes.items():
@@ -426,7 +431,7 @@ def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
     if blank.dome is not None:
         flat = scene.flat_lens(blank.back.net).with_front(front)
         try:
-            return flat.with_back(RadialSurface.like(flat.back, found["control_points"]))
+            return flat.with_back(RadialSurface.like(flat.back, found["control_points"], found.get(DISTANCES)))
         except ValueError as error:
             raise SceneError(f"{DESIGN}: {error}; {REMEDY}") from None
     back = _surface(found["control_points"], blank.back.z)

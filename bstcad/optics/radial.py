@@ -115,11 +115,15 @@ class RadialSurface(BSplineSurface):
         return surface._checked(net)
 
     @staticmethod
-    def like(surface: Surface, net: np.ndarray) -> RadialSurface:
-        """Return a radial surface with other control points (m, n, 3) (mm); ValueError if they leave its directions."""
+    def like(surface: Surface, net: np.ndarray, heights: np.ndarray | None = None) -> RadialSurface:
+        """Return a radial surface with other control points (m, n, 3) (mm); ValueError if they leave its directions.
+
+        heights: h_ij (m, n) of these points, if known to the last bit; None: computed from the points, and so rounded.
+        """
         assert isinstance(surface, RadialSurface)
-        rho = np.sqrt(((net - np.array([0.0, 0.0, surface.z])) ** 2).sum(-1))
-        return replace(surface, heights=torch.from_numpy(rho - surface.radius))._checked(net)
+        if heights is None:
+            heights = np.sqrt(((net - np.array([0.0, 0.0, surface.z])) ** 2).sum(-1)) - surface.radius
+        return replace(surface, heights=torch.from_numpy(heights))._checked(net)
 
     def _checked(self, net: np.ndarray) -> Self:
         """Return the surface; ValueError if its control points are not `net` (m, n, 3) (mm)."""

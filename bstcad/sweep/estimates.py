@@ -8,20 +8,22 @@ the finished lens.  The diagnosis of a finished design uses its picture and the 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import torch
 
 from bstcad.analysis.cost import ending, remaining
-from bstcad.analysis.neglected_effects import Change, Reference
+from bstcad.analysis.neglected_effects import Change, Reference, difference
 from bstcad.optics import media
 from bstcad.optics.channels import Channel
 from bstcad.optics.collimated import Collimated
 from bstcad.optics.goal import Goal
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import tubes_picture
 from bstcad.optics.profiles import pair_of
 from bstcad.optics.sides import as_pair
 from bstcad.report.record import DesignCourse, LeftOut
@@ -90,6 +92,8 @@ VISIBLE_BAND = (400.0, 700.0)  # band of white light, nm
 SUN_ANGLES = (0.5, 0.56)  # range of full divergence angles (degrees) treated as sunlight; the sun's mean is 0.53
 LINE_WIDTH = 10.0  # assumed width (nm) of a spectral line; LEDs have 20 to 40, lasers less than 1
 LINE_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # (offset / half width of the band, weight)
+BAND_POINTS = ((-0.5, 0.5), (0.5, 0.5))  # the same where lines stand for bands: twice as many lines
+TUBES_PER_PIXEL = 1.0  # flux tubes per pixel, along each side, for the pictures of lines and of a continuous spectrum
 FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"  # TOML for scenes
 
 
@@ -124,8 +128,7 @@ def _glass_effects(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
         yield _entry("fresnel", reference.change([_central_channel(scene, bare)]), simulate_by=FRESNEL_KEYS)
     if find_effect(scene.effects, Absorption) is None:
         yield _absorption(scene, reference)
-    if len(scene.source.lines) == 1:
-        yield _dispersion(scene, reference)
+    yield _dispersion(scene, reference)
     if scene.lens.passes.reflects:
         yield _entry("ghost", None, "ghosts of a mirror behind glass are not simulated")
     elif find_effect(scene.effects, Ghost) is None:
@@ -156,19 +159,51 @@ def _absorption(scene: Scene, reference: Reference) -> LeftOut:
 
 
 def _dispersion(scene: Scene, reference: Reference) -> LeftOut:
-    channel, material = reference.channel, scene.lens.material
+    """Return the change by the width of an only line, or by light between several lines.
+
+    Several lines may stand for a continuous spectrum.  Their pictures then lie between those of other wavelengths, and
+    each has structures that only the sum of all lines does not have.
+    """
+    channel, material, lines = reference.channel, scene.lens.material, scene.source.lines
     if material is None:
         return _entry("dispersion", None, "lens.index names no material", f"lens.material, and {LINES_KEYS}")
-    low, high = band(scene)
-    lines = [((low + high) / 2 + (high - low) / 2 * place, weight) for place, weight in LINE_POINTS]
+    bands = [band(scene)] if len(lines) == 1 else _bands([nm for nm, _ in lines])
+    points = LINE_POINTS if len(lines) == 1 else BAND_POINTS
+    finer = [
+        ((low + high) / 2 + (high - low) / 2 * place, weight * share)
+        for (low, high), (_, weight) in zip(bands, lines, strict=True)
+        for place, share in points
+    ]
     try:
-        channels = [replace(channel, index=media.refractive_index(material, nm), weight=w) for nm, w in lines]
+        channels, own = (
+            [replace(channel, index=media.refractive_index(material, nm), weight=weight) for nm, weight in each]
+            for each in (finer, lines)
+        )
     except ValueError:
-        span = f"from {low:g} to {high:g} nm"
+        span = f"from {min(nm for nm, _ in finer):.0f} to {max(nm for nm, _ in finer):.0f} nm"
         return _entry("dispersion", None, f"there are no data of {material} {span}", LINES_KEYS)
+    change = reference.change(channels)
+    if len(lines) > 1:
+        words = f"if the light is continuous between the {len(lines)} lines, as for a lamp"
+        if change is not None:
+            tubes = math.ceil(TUBES_PER_PIXEL * max(reference.screen.shape))
+            after, before = (
+                tubes_picture(reference.lens, each, reference.screen, tubes).numpy() for each in (channels, own)
+            )
+            change = replace(change, flux=float(after.sum() / before.sum() - 1), rrmsd=difference(after, before))
+        return _entry("dispersion", change, words, f"{LINES_KEYS}, with more lines", assumed=True)
+    [(low, high)] = bands
     sun = (low, high) == VISIBLE_BAND
     words = f"of sunlight, uniform from {low:g} to {high:g} nm" if sun else f"for a spectral width of {LINE_WIDTH:g} nm"
-    return _entry("dispersion", reference.change(channels), words, LINES_KEYS, assumed=not sun)
+    return _entry("dispersion", change, words, LINES_KEYS, assumed=not sun)
+
+
+def _bands(lines: Sequence[float]) -> list[tuple[float, float]]:
+    """Return the band (low, high), nm, of each line: to the middle between neighbours, and as far beyond the last."""
+    middle = [(low + high) / 2 for low, high in pairwise(sorted(lines))]
+    edges = [2 * min(lines) - middle[0], *middle, 2 * max(lines) - middle[-1]]
+    bands = dict(zip(sorted(lines), pairwise(edges), strict=True))
+    return [bands[nm] for nm in lines]
 
 
 def band(scene: Scene) -> tuple[float, float]:

@@ -71,6 +71,23 @@ def test_sunlight_parts_over_all_that_is_seen():
     assert 20 < sun.blur_pixels / laser.blur_pixels < 60 and sun.rrmsd_change > 10 * laser.rrmsd_change
 
 
+def test_lines_that_stand_for_a_lamp_are_told_from_a_continuous_spectrum():
+    """A lens that is tailored for two lines far apart has another picture at wavelengths between them, by new rays."""
+    lines = {"source.wavelength": [[500.0, 1.0], [650.0, 1.0]], "lens.material": "PMMA", "lens.index": None}
+    off_axis = {"target.x": [40.0, 80.0], "target.y": [-20.0, 20.0]}
+    found = pipeline.design(load(DISK, TINY | lines | off_axis))
+    continuous = found.scene.changed({"source.wavelength": [[nm, 1.0] for nm in np.arange(430.0, 725.0, 10.0)]})
+    pictures = (
+        measure(found.lens, scene.channels(), scene.target.screen, found.goals[0].picture, Effort(256)).picture
+        for scene in (found.scene, continuous)
+    )
+    before, after = (picture / picture.sum() for picture in pictures)
+    changed = float(np.sqrt(((after - before) ** 2).sum() / (before**2).sum()))
+    [entry] = [e for e in left_out(found.scene, found.lens, before) if e.kind == "dispersion"]
+    assert changed > 0.01 and entry.assumed and "continuous between the 2 lines" in entry.detail
+    assert changed / 2 < entry.rrmsd_change < changed * 2
+
+
 def test_a_design_that_was_stopped_before_there_was_a_curve():
     asked = iter([False, False, False])
     found, _ = of(pipeline.design(load(DISK, TINY), hooks=Hooks(interrupted=lambda: next(asked, True))))
