@@ -36,7 +36,7 @@ from bstcad.tailoring.feasibility import find_demand, is_infeasible
 from bstcad.tailoring.grazing import without_reflection
 from bstcad.tailoring.machinability import BOUNDS_STAGE, active_bounds, enforce_bounds, place_back
 from bstcad.tailoring.merit import PictureError
-from bstcad.tailoring.reachable import DomeReach, reachable, reachable_by_dome
+from bstcad.tailoring.reachable import Reach, reach_of
 from bstcad.tailoring.run import (
     BEST_LENS_STAGE,
     NO_HOOKS,
@@ -260,16 +260,16 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
     lens, grazing = light.through(scene.flat_lens(REACH_NET)), MAX_EXIT_ANGLE
     if refracts := lens.passes.largest_deflection(light.index) is not None:
         grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.light, lens))
+    found = reach_of(light.source, lens, goal, grazing=grazing)
     if scene.lens.dome is not None:
-        found = reachable_by_dome(light.source, lens, goal, grazing=grazing)
         if found.astray > MAX_ASTRAY:
             raise SceneError(light_astray(scene, found))
         return found.part, None  # no part of the light is held from total internal reflection yet
-    part = reachable(light.source, lens, goal, grazing=grazing)
+    part = found.part
     if part is not None and scene.lens.front.free:  # another front may send light further
         free, effort = scene.lens.front.free, stage1.FrontSearch(repeats=1)
         shaped = stage1.shaped_front(light.source, lens, goal, free, rim_sags=scene.rim_sags, effort=effort)
-        part = reachable(light.source, lens.with_front(shaped.front), goal, grazing=grazing)
+        part = reach_of(light.source, lens.with_front(shaped.front), goal, grazing=grazing).part
     if part is None:
         return None, None
     if not goal.picture[part].sum() > MIN_REACHABLE:
@@ -279,7 +279,7 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
     return part, Edge(light, grazing) if refracts else None
 
 
-def light_astray(scene: Scene, found: DomeReach) -> str:
+def light_astray(scene: Scene, found: Reach) -> str:
     """Return a sentence on light that a dome cannot send to the target."""
     deflection, angle = scene.lens.passes.largest_deflection(scene.index), math.degrees(found.beyond)
     limit = "" if deflection is None else f", which bends light by up to {deflection:.3g} degrees"

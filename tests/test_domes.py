@@ -224,7 +224,7 @@ def _beside(points):
 
 DAMAGES = {  # (change of the folder, the sentence)
     "a point beside its direction": (
-        lambda f: _with_points(f, _beside), r"design\.npz: .*directions of a radial net by 0\.000\d+ mm; generate",
+        lambda f: _with_points(f, _beside), r"design\.npz: .*directions of a radial net by 0\.00\d+ mm; generate",
     ),
     "a distance that is no number": (lambda f: _with_points(f, lambda p: p * np.nan), r"not finite; generate"),
     "another half angle": (
