@@ -697,6 +697,35 @@ def test_each_light_is_right_inside_the_pixels(light, wall, picture):
     assert found.half.rrmsd <= MAX_HALF_RATIO * found.rrmsd + MAX_HALF + noise
 
 
+BODIES = {  # choices of a scene, by the body that it has
+    "lens": {},
+    "mirror": {"front": "mirror"},
+    "glass mirror": {"front": "mirror behind glass"},
+    "tailored front": {"front": "tailored spline"},
+    "two faces": {"front": "tailored spline", "targets": "two"},
+    "windows": {"elements": "window behind"},
+    "dome": {"back": "dome", "light": "cone", "rim": "circle"},
+}
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_a_design_remains_the_design_of_its_folder(body, tmp_path):
+    """What a design can do works after it was written, opened, and written again: its net is equal to the last bit."""
+    folder = tmp_path / "design"
+    design = bstcad.design(scene_of(PLAIN | BODIES[body]), progress=False)
+    report = design.write(folder, progress=False)
+    again = bstcad.open(folder)
+    assert np.array_equal(design.lens.back_net.control_points(), again.lens.back_net.control_points())
+    for each in (design, again):
+        assert each.verify(progress=False).rrmsd == pytest.approx(report.rrmsd, rel=1e-3)
+        assert each.solid().Volume() > 0 and each.picture().any() and each.write_part(tmp_path / "p.step").exists()
+        if body != "dome":
+            assert each.with_lens(each.lens).with_heights(each.lens.back.heights).lens is not None
+    again.write(folder, progress=False)
+    for each in (design, again, bstcad.open(folder)):
+        assert all(path.exists() for path in each.export("points"))
+
+
 REACHING = covering(to_cover(2, ("light", "rim", "wall", "back", "front", "medium", "elements")))
 INDICES = (1.05, 1.3, 1.49, 2.0)  # of the encapsulant, from almost air to more than the lens
 
@@ -762,7 +791,7 @@ def landed_by_snell(lens, source, receiver, grazing):
 
 @pytest.mark.parametrize("number", range(len(REACHING)))
 def test_what_a_face_can_light_is_not_called_dark(number):
-    """By Snell's law at each point of the face and every slope, against `reachable_part`, which knows it in closed form.
+    """By Snell's law at each point of the face and every slope, against the closed form of `reachable_part`.
 
     The light of the whole source counts, and not that of its centre alone.  A pixel at the edge of the reach may count
     as dark, since only a part of it can be lit.

@@ -159,6 +159,14 @@ def test_light_that_cannot_return_to_the_target_is_refused_before_the_design(sce
     assert pipeline.reachable_part(of, of.goals[0]) == (None, None)
 
 
+def test_the_advice_for_two_targets_can_be_followed(scene):
+    """A dome has one tailored face, and refuses a tailored front."""
+    near = scene.targets[0].model_dump(exclude_none=True, exclude_defaults=True) | {"z": 2 * scene.targets[0].z}
+    both = [scene.targets[0].model_dump(exclude_none=True, exclude_defaults=True), near]
+    said = " ".join(scene.changed({"target": both, "wavefront": None}).warnings())
+    assert "set the weights" in said and "bspline" not in said
+
+
 def test_a_front_about_the_lamp_ends_at_the_half_angle(scene):
     """The sphere's rim is seen from the centre at the half angle, but for the margin."""
     x = scene.lens.front.outline.radius

@@ -81,8 +81,11 @@ def chordal_error(vertices: np.ndarray, faces: np.ndarray, lens: Lens, enough: f
     for start in range(0, len(faces), FACETS_AT_A_TIME):
         corners = vertices[faces[start : start + FACETS_AT_A_TIME]]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        wall = np.abs(normals[:, 2]) <= 1e-6 * np.linalg.norm(normals, axis=1)
-        flat = np.abs(corners[..., 2] - lens.front.around.z).max(axis=1) <= BASE_TOLERANCE
+        over_base = np.abs(corners[..., 2] - lens.front.around.z)
+        flat = over_base.max(axis=1) <= BASE_TOLERANCE
+        # a facet of the wall stands on the base; one of a steep dome may be upright, too
+        upright = np.abs(normals[:, 2]) <= 1e-6 * np.linalg.norm(normals, axis=1)
+        wall = upright & (over_base.min(axis=1) <= BASE_TOLERANCE)
         outer = (normals * (corners.mean(axis=1) - (0.0, 0.0, dome.z))).sum(axis=1) > 0
         middles = (corners[wall] + np.roll(corners[wall], -1, axis=1)) / 2
         parts = [_from_rim(lens, dome, middles.reshape(-1, 3))]

@@ -11,6 +11,7 @@ import torch
 from pydantic import Field
 
 from bstcad.analysis.cell_errors import is_right, right_down_to
+from bstcad.analysis.etendue import Silhouette
 from bstcad.analysis.top_hat import FLAT_LEVEL, FlatTop
 from bstcad.optics.goal import Goal, suffix_of, words_of
 from bstcad.optics.irradiance import Screen
@@ -203,11 +204,12 @@ def photometry(scene: Scene, proof: Proof) -> Iterator[Photometry]:
 
 
 def _luminance(proof: Proof, screen: Screen, peak: float, at: tuple[int, int]) -> float | None:
-    """Return I / (A cos θ) (cd/m²): I = peak (cd) in the direction of the pixel `at`, θ from +z, A the back's area."""
+    """Return I / A (cd/m²): I = peak (cd) in the direction of the pixel `at`, from which the back has the area A."""
     (row, column), (per_x, per_y) = at, screen.per_unit
     x, y = screen.x[0] + (column + 0.5) / per_x, screen.y[1] - (row + 0.5) / per_y
     cosine = float(screen.plane.normal(torch.tensor([x, y], dtype=torch.float64))[2])
-    return peak / (proof.lens.apertures[1].area * cosine) * PER_LX if cosine > 0 else None
+    area = float(Silhouette.of(proof.lens).area(np.array([abs(cosine)]))[0])
+    return peak / area * PER_LX if area > 0 else None
 
 
 def flat_tops(scene: Scene, proof: Proof) -> Iterator[FlatTop]:

@@ -23,6 +23,7 @@ from pydantic_core import from_json, to_json, to_jsonable_python
 from typing_extensions import TypedDict
 
 from bstcad.analysis.cost import lifted, unlit
+from bstcad.analysis.etendue import Etendue, etendue
 from bstcad.analysis.light import Blur, FinestDetail, finest_detail
 from bstcad.analysis.steepness import Steepness
 from bstcad.analysis.top_hat import FlatTop
@@ -202,6 +203,8 @@ class Contents:
     # unreachable part of the target, by key: area (fraction of the target), light (fraction of the picture's light) and
     # angle (largest deflection by a face of this index, degrees; None for a mirror).  None: all is reached
     unreachable: Mapping[str, Size | None] | None = None
+    # how much of the light of a source of finite size fits into the target, the least of all targets; None: not known
+    etendue: Etendue | None = None
     leak: Fraction | None = None  # fraction of the light on the target that is on its dark pixels; None: no dark pixels
     contrast: Size | None = None  # mean irradiance of lit divided by dark pixels; None: no dark pixels, or no leak
     optic: Literal["lens", "mirror"] = "lens"  # kind of the design
@@ -339,6 +342,7 @@ def contents_of(
         seed=scene.tailoring.seed,
         rrmsd_whole=light.rrmsd_whole,
         unreachable=_unreached(scene, goal),
+        etendue=_least_etendue(scene, proof, goals),
         optic=scene.optic,
         quality=scene.tailoring.quality,
         rrmsd_asked=scene.accept.rrmsd,
@@ -362,6 +366,11 @@ def _unreached(scene: Scene, goal: Goal) -> dict[str, float | None] | None:
     if goal.reachable is None:
         return None
     return unreached(goal.whole, goal.reachable, scene.lens.passes.largest_deflection(scene.index))
+
+
+def _least_etendue(scene: Scene, proof: Proof, goals: Sequence[Goal]) -> Etendue | None:
+    found = (etendue(scene.light, proof.lens, goal) for goal in goals)
+    return min((each for each in found if each is not None), key=lambda each: each.fits, default=None)
 
 
 def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:

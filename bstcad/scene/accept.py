@@ -142,9 +142,6 @@ class Accept(Record):
             yield from _limit_complaints("accept.cut_off", self.cut_off, ("least", "most"), targets)
             if self.cut_off.target < len(targets):
                 yield from _cut_off_complaints(self.cut_off, targets[self.cut_off.target])
-        if self.glare is not None and targets[0].screen.plane.photometric_unit != "cd":
-            only = "the intensities at 70, 80 and 90 degrees are judged with a target over directions"
-            yield f'accept.glare: {only}; set target.kind = "intensity", or remove this key'
 
 
 def _limit_complaints(key: str, table: Any, names: Sequence[str], targets: Sequence[Target]) -> Iterator[str]:

@@ -144,6 +144,8 @@ class Scene(Record):
                     yield f"{key}: {several}; make it a plane, or keep one target without a wavefront"
         yield from coplanar_complaints(self.targets)
         yield from self.accept.complaints(self.targets, self.source)
+        if self.accept.glare is not None and self.behind:
+            yield "accept.glare: is judged on the light behind the lens and does not go with [[behind]]; remove one"
         if self.wavefront is not None and self.light_path.is_folded:
             yield "wavefront: cannot be set with a mirror in [[behind]], which reverses the wave; remove one of them"
         yield from _wavefront_complaints(self.wavefront, source, lens, accept=self.accept)
@@ -489,7 +491,9 @@ def _doubts_of_goals(scene: Scene) -> Iterator[str]:
         faces, remedy = "two tailored faces", "set their weights, or remove a goal"
         if len(shaped) == 1:
             faces, remedy = "one tailored face", "a mirror has no second face, so set the weights"
-            if "front" in lens.passes.faces:
+            if lens.dome is not None:
+                remedy = "a dome has no second face, so set the weights"
+            elif "front" in lens.passes.faces:
                 front = f'lens.front = {{ kind = "bspline", z = {lens.front.z:g}, optimise = true }}'
                 remedy = f"tailor the front too, {front}" if lens.back.optimise else "remove lens.back.optimise = false"
         key = "target" if pictures > 1 else "wavefront"

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from bstcad.analysis.etendue import FORBIDDEN, etendue
 from bstcad.analysis.light import blur
 from bstcad.optics.goal import worst
 from bstcad.optics.lens import Lens
@@ -36,9 +37,11 @@ def plan(scene: Scene, text: str = "", keys: Sequence[str] = (), tick: Tick = la
     """Yield the entries of `plan --json`: first the effects, then the predictions (see `predict_qualities`).
 
     simulated: effects that are simulated.  goals: for each target its key, left_out (neglected effects, ordered by
-    change of the RRMSD), blur and unreachable.  The entries of the most blurred target are repeated outside goals.
+    change of the RRMSD), blur, unreachable and etendue.  Those of the most blurred target are repeated outside goals.
 
     unreachable: part of the target that light cannot reach (optics.reach.unreached); None: none, or a tailored front.
+
+    etendue: {fits, narrowest, unit} of analysis.etendue.Etendue; None: a source without extent.
 
     blur: width (in the target's unit and in pixels) of the image of an extended source through the coarse lens, and the
     RRMSD of the target convolved with this image; None: a source without extent, or no light passes.
@@ -68,9 +71,10 @@ def plan(scene: Scene, text: str = "", keys: Sequence[str] = (), tick: Tick = la
 def verdict(scene: Scene, entries: Mapping[str, Any]) -> dict[str, str] | None:
     """Return the verdict of a plan, {kind, sentence}; None if the present entries do not determine it.
 
-    kind: "blurred" (with any lens, the blur by the source exceeds the allowed RRMSD), "within", "open" or "beyond" (the
-    interval of nine of ten designs is below, around or above the requested RRMSD, on pixels or half pixels, whichever
-    is harder to reach), "no limit" (no RRMSD is requested), or "not predicted".
+    kind: "etendue" (with any lens, much of the light cannot fit into the target), "blurred" (with any lens, the blur by
+    the source exceeds the allowed RRMSD), "within", "open" or "beyond" (the interval of nine of ten designs is below,
+    around or above the requested RRMSD, on pixels or half pixels, whichever is harder to reach), "no limit" (no RRMSD
+    is requested), or "not predicted".
     """
     requested = scene.accept.rrmsd
     allowed = DEFAULT_RRMSD_LIMIT if requested is None else requested
@@ -79,7 +83,12 @@ def verdict(scene: Scene, entries: Mapping[str, Any]) -> dict[str, str] | None:
     blurred, width, target = max(images, key=lambda image: image[0], default=(0.0, 0.0, scene.target))
     target_width = max(high - low for low, high in (target.x, target.y))
     prediction: Any = entries.get("not_predicted")
-    if REMAINING_BLUR * blurred > allowed:
+    fits = min(
+        (each["etendue"] for each in entries["goals"] if each.get("etendue")), key=lambda e: e["fits"], default=None
+    )
+    if fits is not None and fits["fits"] < FORBIDDEN:
+        kind = "etendue"
+    elif REMAINING_BLUR * blurred > allowed:
         kind = "blurred"
     elif "predicted" not in entries:
         return None
@@ -100,19 +109,23 @@ def verdict(scene: Scene, entries: Mapping[str, Any]) -> dict[str, str] | None:
             kind = "within" if high <= requested else "beyond" if low > requested else "open"
     image: dict[str, Any] = {"rrmsd": blurred, "least": REMAINING_BLUR * blurred, "width": width}
     image |= {"target": target_width, "unit": target.unit, "optic": scene.optic}
-    [sentence] = paragraphs("plan.txt.j2", "verdict", kind=kind, image=image, asked=requested, likely=prediction)
+    [sentence] = paragraphs(
+        "plan.txt.j2", "verdict", kind=kind, image=image, fits=fits, asked=requested, likely=prediction
+    )
     return {"kind": kind, "sentence": sentence}
 
 
 def _goal_effects(scene: Scene, lens: Lens, key: str) -> dict[str, Any]:
-    """Return the entries key, left_out, blur and unreachable of `plan` for one target; lens: a coarse lens for it."""
+    """Return the entries of `plan` for one target; lens: a coarse lens for it."""
     goal = replace(scene.goals[0], key=key)
     goal = goal.restricted(reachable_part(scene, goal)[0])
     part, target = goal.reachable, goal.picture
     whole, deflection = goal.whole, lens.passes.largest_deflection(scene.index)
     beyond = None if part is None or whole is None else unreached(whole, part, deflection)
     estimates, image = left_out(scene, lens, target), blur(scene.channels(), lens, scene.target.screen, target)
+    fits = etendue(scene.light, lens, goal)
     rounded = {"blur": image and round_numbers(asdict(image), 3), "unreachable": beyond and round_numbers(beyond, 3)}
+    rounded["etendue"] = fits and round_numbers(asdict(fits), 3)
     return {"key": key, "left_out": [asdict(estimate) for estimate in estimates], **rounded}
 
 

@@ -38,7 +38,9 @@ MAX_AIMS = 64  # largest number of pixels along the longer side of the picture f
 class Reach(NamedTuple):
     """Reach of the light of a lens."""
 
-    part: np.ndarray | None  # True for each pixel that some light reaches, (rows, columns); None: all of the lit picture
+    part: (
+        np.ndarray | None
+    )  # True for each pixel that some light reaches, (rows, columns); None: all of the lit picture
     astray: float  # fraction of the light on the face that reaches no lit point of the picture
     beyond: float  # smallest angle (rad) from the centre of a dome to such light, to the axis; π / 2: there is none
 
@@ -93,9 +95,7 @@ def reach_from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver,
     return reach_margin(rays, t[:, None].expand(-1, *position.shape[1:]), plane, law=law, grazing=grazing)
 
 
-def reach_in_order(
-    grid: FaceGrid, aims: Points, lit: np.ndarray, plane: Receiver, law: Law, grazing: float
-) -> Tensor:
+def reach_in_order(grid: FaceGrid, aims: Points, lit: np.ndarray, plane: Receiver, law: Law, grazing: float) -> Tensor:
     """Return the margin (…) of each aim from the point of the face with the same relative position in its lit window.
 
     A target close to the lens is reached from the part of the face in front of it, which may lie between the points of
@@ -103,7 +103,8 @@ def reach_in_order(
     """
     sizes = grid.window.width, grid.window.height
     places = [
-        np.clip((p - p[lit].min()) / np.ptp(p[lit]) - 0.5, -0.5, 0.5) * size for p, size in zip(aims, sizes, strict=True)
+        np.clip((p - p[lit].min()) / np.ptp(p[lit]) - 0.5, -0.5, 0.5) * size
+        for p, size in zip(aims, sizes, strict=True)
     ]
     b = places[0], places[1]
     margin = reach_margin(slope_map.rays_at(grid, b), torch.from_numpy(np.stack(aims)), plane, law=law, grazing=grazing)

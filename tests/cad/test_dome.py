@@ -150,6 +150,17 @@ def test_the_chordal_error_of_a_sphere_is_its_sagitta():
         assert mesh.vertex_error(replace(made, vertices=moved), lens) == pytest.approx(0.1, abs=2e-3)
 
 
+def test_an_upright_facet_of_a_steep_dome_is_no_wall():
+    """Rounded corners may lie exactly above one another: such a facet is measured from the dome, not from its rim."""
+    lens, height = dome(wave=0.0, m=65), R * math.cos(math.radians(80.0))
+    r, turn = R * math.sin(math.radians(80.0)), 0.004
+    vertices = np.array(
+        [[r, 0.0, height - 0.05], [r * math.cos(turn), r * math.sin(turn), height], [r, 0.0, height + 0.05]]
+    )
+    found = dome_mesh.chordal_error(vertices, np.array([[0, 1, 2]]), domes.on_base(lens), math.inf)
+    assert found < 0.02
+
+
 def test_a_flange_adds_its_volume_alone():
     lens, high = dome(), 0.3
     on_base = domes.on_base(lens)

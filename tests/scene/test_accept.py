@@ -23,6 +23,10 @@ def disk():
 
 
 POINT = {"at": [0.0, 0.0], "least": 0.5}
+WINDOW = {
+    "kind": "window", "z": 60.0, "thickness": 3.0, "material": "N-BK7",
+    "outline": {"shape": "circle", "diameter": 200.0},
+}  # fmt: skip
 WRONG = {
     "flux unknown": ({"accept.point": [POINT | {"unit": "lx"}]}, r"point\[0\]\.unit: lx needs the flux .*lumens"),
     "candela on a plane": ({"accept.point": [POINT | {"unit": "cd"}]}, r'unit: .* not measured in cd; .* "lx"'),
@@ -39,7 +43,7 @@ WRONG = {
         {"target": ANGLES | {"pixels": 40}, "accept.cut_off": {"at": 2.5, "least": 0.1}}, "step: a step of 0.1 degrees"
     ),
     "line beside": ({"accept.cut_off": {"at": -300.0, "least": 0.1}}, "cut_off.at: -300 is outside of the target"),
-    "glare on a wall": ({"accept.glare": [1.0, 1.0, 1.0]}, "accept.glare: .* over directions"),
+    "glare behind a window": ({"accept.glare": [1.0, 1.0, 1.0], "behind": [WINDOW]}, "accept.glare: .*behind"),
     "control characters": ({"accept.point": [POINT | {"name": "a\x1b[2J"}]}, "name: must be one line"),
 }  # fmt: skip
 

@@ -192,7 +192,18 @@ class TestCommand:
         assert cli.run([*few, "--json"]) == 0
         out, err = capsys.readouterr()
         found = json.loads(out)
-        keys = {"predicted", "not_predicted", "finer", "notes", "simulated", "left_out", "blur", "unreachable", "files"}
+        keys = {
+            "predicted",
+            "not_predicted",
+            "finer",
+            "notes",
+            "simulated",
+            "left_out",
+            "blur",
+            "unreachable",
+            "etendue",
+            "files",
+        }
         keys |= {"verdict", "goals"}
         assert set(found) == keys and err == ""
         assert found["blur"] is None and found["unreachable"] is None  # a beam of no size, all within reach
