@@ -96,11 +96,12 @@ def largest_radiance(source: Emitter, lens: Lens) -> float | None:
     rays = [each.rays_through(x, y, z, 1.0) for each in elements]
     flux = sum((each.irradiance(x, y, z) for each in elements), torch.zeros_like(x)) / len(elements)
     flux = torch.where(is_transmitted(centre.rays_through(x, y, z, 1.0), lens), flux, torch.zeros_like(flux))
-    (u_x, u_y), (v_x, v_y) = (
-        sum(sign[axis] * each.direction[:2] for sign, each in zip(signs, rays, strict=True)) / (4 * share * half)
-        for axis, half in ((0, a), (1, b))
+    along_x, along_y = (
+        torch.stack([sign[axis] * each.direction[:2] for sign, each in zip(signs, rays, strict=True)]).mean(0) / half
+        for axis, half in ((0, share * a), (1, share * b))
     )
-    solid = lens.passes.index_before**2 * extent.area * (u_x * v_y - u_y * v_x).abs()
+    turned = along_x[0] * along_y[1] - along_x[1] * along_y[0]
+    solid = lens.passes.index_before**2 * extent.area * turned.abs()
     whole = float(total(flux)) * area.area / ENTRANCE_POINTS**2
     return float((flux[flux > 0] / solid[flux > 0]).max()) / whole if whole > 0 else None
 
@@ -123,7 +124,8 @@ def pixel_etendue(lens: Lens, goal: Goal) -> np.ndarray:
 def _seen(lens: Lens, plane: Receiver, aim: Tensor) -> np.ndarray:
     """Return g of aims (2, n) per area (mm²) or solid angle (sr) of the receiver, unfolded to `plane`."""
     outline, sum_of_all = lens.plan, np.zeros(aim.shape[1])
-    x, y = (p.reshape(-1) for p in sampling.grid(Rectangle(*(2 * half for half in outline.half_extent)), FACE_POINTS))
+    half_x, half_y = outline.half_extent
+    x, y = (p.reshape(-1) for p in sampling.grid(Rectangle(2 * half_x, 2 * half_y), FACE_POINTS))
     places, seen = torch.stack([x, y])[:, outline.contains(x, y)].T, Silhouette.of(lens)
     places = places[:1] if plane.unit == "degrees" else places  # a direction is the same from everywhere
     for p in places:

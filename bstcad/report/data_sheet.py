@@ -22,7 +22,19 @@ from bstcad.report.drawing import GREY, styled
 from bstcad.report.exports import across
 from bstcad.report.goal_figures import GoalFigures, Photometry
 from bstcad.report.light_figures import View, brightest, srgb_grey
-from bstcad.report.part_views import NOTES, THICK, THIN, Paper, kinds_of_holes, wall_words, wrapped
+from bstcad.report.part_views import (
+    LINE_PITCH,
+    NOTES,
+    PRINTED,
+    SMALLER,
+    THICK,
+    THIN,
+    Paper,
+    broken,
+    fitted,
+    kinds_of_holes,
+    wall_words,
+)
 from bstcad.report.prescription import PART, Order, prescription
 from bstcad.report.units import Rows, mm, rounded_up, tables
 from bstcad.scene.mount import Mount, as_cut
@@ -36,6 +48,7 @@ WIDTH, HEIGHT = 297.0, 210.0  # size of the page, A4 (mm)
 FRAME = (20.0, 10.0, 287.0, 200.0)  # left, lower, right and upper edge of the frame (mm, ISO 5457)
 TABLE_TOP, TITLE_LEFT, LIGHT_LEFT = 60.5, 205.0, 226.0  # y of the tables' top; x where title block and light begin (mm)
 ROW_HEIGHT, TABLE_FONT, HEADING_FONT = 3.57, 2.3, 2.6  # height of a table row, font sizes of rows and headings (mm)
+PITCH, MOST_LINES = 3.4, 6  # distance of lines beside the drawing (mm); most lines of a text of the title block
 PICTURE_PIXELS = 256  # largest number of pixels along the longer side of a picture of the light
 APERTURE_ROUNDING = 1e-4  # relative amount by which a printed clear aperture may be too small
 
@@ -135,16 +148,12 @@ def page(sheet: DataSheet) -> Figure:
     used = sheet.apertures["back"]
     views = part_views.Views(sheet.lens, sheet.mount or Mount(), sheet.order.origin, used=used, names=names)
     scale = part_views.draw(paper, views, left=left, low=TABLE_TOP, right=LIGHT_LEFT, high=high)
-    *columns, purpose, mount = [*sheet.tables.items(), None][:5]
-    for k, (heading, rows) in enumerate(columns):
+    tables = list(sheet.tables.items())
+    for k, (heading, rows) in enumerate(tables[:3]):
         _column(paper, left + k * (TITLE_LEFT - left) / 3, heading, rows)
     _title_block(paper, sheet, part_views.scale_words(scale))
-    start, pitch = LIGHT_LEFT + 2.4, 3.05 if mount else 3.4
-    paper.text(start, high - 5.4, purpose[0], HEADING_FONT, weight="bold")
-    y = _write_rows(paper, purpose[1], _light(paper, sheet, high - 9.4), pitch)
-    if mount:
-        paper.text(start, y - 1.9, mount[0], HEADING_FONT, weight="bold")
-        _write_rows(paper, mount[1], y - 6.4, pitch)
+    paper.text(LIGHT_LEFT + 2.4, high - 5.4, tables[3][0], HEADING_FONT, weight="bold")
+    _write_tables(paper, tables[3:], _light(paper, sheet, high - 9.4))
     return figure
 
 
@@ -163,10 +172,30 @@ def _column(paper: Paper, left: float, heading: str, rows: Rows) -> None:
         paper.line([(left, FRAME[1]), (left, TABLE_TOP)], 0.25)
     paper.text(start, y, heading, HEADING_FONT, room=end - start, weight="bold")
     paper.line([(left, y - 1.7), (right, y - 1.7)])
-    for k, (name, value) in enumerate(rows, start=1):
-        level = y - 1.7 - k * ROW_HEIGHT
-        paper.text(start, level, name, TABLE_FONT, room=23.0, color=GREY)
-        paper.text(start + 23.6, level, value, TABLE_FONT, room=end - start - 23.6)
+    rooms = 23.0, end - start - 23.6
+    lines, scale = _set(rows, rooms, TABLE_FONT, (y - 1.7 - FRAME[1] - 1.0) / ROW_HEIGHT)
+    level = y - 1.7
+    for cells in lines:
+        for text, place, colour in zip(cells, (start, start + 23.6), (GREY, "black"), strict=True):
+            for k, line in enumerate(text, start=1):
+                paper.text(place, level - k * ROW_HEIGHT * scale, line, TABLE_FONT * scale, color=colour)
+        level -= max(map(len, cells)) * ROW_HEIGHT * scale
+
+
+def _set(rows: Rows, rooms: tuple[float, float], size: float, height: float, gap: float = 0.0) -> tuple[Any, float]:
+    """Return (lines of each cell of each row, scale): rows of names and values, as large as fits.
+
+    rooms: widths (mm) of names and values.  height: room for so many lines of the full size; gap: of a row, in lines.
+    """
+    scale = 1.0
+    while True:
+        lines = [
+            tuple(broken(cell, scale * size, PRINTED * room) for cell, room in zip(row, rooms, strict=True))
+            for row in rows
+        ]
+        if scale * sum(max(map(len, cells)) + gap for cells in lines) <= height:
+            return lines, scale
+        scale *= SMALLER
 
 
 def _title_block(paper: Paper, sheet: DataSheet, scale: str) -> None:
@@ -174,8 +203,8 @@ def _title_block(paper: Paper, sheet: DataSheet, scale: str) -> None:
     scene, part, order, left, right = sheet.scene, sheet.scene.part, sheet.order, TITLE_LEFT, FRAME[2]
     room = right - left - 3.6
     paper.text(left + 1.8, TABLE_TOP - 5.6, scene.name, 4.2, room=room, weight="bold")
-    for k, line in enumerate(wrapped(scene.title or f"freeform {scene.optic}", TABLE_FONT, room, 2)):
-        paper.text(left + 1.8, TABLE_TOP - 10.2 - 3.3 * k, line, TABLE_FONT, room=room)
+    title = scene.title or f"freeform {scene.optic}"
+    _in_box(paper, left + 1.8, TABLE_TOP - 7.6, title, TABLE_FONT, room=room, height=7.6)
     cells = (
         (("Part no.", part.number), ("Drawn by", part.author), ("Organisation", part.organisation)),
         (("Date", part.date), ("Scale", scale), ("Unit", "mm"), ("Sheet", "1/1"), ("Projection", " ")),
@@ -189,7 +218,7 @@ def _title_block(paper: Paper, sheet: DataSheet, scale: str) -> None:
         for edge, (name, value) in zip(edges, row, strict=False):
             space = edges[1] - left - 2.4
             paper.text(edge + 1.2, level - 2.6, name, 1.8, room=space, color=GREY)
-            paper.text(edge + 1.2, level - 7.2, value or "\u2014", 3.0, room=space)
+            _in_box(paper, edge + 1.2, level - 3.2, value or "\u2014", 3.0, room=space, height=height - 3.8)
         level -= height
     paper.first_angle(edges[-2] + 2.6, level + height - 5.9, 3.2)
     paper.line([(left, level), (right, level)], 0.25)
@@ -202,6 +231,18 @@ def _title_block(paper: Paper, sheet: DataSheet, scale: str) -> None:
     )
     for k, note in enumerate(notes):
         paper.text(left + 1.8, level - 3.3 - 2.95 * k, note, NOTES, room=room)
+
+
+def _in_box(paper: Paper, x: float, top: float, text: str, size: float, *, room: float, height: float) -> None:
+    """Write text in a box below `top`, of width `room` and this height (mm), in as many lines as make it largest."""
+    settings = (
+        fitted(text, min(size, height / (1 + LINE_PITCH * (most - 1))), PRINTED * room, most=most)
+        for most in range(1, MOST_LINES + 1)
+    )
+    lines, size = max(settings, key=lambda each: each[1])
+    free = height - size * (1 + LINE_PITCH * (len(lines) - 1))
+    for k, line in enumerate(lines):
+        paper.text(x, top - free / 2 - size * (0.85 + LINE_PITCH * k), line, size)
 
 
 def _light(paper: Paper, sheet: DataSheet, y: float) -> float:
@@ -229,17 +270,20 @@ def _reduced(picture: np.ndarray) -> np.ndarray:
     return np.asarray(Image.fromarray(picture.astype(np.float32)).reduce(-(-max(picture.shape) // PICTURE_PIXELS)))
 
 
-def _write_rows(paper: Paper, rows: Rows, y: float, pitch: float) -> float:
-    """Write rows, lines `pitch` mm apart, beside the drawing from y down as far as there is room; return the next y."""
+def _write_tables(paper: Paper, tables: Sequence[tuple[str, Rows]], y: float) -> None:
+    """Write tables beside the drawing from y down, all but the first with their headings, as large as fits."""
     start, end = LIGHT_LEFT + 2.4, FRAME[2] - 2.4
-    for name, value in rows:
-        lines = wrapped(value, NOTES, end - start - 17.0, 3)
-        if y - pitch * len(lines) < TABLE_TOP:
-            paper.text(start, y, "More rows do not fit on this page", NOTES, color=GREY)
-            break
-        paper.text(start, y, name, NOTES, room=16.4, color=GREY)
-        for line in lines:
-            paper.text(start + 17.0, y, line, NOTES, room=end - start - 17.0)
-            y -= pitch
-        y -= 0.5
-    return y
+    rooms, rows = (16.4, end - start - 17.0), [row for _, each in tables for row in each]
+    free = y - TABLE_TOP - 1.0 - 6.4 * (len(tables) - 1)
+    lines, scale = _set(rows, rooms, NOTES, free / PITCH, gap=0.15)
+    done = 0
+    for k, (heading, each) in enumerate(tables):
+        if k:
+            paper.text(start, y - 1.9, heading, HEADING_FONT, weight="bold")
+            y -= 6.4
+        for cells in lines[done : done + len(each)]:
+            for text, place, colour in zip(cells, (start, start + 17.0), (GREY, "black"), strict=True):
+                for line, content in enumerate(text):
+                    paper.text(place, y - line * PITCH * scale, content, NOTES * scale, color=colour)
+            y -= (max(map(len, cells)) + 0.15) * PITCH * scale
+        done += len(each)

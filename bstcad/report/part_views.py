@@ -42,7 +42,9 @@ TAIL = 4.5  # length of a dimension line outside the measured length (mm)
 LETTERS, NOTES, NUMBERS = 2.5, 2.1, 1.9  # font sizes of dimensions, of leaders and notes, of numbers on contours (mm)
 CHAIN = (0, (14, 2.5, 2, 2.5))  # dashes and gaps of a centre line, in line widths
 FAMILY = STYLE["font.family"]
-MIN_FONT_SCALE = 0.8  # smallest factor on the font size of a wide text; a text that is still too wide is cut
+PRINTED = 0.96  # room that a text may fill, since programs that print it round the widths of letters
+MIN_ROOM = 6.0  # least room for the name of a face (mm)
+SMALLER, LINE_PITCH = 0.96, 1.3  # factor by which a text is made smaller until it fits; distance of lines / font size
 UNKNOWN = "\u25a1"  # box for a character that the font lacks
 CONTOUR_POINTS, SECTION_POINTS = 241, 401  # points of the map of heights per axis, and of each face of a section
 MAX_CONTOURS = 18  # largest range of heights, in steps between contour lines
@@ -89,13 +91,19 @@ class Paper:
         self.axes.fill(*np.asarray(points, dtype=float).T, **({"linewidth": 0} | style))
 
     def text(
-        self, x: float, y: float, text: str, size: float = LETTERS, *, room: float | None = None, **style: Any
-    ) -> None:
-        """Write text with an em of `size` mm; if it is wider than `room` (mm), it is scaled down, then cut."""
-        text = drawable(text)
+        self, x: float, y: float, text: str, size: float = LETTERS, *, room: float | None = None, most: int = 1,
+        **style: Any,
+    ) -> None:  # fmt: skip
+        """Write text with an em of `size` mm, the first of its lines at y.
+
+        room: largest width (mm); wider text is broken into at most `most` lines, and else smaller.  It is never cut.
+        """
+        lines = [drawable(text)]
         if room is not None:
-            text, size = fitted(text, size, room, style.get("weight") == "bold")
-        self.axes.text(x, y, text, fontsize=size / TYPE_POINT, parse_math=False, **({"va": "baseline"} | style))
+            lines, size = fitted(lines[0], size, PRINTED * room, style.get("weight") == "bold", most)
+        given = {"va": "baseline", "fontsize": size / TYPE_POINT, "parse_math": False} | style
+        for k, line in enumerate(lines):
+            self.axes.text(x, y - k * LINE_PITCH * size, line, **given)
 
     def arrow(self, tip: Point, towards: Point, color: str = "black", **style: Any) -> None:
         """Draw a filled arrow head at `tip` that points along `towards`, a unit vector."""
@@ -161,32 +169,40 @@ def _letters() -> frozenset[int]:
 
 def width_of(text: str, size: float, bold: bool = False) -> float:
     """Return the width (mm) of a line of text whose em is `size` mm."""
+    return size * _relative_width(text, bold) if text else 0.0
+
+
+@functools.lru_cache(maxsize=1 << 14)
+def _relative_width(text: str, bold: bool) -> float:
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import text_to_path
 
+    size = 10.0  # matplotlib makes a font of size 1 of each smaller one
     font = FontProperties(family=FAMILY, size=size, weight="bold" if bold else "normal")
-    return text_to_path.get_text_width_height_descent(text, font, False)[0] if text else 0.0
+    return text_to_path.get_text_width_height_descent(text, font, False)[0] / size
 
 
-def fitted(text: str, size: float, room: float, bold: bool = False) -> tuple[str, float]:
-    """Return (text, size) that fit into `room` (mm): `size` times MIN_FONT_SCALE or more, then cut at the end."""
-    size *= max(MIN_FONT_SCALE, min(1.0, room / max(width_of(text, size, bold), 1e-9)))
-    if width_of(text, size, bold) > room * (1 + 1e-9):
-        while text and width_of(f"{text}\u2026", size, bold) > room:
-            text = text[:-1]
-        text = f"{text.rstrip()}\u2026"
-    return text, size
+def fitted(text: str, size: float, room: float, bold: bool = False, most: int = 1) -> tuple[list[str], float]:
+    """Return (lines, size): the text in at most `most` lines of width `room` (mm), of `size` or smaller."""
+    while len(lines := broken(text, size, room, bold)) > most:
+        size *= SMALLER
+    return lines, size
 
 
-def wrapped(text: str, size: float, room: float, most: int) -> list[str]:
-    """Return the text in at most `most` lines of width `room` (mm), broken between words; the last may be wider."""
+def broken(text: str, size: float, room: float, bold: bool = False) -> list[str]:
+    """Return the text in lines of width `room` (mm), broken between words, or within a word that is wider than that."""
     lines = [""]
     for word in drawable(text).split():
         longer = f"{lines[-1]} {word}".strip()
-        if len(lines) == most or longer == word or width_of(longer, size) <= room:
+        if width_of(longer, size, bold) <= room * (1 + 1e-9):
             lines[-1] = longer
-        else:
-            lines.append(word)
+            continue
+        parts = [""]
+        for letter in word:
+            if parts[-1] and width_of(parts[-1] + letter, size, bold) > room * (1 + 1e-9):
+                parts.append("")
+            parts[-1] += letter
+        lines = [line for line in lines if line] + parts
     return lines
 
 
@@ -521,7 +537,7 @@ def _section(paper: Paper, views: Views, which: int, scale: float, *, left: floa
     paper.text((left + right) / 2, middle + max(half) + 12, title, ha="center", weight="bold")
     for (low, high), level, feet in _thicknesses(views, which, at, reach):
         paper.dimension((at.x + scale * low, at.x + scale * high), level, feet, mm(high - low))
-    room = scale * cut.front_ends[1] - 2
+    room = max(scale * cut.front_ends[1] - 2, MIN_ROOM)
     turned = {"rotation": 90, "rotation_mode": "anchor", "ha": "center"}
     for beside, names in zip((left - 1.6, right + 1.6 + 0.8 * LETTERS), views.names, strict=True):
         name = next((name for name in names if width_of(name, LETTERS) <= room), names[-1])
@@ -567,7 +583,7 @@ def _walls(paper: Paper, views: Views, at: PaperFrame, reach: float) -> None:
         paper.leader(tip, (tip[0] - 2.0, tip[1] + 3.5), words, -1)
     if flange is not None and (words := wall_words(flange)):
         x, _ = at((flange.z - views.origin + flange.thickness / 2, 0.0))
-        paper.leader((x, at.y - reach), (x + 1.5, at.y - reach - 5.0), words, 1)
+        paper.leader((x, at.y - reach), (x - 1.5, at.y - reach - 5.0), words, -1)
 
 
 def wall_words(walls: Mount | Flange) -> str:

@@ -1,6 +1,8 @@
 """The data sheet: true to scale, no label over another, the same bytes twice, whatever the lens and its title."""
 
 import functools
+import io
+import itertools
 import re
 import tempfile
 import zlib
@@ -19,6 +21,7 @@ from OCP.BRepGProp import BRepGProp
 from OCP.gp import gp_Pnt
 from OCP.GProp import GProp_GProps
 from OCP.TopAbs import TopAbs_State
+from pypdf import PdfReader
 
 from bstcad.analysis.light import needed_apertures
 from bstcad.analysis.shape import describe
@@ -69,12 +72,33 @@ SCENES = {
             "thickness_tolerance": 0.05,
         },
     },
+    "the longest values": {
+        "title": 199 * "w" + "W", "name": 40 * "W",
+        "lens.front": {"kind": "sphere", "z": 14.0123456, "curvature": -0.0123456789},
+        "mount": {
+            "datum": "flange", "rim": {"shape": "circle", "diameter": 14.0123}, "draft": 1.2345, "bevel": 0.1234,
+            "flange": {
+                "outline": {"shape": "rectangle", "width": 28.1234, "height": 26.1234, "corner_radius": 3.1234}, "z": 16.1,
+                "thickness": 1.5123, "draft": 2.1234, "bevel": 0.2123,
+                "screws": {"count": 4, "diameter": 2.2123, "circle": 27.123, "first": 45.123},
+                "holes": [[0.1234, 9.5123, 1.5123], [0.1234, -9.5123, 1.6123], [10.1234, 1.0123, 2.0123]],
+            },
+        },
+        "part": {
+            **{key: " ".join(30 * [f"{key[:8]}"])[:200] for key in ("number", "author", "organisation", "coating")},
+            "material": 200 * "M", "surface_profile": 0.00012345, "front_profile": 0.00054321, "roughness": 0.0123,
+            "thickness_tolerance": 0.00012345, "date": "2031-05-06", "density": 12.3456,
+        },
+        "tolerance": [
+            {"name": f"{face}.form", "limit": 1.2345e-6, "correlation_length": 3.0} for face in ("front", "back")
+        ],
+    },
     "a round flange around a bare lens": {
         "mount": {"flange": {"outline": {"shape": "circle", "diameter": 30.0}, "z": 15.5, "thickness": 6.0}},
         "part": {"density": 2.0},
     },
 }  # fmt: skip
-MOUNTED = ("a round rim", "a flange", "a round flange around a bare lens")
+MOUNTED = ("a round rim", "a flange", "the longest values", "a round flange around a bare lens")
 
 
 LIGHT = Light(np.ones((2, 2)), 0.0123, 0.0, rays=1, flux={"on target": 0.87, "off target": 0.13})
@@ -284,12 +308,27 @@ def test_the_pdf_is_one_a4_with_its_fonts_and_the_same_twice():
     assert pdf != data_sheet.draw(replace(made, order=replace(made.order, sha256="0" * 64)))
 
 
+@pytest.mark.parametrize("name", SCENES)
+def test_every_figure_of_the_tables_is_read_back_from_the_pdf_whole(name):
+    """The text of the PDF, without spaces and line breaks, contains each name and value of each table, and the part's."""
+    made = sheet(name)
+    [page] = PdfReader(io.BytesIO(data_sheet.draw(made))).pages
+    text = re.sub(r"\s", "", page.extract_text())
+    assert "\u2026" not in text
+    for rows in made.tables.values():
+        for cell in itertools.chain.from_iterable(rows):
+            assert re.sub(r"\s", "", part_views.drawable(cell)) in text, cell
+    part = made.scene.part
+    for told in (part.number, part.author, part.organisation, part.date, made.scene.name, made.scene.title):
+        assert told is None or re.sub(r"\s", "", part_views.drawable(told)) in text, told
+
+
 def test_text_is_made_to_fit_its_room():
     text = "a sentence that is too long for the room that it is given"
     for room in (3.0, 20.0, 300.0):
-        said, size = part_views.fitted(text, 2.5, room)
-        assert part_views.width_of(said, size) <= room * (1 + 1e-9) and 2.0 <= size <= 2.5
-        lines = part_views.wrapped(text, 2.5, room, 3)
-        assert len(lines) <= 3
-        assert all(part_views.width_of(line, 2.5) <= room or " " not in line for line in lines[:2])
+        for most in (1, 3):
+            lines, size = part_views.fitted(text, 2.5, room, most=most)
+            assert len(lines) <= most and 0 < size <= 2.5 and "".join(lines).replace(" ", "") == text.replace(" ", "")
+            assert all(part_views.width_of(line, size) <= room * (1 + 1e-9) for line in lines)
+        assert all(part_views.width_of(line, 2.5) <= room * (1 + 1e-9) for line in part_views.broken(text, 2.5, room))
     assert part_views.drawable("m\u00b2 \u65e5") == f"m\u00b2 {part_views.UNKNOWN}"
