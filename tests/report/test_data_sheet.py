@@ -78,7 +78,8 @@ SCENES = {
         "mount": {
             "datum": "flange", "rim": {"shape": "circle", "diameter": 14.0123}, "draft": 1.2345, "bevel": 0.1234,
             "flange": {
-                "outline": {"shape": "rectangle", "width": 28.1234, "height": 26.1234, "corner_radius": 3.1234}, "z": 16.1,
+                "outline": {"shape": "rectangle", "width": 28.1234, "height": 26.1234, "corner_radius": 3.1234},
+                "z": 16.1,
                 "thickness": 1.5123, "draft": 2.1234, "bevel": 0.2123,
                 "screws": {"count": 4, "diameter": 2.2123, "circle": 27.123, "first": 45.123},
                 "holes": [[0.1234, 9.5123, 1.5123], [0.1234, -9.5123, 1.6123], [10.1234, 1.0123, 2.0123]],
@@ -310,7 +311,7 @@ def test_the_pdf_is_one_a4_with_its_fonts_and_the_same_twice():
 
 @pytest.mark.parametrize("name", SCENES)
 def test_every_figure_of_the_tables_is_read_back_from_the_pdf_whole(name):
-    """The text of the PDF, without spaces and line breaks, contains each name and value of each table, and the part's."""
+    """The text of the PDF, without spaces and line breaks, contains each name and value of the tables."""
     made = sheet(name)
     [page] = PdfReader(io.BytesIO(data_sheet.draw(made))).pages
     text = re.sub(r"\s", "", page.extract_text())
