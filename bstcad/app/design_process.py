@@ -47,6 +47,7 @@ class State:
     rrmsd: float | None = None  # RRMSD of the design, or as predicted for a made part; None: unknown
     folder: str = ""  # name of the folder with the result; "" without one
     sentence: str = ""  # reason why the run stopped, was refused or failed
+    files: tuple[str, ...] = ()  # names of files that an export has written into the design's folder
 
     def put(self, run: Path) -> None:
         """Write the state into a run's folder."""
@@ -59,6 +60,8 @@ class ProgressFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         path.touch()
+        if path.stat().st_size:  # a continued run: a line without a stage marks the end of its pause
+            self("", 0, 0, "continued")
 
     def __call__(self, stage: str, done: int, total: int, text: str) -> None:
         """Append one line, unless the disk is full: a design goes on without it."""
@@ -174,8 +177,18 @@ def retailor(job: Mapping[str, Any], run_folder: Path, output: Path, resume: boo
     return State("finished", passed=report.contents.passed, rrmsd=report.contents.rrmsd, folder=folder.name)
 
 
+def export(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool) -> State:
+    """Write files for a shop into the design's folder.  job: kind, tool_radius (mm) or None, tiles such as "2x3"."""
+    from bstcad import commands
+
+    ProgressFile(run_folder / PROGRESS)("export", 0, 1, job["kind"])
+    cutting = {"tool_radius": job["tool_radius"]} if job["tool_radius"] else {}
+    written = commands.export(output, [job["kind"]], cutting=cutting, tiles=job["tiles"] or None)
+    return State("finished", folder=output.name, files=tuple(path.name for path in written.paths))
+
+
 # functions by kind of run
-JOBS = {work.__name__: work for work in (design, tolerance, tradeoff, measured, compensate, retailor)}
+JOBS = {work.__name__: work for work in (design, tolerance, tradeoff, measured, compensate, retailor, export)}
 STUDIES = tuple(kind for kind in JOBS if kind != design.__name__)  # kinds of runs of a finished design
 
 

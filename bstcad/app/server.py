@@ -39,7 +39,7 @@ from bstcad.app.preview_desk import STAGES, PreviewDesk, PreviewRequest
 from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
 from bstcad.report import manual, record
 from bstcad.report.light_figures import View, dark_triptych
-from bstcad.report.report import VIEWER, cell_sentences, counts, doubts
+from bstcad.report.report import VIEWER, cell_sentences, counts, doubts, first_figures
 from bstcad.runs import files
 from bstcad.runs.files import SentenceError
 from bstcad.scene import new_scene, scene_file
@@ -64,6 +64,10 @@ RRMSD = (
 KEYS_PAGE = "reference/scene-keys"  # page of the documentation that is generated from the schema
 MAX_VALID_TEXTS = 31  # largest number of scenes, besides the current one, whose latest valid text is stored
 # Files at the top of the list of a design's files.
+SHOP_FILES = {  # kinds of `bstcad export` on the page of a design, and their names
+    "raster": "tool path for a router (G-code)", "spiral": "tool path for a lathe (C, X, Z)",
+    "heightmap": "height map (picture)", "tiles": "tiles for a smaller machine (STEP)",
+}  # fmt: skip
 FIRST_FILES = ("lens.step", "part.step", "report.html", "datasheet.pdf", "lens.stl", "lens.3mf")
 CLOUD_ENDINGS = (  # (offset of the first bytes of a file of measured points, these bytes in lower case, file ending)
     (0, b"ply", ".ply"), (0, b"solid", ".stl"), (0, b"pk\x03\x04", ".x3p"), (1, b"iso-", ".sdf"), (1, b"bcr-", ".sdf"),
@@ -100,7 +104,6 @@ class Workbench:
             f"{scene}/drop": self.drop_changes,
             f"{design}/stop": self.stop,
             f"{design}/go-on": self.go_on,
-            f"{design}/edit": self.edit,
             f"{design}/measured": partial(self.measured, kind="measured"),
             f"{design}/compensate": partial(self.measured, kind="compensate"),
             "/api/scenes": _json_handler(self.add_scene),
@@ -112,6 +115,8 @@ class Workbench:
             f"{design}/tolerance": _json_handler(self.tolerance),
             f"{design}/tradeoff": _json_handler(self.tradeoff),
             f"{design}/retailor": _json_handler(self.retailor),
+            f"{design}/export": _json_handler(self.export),
+            f"{design}/edit": _json_handler(self.edit),
         }
         routes = [Route(path, answer) for path, answer in get_routes.items()]
         routes += [Route(path, answer, methods=["POST"]) for path, answer in post_routes.items()]
@@ -223,9 +228,12 @@ class Workbench:
         result = {"rrmsd": record.rrmsds(known) if known else "", "doubts": doubts(known) if known else ()}
         result |= {"report": known, "files": names, "has_light": "figures/irradiance.png" in names}
         result["counts"] = counts(known.checks) if known else ""
+        result["figures"] = first_figures(known) if known else []
+        result["copy_title"] = known.title if known else ""
         measured = [goal for goal in known.goals if goal.on_cells(0.5)] if known else []
         result["by_cell"] = [sentence for goal in measured for sentence in cell_sentences(goal)]
         jobs = {kind: self._news(Run(folder, kind)) for kind in STUDIES}
+        result["shop_files"] = SHOP_FILES
         return self._page("design.html.j2", title=name, name=name, run=self._news(run), jobs=jobs, **result)
 
     def compare_page(self, request: Request) -> Response:
@@ -468,12 +476,12 @@ class Workbench:
         self.started.append(run)
         return JSONResponse({})
 
-    def edit(self, request: Request) -> Response:
-        """Write the scene of a design as a new scene file, and answer with the name of the new scene."""
-        name = request.path_params["name"]
+    def edit(self, name: str, body: Body) -> dict[str, Any]:
+        """Write the scene of a design as a new scene, and answer with its name; body: {"title": text}, optional."""
         folder = self.workspace.design(name)
         source = folder if (folder / "scene.toml").is_file() else Run(folder).folder
-        return JSONResponse({"name": self.workspace.adopt(name, source, Run(folder).folder / SCENE_TEXT)})
+        title = None if body.get("title") is None else str(body["title"])
+        return {"name": self.workspace.adopt(name, source, Run(folder).folder / SCENE_TEXT, title=title)}
 
     def tolerance(self, name: str, body: Body) -> dict[str, Any]:
         """Start a study of tolerances; body: {"grade": name, "yield": percent}, both optional."""
@@ -490,6 +498,14 @@ class Workbench:
             raise SceneError(f"budget: {budget:g} s is not between 1 s and one day; give a time in s, such as 600")
         self.workspace.design(f"{name}-tradeoff")  # raises if the folder of the result lies outside
         return self._begin(name, "tradeoff", {"budget": budget})
+
+    def export(self, name: str, body: Body) -> dict[str, Any]:
+        """Start to write files for a shop; body: {"kind": name, "tool_radius": mm, "tiles": "2x3"}, kind required."""
+        kind, radius, tiles = (body.get(key) for key in ("kind", "tool_radius", "tiles"))
+        if kind not in SHOP_FILES:
+            raise SceneError(f"kind: {kind!r} is no file for a shop; give {', '.join(SHOP_FILES)}")
+        size = None if radius in (None, "") else _number(radius, "tool_radius")
+        return self._begin(name, "export", {"kind": kind, "tool_radius": size, "tiles": str(tiles or "")[:20]})
 
     def retailor(self, name: str, body: Body) -> dict[str, Any]:
         """Start to tailor the back anew; body: {"thickness": mm, "index": number}, one of which may be empty."""

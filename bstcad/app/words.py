@@ -23,6 +23,7 @@ from bstcad.app.kinds import (
     without_numbers,
 )
 from bstcad.scene.errors import SceneError, nearest
+from bstcad.scene.new_scene import without_unit
 from bstcad.scene.schema import Node, records
 
 BARE = re.compile(r"[A-Za-z0-9_-]+")  # name that TOML allows without quotes
@@ -42,7 +43,8 @@ def typed(key: str, words: str, data: Mapping[str, Any]) -> Any:
 
     A number has a decimal point or a decimal comma: 0.5 and 0,5.  A single point or comma is decimal: 1,000 is 1.  If
     both occur, the last is decimal and the others separate thousands, as spaces do: "1.000,5", "1,000.5" and "1 000,5".
-    If one is repeated, or the key takes integers, it separates thousands: 1.000 pixels are 1000.  A unit may follow.
+    If one is repeated, or the key takes integers, it separates thousands: 1.000 pixels are 1000.  A unit may follow;
+    lengths are converted to mm: 40 cm.
 
     Items of a list are separated by ";", else by commas with a space, else by spaces: "1,5; 2,5" and "1.5, 2.5" and
     "1,5 2,5"; if none of these occurs, by commas: "1.5,2.5", and "1,000" is the list [1, 0] if the key takes lists of
@@ -108,6 +110,10 @@ def _scalar(node: Node, words: str) -> Any:
     words = words.strip("\"' ")
     same = next((choice for choice in choices(node) if str(choice).casefold() == words.casefold()), None)
     found = BOOLEAN_WORDS.get(words.casefold()) if same is None else same
+    if found is None and node.get("unit") == "mm":
+        bare, unit = without_unit(words)
+        length = number(bare)
+        found = length if length is None or unit == 1.0 else length * unit
     found = number(words) if found is None else found
     return words if found is None else found
 

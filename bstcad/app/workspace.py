@@ -210,9 +210,10 @@ class Workspace:
             path.unlink()
             raise
 
-    def adopt(self, design: str, folder: Path, written: Path | None = None) -> str:
+    def adopt(self, design: str, folder: Path, written: Path | None = None, title: str | None = None) -> str:
         """Write a new scene file for the scene in a folder, with the files that it names; return the scene's name.
 
+        title: title of the new scene; None: that of the scene in the folder.
         written: file with the original text of the scene.  The new file has the first of these texts that describes the
         scene: `written`, the scene file with the design's name, the folder's scene.toml.
         """
@@ -223,7 +224,7 @@ class Workspace:
             name = self._free_name(design.removeprefix("my-"))
             commented = self._commented(loaded, [*filter(None, [written]), self.path(design)])
             if commented is not None:
-                files.put(self.path(name), changed(_renamed(commented, name), "name", name).encode())
+                files.put(self.path(name), _titled(changed(_renamed(commented, name), "name", name), title).encode())
                 return name
             for key, content in contents(loaded):
                 if isinstance(content, picture.Picture) and not content.name.endswith(".csv"):
@@ -231,7 +232,7 @@ class Workspace:
                 else:
                     files.put(self.scenes / (file := f"{name}-{content.name}"), content.copy)
                 text = changed(text, key if len(loaded.targets) > 1 else key.replace("target[0]", "target"), file)
-            files.put(self.path(name), changed(text, "name", name).encode())
+            files.put(self.path(name), _titled(changed(text, "name", name), title).encode())
         return name
 
     def _commented(self, scene: Scene, paths: list[Path]) -> str | None:
@@ -313,6 +314,10 @@ class Workspace:
         paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and not path.is_symlink())
         names = (path.relative_to(folder) for path in paths)
         return [name.as_posix() for name in names if not _hidden(name)]
+
+
+def _titled(text: str, title: str | None) -> str:
+    return text if title is None or not title.strip() else changed(text, "title", title.strip())
 
 
 def _renamed(text: str, name: str) -> str:

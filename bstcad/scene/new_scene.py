@@ -28,6 +28,8 @@ RANGES = {"size": (1.0, 10_000.0), "distance": (1.0, 1e7)}  # ranges of the opti
 BLUR_MARGIN = 1.1  # accept.rrmsd divided by the RRMSD of the blurred picture; standard designs stay below this limit
 MIN_RRMSD, MAX_RRMSD = 0.05, 0.25  # smallest and largest accept.rrmsd of a new scene
 
+LENGTH_UNITS = {"mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0, "µm": 1e-3, "um": 1e-3, "in": 25.4, "ft": 304.8}  # mm
+LENGTH_WITH_UNIT = re.compile(rf"(.*\d\.?)\s*({'|'.join(LENGTH_UNITS)})", re.DOTALL)
 LIKE_THE_PHOTO = re.compile(r"(?:([^xX×]+)[xX×])?photo")  # size with the photo's proportions: "photo" or "120xphoto"
 
 TEMPLATE = Path(__file__).with_name("plate.toml.j2")
@@ -89,6 +91,11 @@ class Plate:
     def before(self) -> float:
         """Distance from the lamp to the plate (mm); 0 for parallel light."""
         return self.light.ahead * self.side
+
+    @property
+    def half_angle(self) -> float:
+        """Half angle (degrees) of the lamp's light that meets the plate, up to its corners."""
+        return round(math.degrees(math.atan(math.hypot(self.width, self.height) / 2 / self.before)), 1)
 
     @property
     def magnification(self) -> float:
@@ -223,14 +230,21 @@ def in_proportions(side: float, shown: tuple[int, int]) -> str:
     return f"{width:.4g}x{height:.4g}"
 
 
+def without_unit(words: str) -> tuple[str, float]:
+    """Return (words without a unit of length at their end, length of this unit in mm); (words, 1.0) without a unit."""
+    found = LENGTH_WITH_UNIT.fullmatch(words.strip())
+    return (found[1], LENGTH_UNITS[found[2]]) if found else (words, 1.0)
+
+
 def _lengths(name: str, given: str | float, example: str, count: int) -> list[float]:
     """Return the lengths (mm) in the value `given` of the option --name: up to `count` lengths, such as "80x60"."""
+    words, unit = without_unit(str(given))
     try:
-        found = [float(length) for length in re.split("[xX×]", str(given))]
+        found = [unit * float(length) for length in re.split("[xX×]", words)]
     except ValueError:
         found = []
     if not 0 < len(found) <= count:
-        raise SceneError(f"--{name} {given}: is not a {name}; give a length in mm, such as {example}")
+        raise SceneError(f"--{name} {given}: is not a {name}; give a length in mm, such as {example}, or with its unit")
     low, high = RANGES[name]
     for length in found:
         if not low <= length <= high:

@@ -301,12 +301,14 @@ DISK = tomllib.loads(TEXTS["disk"])
 WHITE = tomllib.loads(TEXTS["white_logo"])
 TYPED = {
     "target.z": {
-        "0,5": 0.5, ",5": 0.5, "+3": 3.0, "−2,5e-3": -0.0025, "500 mm": 500.0, " ": None, "1.000,5": 1000.5,
+        "0,5": 0.5, ",5": 0.5, "+3": 3.0, "−2,5e-3": -0.0025, "500 mm": 500.0, "40 cm": 400.0,
+        "0,5 m": 500.0, "2 in": 50.8, " ": None, "1.000,5": 1000.5,
         "1,000.5": 1000.5, "1'000.5": 1000.5, "1_000": 1000.0, "1.000.000": 1e6, "1,000": 1.0, "1.000": 1.0,
     },
     "target.x": {
         "1,5; 2,5": [1.5, 2.5], "1.5, 2.5": [1.5, 2.5], "1,5 2,5": [1.5, 2.5], "1,5, 2,5": [1.5, 2.5],
         "1.5,2.5": [1.5, 2.5], "-200,200": [-200.0, 200.0], "-200, 200 mm": [-200.0, 200.0],
+        "-20 cm; 20 cm": [-200.0, 200.0],
         "-1 000; 1 000": [-1000.0, 1000.0], "[0,5; 1,5]": [0.5, 1.5],
     },
     "source.position": {"0 0 1,5": [0.0, 0.0, 1.5]},
@@ -339,6 +341,7 @@ def test_words_are_values(key):
 @pytest.mark.parametrize(("key", "words", "sentence"), [
     ("target.z", "far", "target.z: 'far' is not a number; write one, such as 1000"),
     ("target.z", "1.00,000.5", "target.z: '1.00,000.5' is not a number; write one, such as 1000"),
+    ("target.z", "40 miles", "target.z: '40 miles' is not a number; write one, such as 1000"),
     ("target.z", "1e999", "target.z: '1e999' is not a number; write one, such as 1000"),
     ("target.x", "5", "target.x: 2 values are needed instead of 1; write 2, such as -200, 200"),
     ("target.x", "1; a", "target.x: 'a' is not a number; write 2 numbers, such as -200, 200"),

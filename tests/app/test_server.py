@@ -391,6 +391,22 @@ def test_a_blank_as_built_is_a_run_with_what_was_measured(own):
     assert [path.name for path in Run(own.folder / "made", "compensate").folder.glob("cloud*")] == ["cloud.csv"]
 
 
+def test_files_for_the_shop_are_a_run_with_their_kind(own):
+    body = {"kind": "raster", "tool_radius": "1.5", "tiles": ""}
+    assert own.ask("/api/design/made/export", json.dumps(body).encode()).status == 200
+    job = json.loads((Run(own.folder / "made", "export").folder / "job.json").read_bytes())
+    assert (job["kind"], job["tool_radius"], job["tiles"]) == ("raster", 1.5, "")
+    refused = own.ask("/api/design/made/export", b'{"kind": "zemax"}')
+    assert refused.status == 400 and b"no file for a shop" in refused.body
+
+
+def test_a_copy_has_the_title_that_it_is_given(own):
+    for title in ("Another lamp", None):
+        answer = own.ask("/api/design/made/edit", json.dumps({"title": title}).encode())
+        text = (own.folder / f"{answer.json['name']}.toml").read_text(encoding="utf-8")
+        assert answer.status == 200 and ('title = "Another lamp"' in text) == (title is not None)
+
+
 def test_a_part_is_judged_by_points_kept_by_no_senders_name(own):
     kinds = {b"x,y,z\n1,2,3\n": ".csv", b"ply\nformat": ".ply", b"solid x": ".stl", bytes(90): ".stl"}
     kinds |= {

@@ -154,6 +154,8 @@ def study(page, folder):
 def compare(page):
     """8: the same scene with a nearer wall, beside the first."""
     page.click("#edit")
+    page.fill("#title", "A nearer wall")
+    page.click("text=Make the copy")
     page.wait_for_url("**/scene/my-laser-2")
     page.wait_for_selector(ALL_SEEN, timeout=PATIENCE)
     value_of(page, "target.z", "308")
@@ -166,7 +168,7 @@ def compare(page):
         page.check(f"input[name=design][value={name}]")
     page.click("text=Compare the chosen designs")
     keys = {row.inner_text() for row in page.locator("tbody th").all()}
-    assert {"name", "target.z"} <= keys
+    assert {"name", "title", "target.z"} <= keys
 
 
 @pytest.mark.bench

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import base64
 import io
+import json
+import re
 import shutil
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -13,6 +18,8 @@ from PIL import Image
 from bstcad import cli, commands
 from bstcad import folder as folders
 from bstcad.app import scene_text
+from bstcad.app.design_process import JOB, PROGRESS, State
+from bstcad.app.design_runs import Run
 from bstcad.scene.scene import load
 from tests.app.conftest import PATIENCE, SEEN, SMALL, open_scene
 
@@ -172,6 +179,41 @@ def test_the_keyboard_alone_leads_from_the_start_to_a_changed_preview(open_page,
     page.keyboard.press("ArrowRight")
     page.wait_for_selector(f"{SEEN}:not([src='{seen}'])", timeout=PATIENCE)
     assert page.evaluate("document.activeElement.dataset.key") == "target.z"  # the focus stays
+
+
+def test_enter_in_the_letters_makes_their_scene(open_page, shared):
+    page = open_page(shared.address)
+    page.press("#side", "Enter")
+    assert "drop a picture" in page.inner_text("#message")
+    page.fill("#side", "4 cm")
+    page.press("#letters", "Enter")
+    page.wait_for_url("**/scene/*")
+    text_has(page, "width = 40.0, height = 40.0")
+
+
+def test_time_left_falls_between_two_lines_and_no_pause_counts(open_page, shared, small_design):
+    """A stage of ten steps had its fourth one 6 s ago, and had paused for 1000 s before; so 9 s - 6 s are left."""
+    folder = shutil.copytree(small_design.folder, shared.folder / "timed")
+    run = Run(folder)
+    run.folder.mkdir()
+    lines = [[0, "stage 2", 0], [4, "stage 2", 2], [1004, "", 0], [1006, "stage 2", 4]]  # s, stage, steps done of ten
+    now = time.time()
+    written = "".join(json.dumps([now - 1012 + at, stage, done, 10, ""]) + "\n" for at, stage, done in lines)
+    (run.folder / PROGRESS).write_text(written, encoding="utf-8")
+    (run.folder / JOB).write_text("{}", encoding="utf-8")
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(100)", str(run.folder)])
+    try:
+        State("running", process.pid, now - 1012).put(run.folder)
+        page = open_page(shared.address)
+        page.goto(f"{shared.root}/design/timed")
+        page.wait_for_selector("#state-says:has-text('left of this stage')")
+        said = page.inner_text("#state-says")
+        assert 1 <= float(re.search(r"(\d+) s left", said)[1]) <= 4, said
+        assert page.inner_text("#stages tr td.n") == "6.0 s"
+    finally:
+        process.kill()
+        process.wait()
+    shutil.rmtree(run.folder)
 
 
 def test_a_design_goes_on_without_its_page(open_page, shared, tmp_path):

@@ -5,7 +5,7 @@ const { name, run, jobs, finished } = embedded(), at = `/api/design/${encodeURIC
 const INTERVAL = 700; // milliseconds between two requests
 const stages = new Map(), curve = [];
 const source = { size: 0, last: 0 }; // latest size of the source (percent) and RRMSD
-let next = 0, began = null, light = "";
+let next = 0, began = null, light = "", latest = null; // latest: time of the last line
 
 // Names of the stages, as in the tutorial.
 const STAGES = {
@@ -16,11 +16,21 @@ const STAGES = {
 const named = (stage) => STAGES[stage] ?? stage;
 const left = (seconds) => (seconds < 90 ? `${Math.ceil(seconds)} s left` : `${Math.ceil(seconds / 60)} min left`);
 
+// Seconds left of a stage by its pace up to its last line, less the time since then.
+const rest = ({ done, total, first, last }, now) => (done && total > done ? Math.max(((last - first) * (total - done)) / done - (now - last), 1) : 0);
+
 const WORDS = { running: "Designing", stopped: "Stopped", refused: "Refused", failed: "Failed", finished: "Finished", none: "" };
 
 function take(news) {
   for (const [when, stage, done, total, text] of news.lines) {
     if (began === null) began = when;
+    if (!stage) { // the run was continued: the time since its last line was a pause
+      const paused = latest === null ? 0 : when - latest;
+      began += paused;
+      for (const each of stages.values()) if (each.done < each.total) each.first += paused;
+      continue;
+    }
+    latest = when;
     stages.set(stage, { done, total, text, first: stages.get(stage)?.first ?? when, last: when });
     const value = /RRMSD ([0-9.]+)/.exec(text);
     if (!value || !stage.startsWith("stage")) continue;
@@ -51,7 +61,8 @@ function take(news) {
   const running = news.state === "running";
   element("stop").hidden = element("pause").hidden = !running;
   element("go-on").hidden = !news.resumable;
-  const seconds = running && news.began ? `, ${Math.max(0, news.now - news.began).toFixed(0)} s` : "";
+  const last = [...stages.values()].at(-1), remaining = running && last ? rest(last, news.now) : 0;
+  const seconds = running && news.began ? `, ${Math.max(0, news.now - news.began).toFixed(0)} s${remaining ? `, ${left(remaining)} of this stage` : ""}` : "";
   const sentence = [WORDS[news.state] + (news.state === "running" ? seconds : ""), news.sentence].filter(Boolean).join(": ");
   if (element("state-says").textContent !== sentence) element("state-says").textContent = sentence;
 }
@@ -78,8 +89,13 @@ const order = (id, address) => element(id).addEventListener("click", () => ask(a
 order("stop", `${at}/stop`);
 order("pause", `${at}/stop?at_once`);
 order("go-on", `${at}/go-on`);
-element("edit").addEventListener("click", async () => {
-  const { name: scene } = await ask(`${at}/edit`, {});
+element("edit").addEventListener("click", () => {
+  element("copy").hidden = !element("copy").hidden;
+  element("title").select();
+});
+element("copy").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const { name: scene } = await ask(`${at}/edit`, { title: element("title").value });
   location.href = `/scene/${scene}`;
 });
 if (run.state !== "none" && !(run.state === "finished" && finished)) follow();
@@ -91,6 +107,7 @@ const RESULTS = {
   tradeoff: (state) => [[`/design/${state.folder}/files/tradeoff.html`, "time against accuracy"], [`/design/${state.folder}/files/tradeoff.csv`, "tradeoff.csv"]],
   measured: () => [[`/design/${name}/files/measured/cloud/report.html`, "the part's report"]],
   compensate: (state) => [[`/design/${name}/files/production.html`, "the page to sign"], [`/design/${name}/files/compensated/${state.folder}/lens.step?download`, "lens.step to cut next"]],
+  export: (state) => state.files.map((file) => [`/design/${name}/files/${file}?download`, file]),
   retailor: (state) => [[`/design/${state.folder}`, "the new design"]],
 };
 
@@ -99,12 +116,12 @@ function show(form, state) {
   const running = state.state === "running", bar = form.querySelector("progress");
   form.began ??= new Map();
   for (const [when, stage] of state.lines) if (!form.began.has(stage)) form.began.set(stage, when);
-  const last = state.lines.at(-1), [, stage, done, total, words] = last ?? [];
+  const last = state.lines.at(-1), [when, stage, done, total, words] = last ?? [];
   bar.hidden = form.querySelector(".stop").hidden = !running;
   if (total) Object.assign(bar, { max: total, value: Math.min(done, total) });
   else bar.removeAttribute("value");
-  const rest = total && done ? ((state.now - form.began.get(stage)) * (total - done)) / done : 0;
-  const text = last ? [`${named(stage)}:`, words, total ? `${done} of ${total},` : "", rest ? left(rest) : ""].filter(Boolean).join(" ").replace(/,$/, "") : "";
+  const remaining = last ? rest({ done, total, first: form.began.get(stage), last: when }, state.now) : 0;
+  const text = last ? [`${named(stage)}:`, words, total ? `${done} of ${total},` : "", remaining ? left(remaining) : ""].filter(Boolean).join(" ").replace(/,$/, "") : "";
   if (running) place.textContent = `Running … ${text}`;
   else if (state.state === "finished") {
     place.replaceChildren("Finished: ", ...RESULTS[kind](state).flatMap(([address, words], k) => {
@@ -139,7 +156,7 @@ for (const form of document.querySelectorAll("form.job")) {
     try {
       if (cloud && !cloud.size) throw new Error("Choose the file of measured points first.");
       const number = (key) => (fields.get(key) ?? "").trim().replace(",", ".");
-      await ask(`${at}/${kind}`, cloud || { grade: fields.get("grade"), yield: number("yield"), budget: number("budget"), thickness: number("thickness"), index: number("index") });
+      await ask(`${at}/${kind}`, cloud || { grade: fields.get("grade"), yield: number("yield"), budget: number("budget"), thickness: number("thickness"), index: number("index"), kind: fields.get("kind"), tool_radius: number("tool_radius"), tiles: fields.get("tiles") });
       form.next = 0;
       form.began = new Map();
       followJob(form);

@@ -42,6 +42,15 @@ for (const kind of ["dragenter", "dragover"]) {
 for (const kind of ["dragleave", "drop"]) drop.addEventListener(kind, () => drop.classList.remove("over"));
 drop.addEventListener("drop", (event) => { event.preventDefault(); take(event.dataTransfer.files[0]); });
 form.addEventListener("submit", (event) => event.preventDefault());
+// Enter in the letters makes their scene, and in the size that of the chosen picture.
+form.addEventListener("keydown", (event) => {
+  if (event.key !== "Enter" || event.isComposing) return;
+  if (event.target === element("letters")) form.querySelector("[data-letters]").click();
+  else if (event.target === element("side") && file.files.length) take(file.files[0]);
+  else if (event.target === element("side")) message.textContent = "Now drop a picture, or choose a sample or letters.";
+  else return;
+  event.preventDefault();
+});
 form.addEventListener("click", (event) => {
   const { sample, letters } = event.target.dataset;
   if (sample) begin({ ...use(), size: size(false), sample }, "Making the scene …");
