@@ -126,7 +126,8 @@ def generate(
             keeper.say("there is a checkpoint; the design starts from the beginning, since --resume is not given")
         with _checkpoint_on_error(keeper, refused=(SceneError,)), signals.stop_on_interrupt() as wished:
             hooks = replace(hooks, save=keeper, interrupted=wished)
-            found = design(scene, device=device, hooks=hooks, began=began, start=state)
+            with processes.kept_awake():
+                found = design(scene, device=device, hooks=hooks, began=began, start=state)
         with _checkpoint_on_error(keeper):
             options = replace(options, limit=scene.tailoring.max_time)
             report = write(found, output_folder(folder, found.making.stopped or ""), options, hooks.progress)

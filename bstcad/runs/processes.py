@@ -157,6 +157,27 @@ def begin() -> None:
         submit(load, *PRELOADED)
 
 
+@contextlib.contextmanager
+def kept_awake() -> Iterator[None]:
+    """Keep the second process, if it runs, from ending for lack of work during a block of long work of this one."""
+    ended = threading.Event()
+
+    def keep() -> None:
+        while not ended.wait(IDLE_TIMEOUT / 3):
+            process = _process
+            if process is not None:
+                with contextlib.suppress(BrokenExecutor, RuntimeError):  # it has just ended
+                    process.submit(os.getpid)
+
+    thread = threading.Thread(target=keep, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
 def load(*modules: str) -> None:
     """Import modules and ignore all errors; an import error is raised again at the first use of the module."""
     gc.disable()

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import BrokenExecutor
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,16 @@ def test_another_process_always_the_same_does_one_work_after_the_other(fresh, tm
     slow = processes.submit(time.sleep, 0.3)
     quick = processes.submit(os.path.exists, str(tmp_path))
     assert quick.result() and slow.done()
+
+
+@pytest.mark.parametrize("awake", [False, True])
+def test_the_second_process_lives_as_long_as_a_long_work_of_this_one(fresh, monkeypatch, awake):
+    """Without work it ends, and loads its libraries again for the next one."""
+    monkeypatch.setattr(processes, "IDLE_TIMEOUT", 0.6)
+    before = processes.submit(os.getpid).result()
+    with processes.kept_awake() if awake else nullcontext():
+        time.sleep(3.0)
+    assert (processes.submit(os.getpid).result() == before) == awake
 
 
 def test_a_work_that_takes_too_long_is_ended_and_the_next_one_done(fresh):
