@@ -7,6 +7,7 @@ address that the terminal prints or in the cookie that this address sets.  The s
 
 from __future__ import annotations
 
+import contextlib
 import re
 import secrets
 from collections.abc import Awaitable, Callable, MutableMapping
@@ -79,11 +80,10 @@ class Guard:
             await _refusal("size", 413)(scope, receive, send)
             return
         body = _Body(receive, send, limit)
-        try:
+        with contextlib.suppress(TooLarge):
             await self._app(scope, body.receive, body.send)
-        except TooLarge:
-            if not body.answered:
-                await _refusal("size", 413)(scope, receive, send)
+        if body.is_too_large and not body.answered:
+            await _refusal("size", 413)(scope, receive, send)
 
     def _refusal(self, scope: Scope) -> Response | None:
         """Return the refusal of a request, or the redirect of an address with a token; None: it is accepted."""
@@ -130,6 +130,11 @@ class _Body:
     def __init__(self, receive: Receive, send: Send, limit: int) -> None:
         self._receive, self._send, self._left = receive, send, limit
         self.answered = False
+
+    @property
+    def is_too_large(self) -> bool:
+        """True if the limit is exceeded."""
+        return self._left < 0
 
     async def receive(self) -> MutableMapping[str, Any]:
         """Return the next part of the body.  TooLarge if the limit is exceeded."""

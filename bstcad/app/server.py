@@ -33,7 +33,7 @@ from bstcad.app.connections import bound, uvicorn_server
 from bstcad.app.design_process import STUDIES
 from bstcad.app.design_runs import SCENE_TEXT, Run
 from bstcad.app.followers import impossible_choices, take_change
-from bstcad.app.guard import POLICY, SANDBOX, Guard
+from bstcad.app.guard import POLICY, SANDBOX, Guard, TooLarge
 from bstcad.app.preview import Preview
 from bstcad.app.preview_desk import STAGES, PreviewDesk, PreviewRequest
 from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
@@ -121,6 +121,7 @@ class Workbench:
         routes = [Route(path, answer) for path, answer in get_routes.items()]
         routes += [Route(path, answer, methods=["POST"]) for path, answer in post_routes.items()]
         handlers = {SentenceError: self._refuse, OSError: self._refuse_file, ClientDisconnect: self._note_disconnect}
+        handlers |= {TooLarge: lambda request, error: Response(status_code=413)}  # the guard says so in its own words
         handlers |= {Exception: self._report_fault, 404: self._no_page}
         self.app = Starlette(routes=routes, exception_handlers=handlers)
         self.app.mount("/static", StaticFiles(directory=STATIC))
