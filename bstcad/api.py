@@ -50,6 +50,7 @@ from bstcad.transport.mapping import TransportMap
 
 if TYPE_CHECKING:
     from bstcad.tolerance.as_made import AsMade
+    from bstcad.tolerance.lit_by import LitBy
 
 RELATIVE_TOLERANCE = 1e-9  # largest ignored difference of indices (relative) and of the ends of nets (in net widths)
 PREVIEW_TUBES = 521  # flux tubes per side of the light, for the picture of a design that is not verified yet
@@ -349,6 +350,16 @@ class Design:
 
         made = self._made
         return as_made(made.scene, made.lens, made.goals, grade=grade, layer_height=layer_height)
+
+    def lit_by(self, light: str, *, distance: float | None = None) -> LitBy:
+        """Predict the pictures of the lens in another light: "sun", "lamp", "led" or "phone" (the flashlight of one).
+
+        distance: from the light to the lens (mm); None: five widths of the lens for a lamp, one for an LED, 500 mm for
+        a phone.  The result has `goals` with the pictures `designed` and `lit`, and their `rrmsds`.
+        """
+        from bstcad.tolerance.lit_by import lit_by  # loaded late, as in commands.tolerance
+
+        return lit_by(self._made.scene, self._made.lens, self._made.goals, name=light, distance=distance)
 
     def show(self, png: AnyPath | None = None) -> None:
         """Draw the lens with rays and screen in the file `png` or, if None, in a window; return once it is closed."""

@@ -53,6 +53,9 @@ with signals.exit_on_signal():  # loading these libraries takes a quarter of a s
         Layer,
         Light,
         Listed,
+        LitAt,
+        LitByLight,
+        LitPng,
         MadeGrade,
         MadePng,
         Measured,
@@ -268,11 +271,14 @@ def generate(
 @app.command(epilog=examples("plan templates/thu.toml", "plan my-lens.toml --made resin-printed --made-png made.png"))
 def plan(
     scene: SceneFile, settings: Settings = None, as_json: AsJson = False, png: ReachPng = None, made: MadeGrade = None,
-    layer: Layer = None, made_png: MadePng = None,
+    layer: Layer = None, made_png: MadePng = None, lit_by: LitByLight = None, lit_at: LitAt = None,
+    lit_png: LitPng = None,
 ) -> int:  # fmt: skip
     """Predict time, error and memory of a design; list neglected effects and unreachable parts of the target."""
     if made is None and (layer is not None or made_png is not None):
         raise SceneError("--layer and --made-png need --made GRADE; add it, for example --made resin-printed")
+    if lit_by is None and (lit_at is not None or lit_png is not None):
+        raise SceneError("--lit-at and --lit-png need --lit-by LIGHT; add it, for example --lit-by phone")
     with loading():
         wanted = load_scene(scene, settings)
         from bstcad import commands
@@ -297,17 +303,21 @@ def plan(
     for k, picture in enumerate(drawn):
         files.put(png.with_stem(numbered(png.stem, k)), picture)
     part = None if made is None else commands.predict_as_made(wanted, made, layer, made_png)
+    lit = None if lit_by is None else commands.predict_lit_by(wanted, lit_by, lit_at, lit_png)
     if as_json:
         net = {"control_points": choice.facts()} if choice else {}
         sizes = {"files": {"lens.step": round(folders.step_size(wanted))}}
-        likely, as_made = next(parts), {} if part is None else {"made": part.facts()}
-        print(json.dumps({"verdict": None} | effects | likely | as_made | net | sizes, ensure_ascii=False, indent=2))
+        other = ({} if part is None else {"made": part.facts()}) | ({} if lit is None else {"lit": lit.facts()})
+        found = {"verdict": None} | effects | next(parts) | other | net | sizes
+        print(json.dumps(found, ensure_ascii=False, indent=2))
         return 0
     console = Console()
     console.print(reports.plan_effects(effects, wanted.title or wanted.name, wanted.optic))
     print("predicting time, RRMSD and memory …", file=sys.stderr, flush=True)
     console.print(reports.plan_predictions(next(parts)))
     for sentence in () if part is None else reports.made_sentences(part.facts(), wanted.optic):
+        console.print(sentence, end="\n\n", markup=False, highlight=False)
+    for sentence in () if lit is None else reports.lit_sentences(lit.facts(), wanted.optic):
         console.print(sentence, end="\n\n", markup=False, highlight=False)
     console.print(f"Files: {folders.size_sentence(wanted)}.")
     return 0

@@ -130,6 +130,13 @@ Layer = option(float | None, "MM", "Height of the layers of a print (default: th
 MadePng = path_option(
     "FILE", "PNG of the target and of its light as designed and as made (target[1]: FILE_2).", "--made-png"
 )
+LitByLight = option(
+    str | None, "LIGHT", "Predict the picture of the lens in another light: sun, lamp, led or phone.", "--lit-by"
+)
+LitAt = option(
+    float | None, "MM", "Distance of this light from the lens (default: that of the light).", min=1e-3, max=1e9
+)
+LitPng = path_option("FILE", "PNG of the target and of its light as designed and in this light.", "--lit-png")
 Budget = option(
     float,
     "S",

@@ -45,7 +45,7 @@ from bstcad.report.exports import Exported
 from bstcad.report.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, draw_wavefront, light_path_of
 from bstcad.report.goal_figures import GoalFigures, figures_of, photometry
 from bstcad.report.grid_sag import GridLight
-from bstcad.report.light_figures import View, draw_judges, draw_part, picture_as_made
+from bstcad.report.light_figures import View, changed_picture, draw_judges, draw_part
 from bstcad.report.photometric_figures import draw_isolux, far_field_of
 from bstcad.report.prescription import SHEET, Order
 from bstcad.report.record import Contents, Examined, LeftOut, Report, StageRecord, contents_of, with_part
@@ -74,6 +74,7 @@ from bstcad.verify.verdict import Check, verdict
 
 if TYPE_CHECKING:
     from bstcad.tolerance.as_made import AsMade
+    from bstcad.tolerance.lit_by import LitBy
     from bstcad.tolerance.study import StudySettings
 
 TILE_FILES = "tile-*-*.step"  # pattern of the names of tiles
@@ -518,12 +519,31 @@ def predict_as_made(
 
     found = preview(scene, REFINED)
     made = found.as_made(grade, layer_height)
-    if png is None:
-        return made
-    for k, goal in enumerate(made.goals):
-        figure = picture_as_made(goal.target, goal.designed, goal.made, View.of(found.scene, k))
-        files.put(png.with_stem(numbered(png.stem, k)), rendered(figure))
+    if png is not None:
+        _draw_changed(png, found.scene, [(goal.target, goal.designed, goal.made) for goal in made.goals], "As made")
     return made
+
+
+def predict_lit_by(scene: Scene, light: str, distance: float | None = None, png: Path | None = None) -> LitBy:
+    """Predict the pictures of a scene's lens in another light (tolerance.lit_by), from a reduced design.
+
+    distance: from the light to the lens (mm); None: that of the light.  png: as for `predict_as_made`.
+    """
+    from bstcad.app.preview import REFINED, preview  # loaded late, as in predict_as_made
+    from bstcad.tolerance.lit_by import scene_lit_by
+
+    scene_lit_by(scene, light, distance)  # an unknown light is refused before the preview
+    found = preview(scene, REFINED)
+    lit = found.lit_by(light, distance)
+    if png is not None:
+        _draw_changed(png, found.scene, [(goal.target, goal.designed, goal.lit) for goal in lit.goals], "In this light")
+    return lit
+
+
+def _draw_changed(png: Path, scene: Scene, pictures: Iterable[tuple[Any, Any, Any]], changed: str) -> None:
+    for k, (target, designed, other) in enumerate(pictures):
+        figure = changed_picture(target, designed, other, view=View.of(scene, k), changed=changed)
+        files.put(png.with_stem(numbered(png.stem, k)), rendered(figure))
 
 
 def export(

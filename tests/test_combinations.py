@@ -710,7 +710,7 @@ BODIES = {  # choices of a scene, by the body that it has
 
 @pytest.mark.parametrize("body", BODIES)
 def test_a_design_remains_the_design_of_its_folder(body, tmp_path):
-    """What a design can do works after it was written, opened, and written again: its net is equal to the last bit."""
+    """Methods of a design work after it was written, opened, and written again: its net is equal to the last bit."""
     folder = tmp_path / "design"
     design = bstcad.design(scene_of(PLAIN | BODIES[body]), progress=False)
     report = design.write(folder, progress=False)
@@ -727,7 +727,7 @@ def test_a_design_remains_the_design_of_its_folder(body, tmp_path):
 
 
 REACHING = covering(to_cover(2, ("light", "rim", "wall", "back", "front", "medium", "elements")))
-INDICES = (1.05, 1.3, 1.49, 2.0)  # of the encapsulant, from almost air to more than the lens
+INDICES = (1.05, 1.3, 1.49, 2.0)  # indices of the encapsulant, from almost air to more than the lens
 
 
 def widened(scene, wall):
@@ -791,7 +791,7 @@ def landed_by_snell(lens, source, receiver, grazing):
 
 @pytest.mark.parametrize("number", range(len(REACHING)))
 def test_what_a_face_can_light_is_not_called_dark(number):
-    """By Snell's law at each point of the face and every slope, against the closed form of `reachable_part`.
+    """Rays by Snell's law from each point of the face, for every slope, agree with the closed form of `reachable_part`.
 
     The light of the whole source counts, and not that of its centre alone.  A pixel at the edge of the reach may count
     as dark, since only a part of it can be lit.

@@ -32,6 +32,7 @@ from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Hooks, Progress
 from bstcad.tailoring.source_image import ExtendedSource
 from bstcad.tolerance.as_made import AsMade, as_made
+from bstcad.tolerance.lit_by import LitBy, lit_by
 
 COARSE_NET = 33  # control points per side in the first rounds of stage 1
 TRANSPORT_CELLS = 48  # cells per side of the transport map
@@ -86,9 +87,16 @@ class Preview:
 
     def as_made(self, grade: str | None = None, layer_height: float | None = None) -> AsMade:
         """Return the pictures of the lens as made by a grade (None: that of the scene); see tolerance.as_made."""
-        pairs = zip(self.scene.goals, self.pictures, strict=True)
-        goals = [replace(goal, picture=target) for goal, (target, _) in pairs]
-        return as_made(self.scene, self.lens, goals, grade=grade, layer_height=layer_height)
+        return as_made(self.scene, self.lens, _with_pictures(self), grade=grade, layer_height=layer_height)
+
+    def lit_by(self, light: str, distance: float | None = None) -> LitBy:
+        """Return the pictures of the lens in another light; see tolerance.lit_by."""
+        return lit_by(self.scene, self.lens, _with_pictures(self), name=light, distance=distance)
+
+
+def _with_pictures(found: Preview) -> list[Goal]:
+    """Return the goals of a preview with its targets."""
+    return [replace(goal, picture=of) for goal, (of, _) in zip(found.scene.goals, found.pictures, strict=True)]
 
 
 def preview(scene: Scene, size: PreviewSize = QUICK, outdated: Callable[[], bool] = lambda: False) -> Preview:

@@ -41,6 +41,7 @@ class PreviewRequest:
     scene: Scene
     text: str = ""  # text of the scene file, to whose lines a plan refers
     grade: str | None = None  # grade of the picture as made; None: no such picture
+    light: str | None = None  # light of the picture in another light (tolerance.lit_by); None: no such picture
     answers: list[tuple[str, Any]] = field(default_factory=list)  # (stage, answer or the Exception that prevented it)
     replaced: bool = False  # True once a later request of the page has come
     preview_time: float = math.inf  # time at which the first preview was ready (time.monotonic)
@@ -153,7 +154,7 @@ class PreviewDesk:
     def _make(self, request: PreviewRequest, stage: str) -> Any:
         """Return the answer of a stage: a preview, or entries of `plan --json` (for "effects", with the chosen `net`).
 
-        "made" gives a pair (preview, its picture as made), or None without a grade.
+        "made" gives (preview, its picture as made, its picture in another light), both None if they are not wanted.
         Outdated once the request is replaced or another one has fewer answers.
         """
 
@@ -168,11 +169,13 @@ class PreviewDesk:
         if stage in ("preview", "settled"):
             return preview(request.scene, QUICK if stage == "preview" else REFINED, outdated)
         if stage == "made":
-            if request.grade is None:
+            if request.grade is None and request.light is None:
                 return None
             tick()
             finer = next(found for _, found in reversed(request.answers) if isinstance(found, Preview))
-            return finer, finer.as_made(request.grade)
+            made = None if request.grade is None else finer.as_made(request.grade)
+            tick()
+            return finer, made, None if request.light is None else finer.lit_by(request.light)
         effects = None
         if request.plan is None:
             tick()

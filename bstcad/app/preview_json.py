@@ -6,15 +6,18 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from bstcad.app.preview import Preview
 from bstcad.report.figure_jobs import light_path_of
 from bstcad.report.light_figures import View
 from bstcad.report.record import LEFT_OUT, LeftOut, changes
 from bstcad.report.rendering import data_url, turnable
-from bstcad.report.report import made_sentences
+from bstcad.report.report import lit_sentences, made_sentences
 from bstcad.report.units import Rows, duration, number, quantity, tables
 from bstcad.sweep.prediction import Interval
 from bstcad.tolerance.as_made import AsMade
+from bstcad.tolerance.lit_by import LitBy
 
 SOLID_CELLS = 96  # cells per side of the mesh of the solid on the page
 # Error of the preview's thicknesses and relief, as a fraction of the relief.  The largest differences from finished
@@ -41,15 +44,27 @@ def of_preview(found: Preview) -> dict[str, Any]:
     return head | {"remarks": list(found.remarks), "solid": solid}
 
 
-def of_made(found: Preview, made: AsMade) -> dict[str, Any]:
-    """Return the pictures on each target as designed and as made, and the sentences on them."""
+def of_made(found: Preview, made: AsMade | None, lit: LitBy | None) -> dict[str, Any]:
+    """Return pairs of pictures on each target, as designed and as changed, and the sentences on them.
+
+    made: the picture as made; lit: the picture in another light; None: not wanted.
+    """
+    changed: list[tuple[str, Any, np.ndarray]] = []
+    sentences: list[str] = []
+    if made is not None:
+        changed += [(f"as made, {made.words}", goal, goal.made) for goal in made.goals]
+        sentences += made_sentences(made.facts(), found.scene.optic)
+    if lit is not None:
+        changed += [(f"in the light of {lit.words}", goal, goal.lit) for goal in lit.goals]
+        sentences += lit_sentences(lit.facts(), found.scene.optic)
     targets = []
-    for k, goal in enumerate(made.goals):
-        view = View.of(found.scene, k)
-        tones = {"designed": view.tones(goal.designed, goal.target), "made": view.tones(goal.made, goal.target)}
+    for words, goal, picture in changed:
+        view = View.of(found.scene, [each.key for each in found.scene.goals].index(goal.key))
+        tones = {"designed": view.tones(goal.designed, goal.target), "made": view.tones(picture, goal.target)}
         pictures = {name: data_url(view.picture(each)) for name, each in tones.items()}
-        targets.append(pictures | {"key": goal.key, "rrmsds": [number(value) for value in goal.rrmsds]})
-    return {"targets": targets, "words": made.words, "sentences": made_sentences(made.facts(), found.scene.optic)}
+        told = {"key": goal.key, "words": words, "rrmsds": [number(value) for value in goal.rrmsds]}
+        targets.append(pictures | told)
+    return {"targets": targets, "several": len(found.scene.targets) > 1, "sentences": sentences}
 
 
 def figures(found: Preview) -> Rows:

@@ -48,6 +48,7 @@ from bstcad.scene.picture import SAMPLES
 from bstcad.scene.quality import GRADE_NAMES
 from bstcad.scene.scene_file import MAX_DOTS
 from bstcad.scene.schema import rows
+from bstcad.tolerance.lit_by import LIGHTS
 
 Body = Mapping[str, Any]  # JSON object that a page sends
 ANSWER_TIMEOUT = 20.0  # time (s) until a waiting request returns without an answer and the page polls again
@@ -179,7 +180,8 @@ class Workbench:
         return self._page("manual.html.j2", title="Documentation", text=text)
 
     def _page(self, template: str, status: int = 200, **values: Any) -> HTMLResponse:
-        common = {"version": bstcad.__version__, "has_docs": self.has_docs, "rrmsd_words": RRMSD, "grades": GRADE_NAMES}
+        common = {"version": bstcad.__version__, "has_docs": self.has_docs, "rrmsd_words": RRMSD}
+        common |= {"grades": GRADE_NAMES, "lights": LIGHTS}
         return HTMLResponse(form.environment().get_template(template).render(**common, **values), status_code=status)
 
     # ---- pages ----
@@ -365,12 +367,13 @@ class Workbench:
     def preview(self, name: str, body: Body) -> dict[str, Any]:
         """Request previews of a scene and answer as `answer` does for the first stage.
 
-        body: {page, number, made}; made: grade of the picture as made, or absent.
+        body: {page, number, made, lit}; made: grade of the picture as made, lit: another light, or absent.
         """
         text = self.workspace.opened(name).text
         page, number = str(_required(body, "page"))[:40], _integer(_required(body, "number"))
         grade = str(body["made"]) if body.get("made") in GRADE_NAMES else None
-        asking = PreviewRequest(page, number, self.workspace.scene(name, text), text=text, grade=grade)
+        light = str(body["lit"]) if body.get("lit") in LIGHTS else None
+        asking = PreviewRequest(page, number, self.workspace.scene(name, text), text=text, grade=grade, light=light)
         self.desk.ask(asking)
         return self._answered(name, asking, 0)
 

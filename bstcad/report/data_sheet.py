@@ -204,7 +204,7 @@ def _title_block(paper: Paper, sheet: DataSheet, scale: str) -> None:
     room = right - left - 3.6
     paper.text(left + 1.8, TABLE_TOP - 5.6, scene.name, 4.2, room=room, weight="bold")
     title = scene.title or f"freeform {scene.optic}"
-    _in_box(paper, left + 1.8, TABLE_TOP - 7.6, title, TABLE_FONT, room=room, height=7.6)
+    _in_box(paper, left + 1.8, TABLE_TOP - 7.6, text=title, size=TABLE_FONT, room=room, height=7.6)
     cells = (
         (("Part no.", part.number), ("Drawn by", part.author), ("Organisation", part.organisation)),
         (("Date", part.date), ("Scale", scale), ("Unit", "mm"), ("Sheet", "1/1"), ("Projection", " ")),
@@ -218,7 +218,7 @@ def _title_block(paper: Paper, sheet: DataSheet, scale: str) -> None:
         for edge, (name, value) in zip(edges, row, strict=False):
             space = edges[1] - left - 2.4
             paper.text(edge + 1.2, level - 2.6, name, 1.8, room=space, color=GREY)
-            _in_box(paper, edge + 1.2, level - 3.2, value or "\u2014", 3.0, room=space, height=height - 3.8)
+            _in_box(paper, edge + 1.2, level - 3.2, text=value or "\u2014", size=3.0, room=space, height=height - 3.8)
         level -= height
     paper.first_angle(edges[-2] + 2.6, level + height - 5.9, 3.2)
     paper.line([(left, level), (right, level)], 0.25)

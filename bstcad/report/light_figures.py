@@ -316,14 +316,16 @@ def irradiance_triptych(target: np.ndarray, irradiance: np.ndarray, view: View) 
 
 
 @styled
-def picture_as_made(target: np.ndarray, designed: np.ndarray, made: np.ndarray, view: View) -> Figure:
-    """Draw target, light as designed and as made, and the difference of the last two in percent of the lit pixels.
+def changed_picture(
+    target: np.ndarray, designed: np.ndarray, other: np.ndarray, view: View, changed: str = "As made"
+) -> Figure:
+    """Draw target, light as designed and as changed, and the difference of the last two in percent of the lit pixels.
 
-    target, designed, made: (rows, columns) in coordinates, with equal sums.
+    target, designed, other: (rows, columns) in coordinates, with equal sums.  changed: title of the changed picture.
     """
-    pictures = {"Target": target, "As designed": designed, "As made": made}
+    pictures = {"Target": target, "As designed": designed, changed: other}
     shown = {title: view.irradiance(picture) for title, picture in pictures.items()}
-    figure, _ = _side_by_side(shown, "As made − as designed", view, height=1.3 + 2.2 * view.proportion)
+    figure, _ = _side_by_side(shown, f"{changed} − as designed", view, height=1.3 + 2.2 * view.proportion)
     view.note(
         figure,
         f"  The grey tones look as the light looks to an eye (sRGB); the scale states the {view.receiver.light}.",

@@ -100,7 +100,7 @@ class Paper:
         """
         lines = [drawable(text)]
         if room is not None:
-            lines, size = fitted(lines[0], size, PRINTED * room, style.get("weight") == "bold", most)
+            lines, size = fitted(lines[0], size, PRINTED * room, bold=style.get("weight") == "bold", most=most)
         given = {"va": "baseline", "fontsize": size / TYPE_POINT, "parse_math": False} | style
         for k, line in enumerate(lines):
             self.axes.text(x, y - k * LINE_PITCH * size, line, **given)

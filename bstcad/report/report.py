@@ -273,6 +273,11 @@ def made_sentences(made: Mapping[str, Any], optic: str) -> list[str]:
     return paragraphs("plan.txt.j2", "made", made=made, optic=optic)
 
 
+def lit_sentences(lit: Mapping[str, Any], optic: str) -> list[str]:
+    """Return sentences on the picture of a lens in another light; lit: entry `lit` of `bstcad plan --json`."""
+    return paragraphs("plan.txt.j2", "lit", lit=lit, optic=optic)
+
+
 def plan_predictions(plan: Mapping[str, Any]) -> Group:
     """Return predicted seconds, RRMSD and memory by quality, and for a finer net; plan: as for `plan_effects`."""
     from rich.console import Group

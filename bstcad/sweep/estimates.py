@@ -92,7 +92,7 @@ VISIBLE_BAND = (400.0, 700.0)  # band of white light, nm
 SUN_ANGLES = (0.5, 0.56)  # range of full divergence angles (degrees) treated as sunlight; the sun's mean is 0.53
 LINE_WIDTH = 10.0  # assumed width (nm) of a spectral line; LEDs have 20 to 40, lasers less than 1
 LINE_POINTS = ((-(0.6**0.5), 5 / 18), (0.0, 8 / 18), (0.6**0.5, 5 / 18))  # (offset / half width of the band, weight)
-BAND_POINTS = ((-0.5, 0.5), (0.5, 0.5))  # the same where lines stand for bands: twice as many lines
+BAND_POINTS = ((-0.5, 0.5), (0.5, 0.5))  # (offset, weight) where lines stand for bands
 TUBES_PER_PIXEL = 1.0  # flux tubes per pixel, along each side, for the pictures of lines and of a continuous spectrum
 FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"  # TOML for scenes
 

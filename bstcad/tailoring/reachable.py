@@ -56,7 +56,7 @@ def reach_of(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT_
     grid = slope_map.face_grid(source, lens, slope_map.lit_window(source, lens, FACE_CELLS), FACE_CELLS)
     plane, law = image_from_last_net(lens, screen.plane), lens.last_freeform.law
     margin, lit = reach_from_each(grid, corners, plane, law, grazing=grazing), slope_map.lit_corners(small.picture)
-    ordered = reach_in_order(grid, corners, lit, plane, law, grazing=grazing)
+    ordered = reach_in_order(grid, corners, lit, plane=plane, law=law, grazing=grazing)
     found = _inside(torch.maximum(margin.amax(0), ordered), screen, small.receiver)
     lost = margin[:, torch.from_numpy(lit)].amax(1) < 0
     some = grid.density[::FACE_STRIDE, ::FACE_STRIDE].cpu()

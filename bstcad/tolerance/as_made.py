@@ -137,8 +137,8 @@ def as_made(
             GoalAsMade(
                 goal.key,
                 goal.picture,
-                _scaled(before, of_target),
-                _scaled(after, of_target),
+                scaled(before, of_target),
+                scaled(after, of_target),
                 light_designed=float(before.sum()),
                 light=float(after.sum()),
                 changes=ordered,
@@ -207,5 +207,6 @@ def _with_form_error(lens: Lens, light: Light, table: Sequence[Tolerance]) -> Le
     return kind.apply(Setup(lens, light.channels, light.goals[0].receiver), size).lens
 
 
-def _scaled(picture: np.ndarray, size: float) -> np.ndarray:
+def scaled(picture: np.ndarray, size: float) -> np.ndarray:
+    """Return the picture scaled to the sum `size`; a dark picture stays dark."""
     return picture * (size / picture.sum()) if picture.sum() > 0 else picture

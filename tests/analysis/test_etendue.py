@@ -66,7 +66,7 @@ def test_sunlight_keeps_its_cone_behind_a_window_of_the_same_area():
 
 
 def test_a_hemisphere_is_seen_as_a_disc_and_a_half():
-    """From the angle θ to the axis the silhouette of a hemisphere is π R² (1 + cos θ) / 2."""
+    """The silhouette of a hemisphere from the angle θ to the axis is π R² (1 + cos θ) / 2."""
     dome = {"kind": "radial", "radius": 15.0, "half_angle": 88.0, "control_points": 65}
     scene = bstcad.load("templates/disk.toml").changed(
         LAMP | {"lens": {"material": "PMMA", "front": {"kind": "sphere", "z": 8.0, "curvature": -0.125}, "back": dome}}

@@ -104,7 +104,7 @@ def test_the_desk_answers_the_newest_request_of_each_page_in_order(monkeypatch):
     try:
         first = PreviewRequest("one", 1, scene)
         desk.ask(first)
-        newer = PreviewRequest("one", 2, scene.changed({"target.z": 150.0}), grade="milled-sanded")
+        newer = PreviewRequest("one", 2, scene.changed({"target.z": 150.0}), grade="milled-sanded", light="led")
         other = PreviewRequest("two", 1, scene)
         desk.ask(newer)
         desk.ask(other)
@@ -118,10 +118,10 @@ def test_the_desk_answers_the_newest_request_of_each_page_in_order(monkeypatch):
         assert [desk.answer(newer, k, 120.0)[0] for k in range(len(STAGES))] == list(STAGES)
         settled = newer.answers[1][1]
         assert np.array_equal(settled.pictures[0][1], preview(newer.scene, size=MORE).pictures[0][1])
-        lens, made = newer.answers[2][1]
-        assert lens is settled and made.grade == "milled-sanded"
-        told = preview_json.of_made(lens, made)
-        assert len(told["targets"]) == 1 and len(told["sentences"]) == 2
+        lens, made, lit = newer.answers[2][1]
+        assert lens is settled and made.grade == "milled-sanded" and lit.name == "led"
+        told = preview_json.of_made(lens, made, lit)
+        assert len(told["targets"]) == 2 and len(told["sentences"]) == 3
         assert set(newer.answers[4][1]["predicted"]) == {"draft", "standard", "fine"}
         refused = PreviewRequest("three", 1, scene.changed({"target.x": [9e4, 9.1e4]}))
         desk.ask(refused)

@@ -241,7 +241,7 @@ area.addEventListener("change", () => {
 });
 element("quality").addEventListener("change", ({ target }) => change({ key: "tailoring.quality", words: QUALITIES[target.value] }));
 
-element("grade").addEventListener("change", () => {
+for (const choice of ["grade", "lit"]) element(choice).addEventListener("change", () => {
   if (!state.error) preview();
 });
 
@@ -254,7 +254,7 @@ async function preview() {
   element("status").textContent = "Computing a new preview …";
   let reply;
   try {
-    reply = await ask(`${at}/preview`, { page, number: mine, made: element("grade").value });
+    reply = await ask(`${at}/preview`, { page, number: mine, made: element("grade").value, lit: element("lit").value });
     while (mine === number && !reply.replaced && !reply.stage) reply = await ask(answer(mine, 0));
   } catch (error) {
     if (mine === number) noEstimates(error.message);
@@ -305,16 +305,16 @@ function noEstimates(sentence) {
   noPlan("");
 }
 
-// Show the light as designed beside the light as made, with the sentences on it.
+// Show the light as designed beside the light as made and in another light, with the sentences on them.
 function showMade(made, refused) {
   element("made-targets").replaceChildren(...(made?.targets ?? []).map((target) => {
-    const pair = document.createElement("div"), of = made.targets.length > 1 ? `${target.key}: ` : "";
+    const pair = document.createElement("div"), of = made.several ? `${target.key}: ` : "";
     pair.className = "both";
     pair.append(figure(target.designed, `${of}Light as designed`, `${of}as designed: RRMSD ${target.rrmsds[0]}`));
-    pair.append(figure(target.made, `${of}Light as made`, `${of}${made.words}: RRMSD ${target.rrmsds[1]}`));
+    pair.append(figure(target.made, `${of}Light ${target.words}`, `${of}${target.words}: RRMSD ${target.rrmsds[1]}`));
     return pair;
   }));
-  const sentences = refused ? [`No picture as made: ${refused}.`] : made?.sentences ?? [];
+  const sentences = refused ? [`No such picture: ${refused}.`] : made?.sentences ?? [];
   element("made-says").replaceChildren(...sentences.map((sentence) => {
     const words = document.createElement("p");
     words.textContent = sentence;
