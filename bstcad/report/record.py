@@ -112,8 +112,8 @@ class PrecisionTest(TypedDict):
     """Comparison of a short run of tailoring in float32 and in float64; see tailoring.stage2.PrecisionComparison."""
 
     control_points: int  # number of control points along the longer side
-    merit: Size  # relative difference of the merit before the first step
-    gradient: Size  # norm of the difference of the gradients before the first step, relative to the gradient's norm
+    merit: Size  # difference of the merits before the first step, relative to the larger one
+    gradient: Size  # norm of the difference of the gradients before the first step, relative to the larger norm
     evaluations: int  # number of evaluations in each precision
     rrmsd_float64: Rrmsd  # RRMSD after the evaluations in float64
     rrmsd_float32: Rrmsd  # RRMSD after the evaluations in float32

@@ -587,8 +587,8 @@ class PrecisionComparison:
     """Differences between two copies of a lens, one tailored in float32, the other in float64."""
 
     control_points: int  # control points along the longer side
-    merit: float  # relative difference of the merit at the start
-    gradient: float  # norm of the difference of the gradients at the start, relative to the norm of the gradient
+    merit: float  # difference of the merits at the start, relative to the larger one; 0 if both are 0
+    gradient: float  # norm of the difference of the gradients at start, relative to the larger norm; 0 if both are 0
     evaluations: int  # number of evaluations in each precision
     rrmsd_float64: float  # RRMSD at the end of the tailoring in float64; each RRMSD is computed in float64
     rrmsd_float32: float  # RRMSD at the end of the tailoring in float32
@@ -609,13 +609,18 @@ def compare_precisions(task: Task, lens: Lens) -> PrecisionComparison:
     pairs = zip(single.nets, double.nets, strict=True)
     return PrecisionComparison(
         control_points=max(max(net.shape) for net in lens.nets),
-        merit=abs(merit / exact_merit - 1),
-        gradient=float((gradient - exact_gradient).norm() / exact_gradient.norm()),
+        merit=_relative(abs(merit - exact_merit), abs(merit), abs(exact_merit)),
+        gradient=_relative(*(float(each.norm()) for each in (gradient - exact_gradient, gradient, exact_gradient))),
         evaluations=COMPARED_EVALUATIONS,
         rrmsd_float64=rrmsd[1],
         rrmsd_float32=rrmsd[0],
         heights=max(float((a.heights - b.heights).abs().max()) for a, b in pairs),
     )
+
+
+def _relative(difference: float, *sizes: float) -> float:
+    """Return a difference divided by the largest of the sizes; 0 if all are 0, as for a picture that the lens makes."""
+    return difference / max(sizes) if difference else 0.0
 
 
 def _tailor_briefly(task: Task, lens: Lens) -> tuple[float, Tensor, Lens]:

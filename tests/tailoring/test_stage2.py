@@ -151,6 +151,17 @@ def test_the_twins_agree_to_what_single_precision_keeps(found):
     assert 0 < found["heights"] < 0.1
 
 
+@pytest.mark.parametrize(("merit", "exact", "difference"), [(0.0, 0.0, 0.0), (0.0, 2.0, 1.0), (2.0, 1.0, 0.5)])
+def test_a_stationary_start_has_differences_that_are_finite(monkeypatch, merit, exact, difference):
+    """A picture that the start makes, such as one white pixel, has no gradient, and may have a merit of zero."""
+    scene = load(DISK, TWINS)
+    task, start = task_of(scene), scene.flat_lens(33)
+    ends = iter([(merit, torch.full((4,), merit), start), (exact, torch.full((4,), exact), start)])
+    monkeypatch.setattr(stage2, "_tailor_briefly", lambda task, lens: next(ends))
+    found = stage2.compare_precisions(task, start)
+    assert (found.merit, found.gradient) == (difference, difference)
+
+
 def test_a_coarser_arithmetic_shows(monkeypatch, found):
     """Heights rounded to 1e-4 of themselves, as half precision would, in the single one of the twins."""
     call = stage2.Problem.__call__
