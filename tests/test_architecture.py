@@ -32,9 +32,9 @@ ENGINE = {
 MAY_IMPORT = {
     "runs": {"bstcad"},  # the ground: files, processes, signals, checkpoints; it knows no lens
     "step_text": {"runs"},
-    "optics": set(),
+    "optics": {"runs"},  # the cache of kernels
     "photometry": {"optics"},  # its hash, by which rays are drawn
-    "transport": set(),
+    "transport": {"runs"},  # the cache of kernels
     "scene": {"runs", "optics", "photometry", "step_text"},
     "tailoring": {"scene", "optics", "transport"},
     "baselines": {"scene", "optics", "transport", "tailoring"},
@@ -43,7 +43,7 @@ MAY_IMPORT = {
     "verify": {"runs", "scene", "optics", "step_text", "cad", "analysis"},
     "judges": {"scene", "optics", "verify"},
     "measured": {"runs", "optics", "analysis", "verify"},
-    "toolpath": {"optics"},
+    "toolpath": {"runs", "optics"},
     "report": {
         "runs",
         "scene",
@@ -228,7 +228,7 @@ def compiled_functions():
         for node in ast.walk(tree(file)):
             if isinstance(node, ast.FunctionDef):
                 decorators = {ast.unparse(each).partition("(")[0] for each in node.decorator_list}
-                if decorators & {"njit", "compiled", "inlined"}:
+                if decorators & {"njit", "compiled", "compiled_kernel", "inlined"}:
                     yield node.name
 
 
@@ -325,7 +325,7 @@ def overlooked_by_a_cache(tree):
         compiled = isinstance(function, ast.FunctionDef) and any(
             re.search("njit|compiled", ast.unparse(decorator)) for decorator in function.decorator_list
         )
-        for node in ast.walk(function) if compiled else ():
+        for node in (node for part in function.body for node in ast.walk(part)) if compiled else ():
             if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in from_afar:
                 yield f"{from_afar[node.value.id]}.{node.attr}"
             elif isinstance(node, ast.Name) and node.id in from_afar:

@@ -40,6 +40,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle, Outline
 from bstcad.optics.surfaces import MIN_COS2, Recess, Surface, sag, sampled
 from bstcad.runs import files
+from bstcad.runs.kernel_cache import compiled_kernel
 from bstcad.scene.scene import FLOAT32_ROUNDING
 
 MIN_MESH_CELLS = 16  # number of grid cells per side of the first mesh that `fit_mesh` tries
@@ -290,7 +291,7 @@ def _normal(a, b, c):
     return q * u - r * t, r * s - p * u, p * t - q * s
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _corners_and_normals(vertices, faces):
     """Return corners (n, 3, 3) of triangles and their normals (n, 3), of twice the triangle's area."""
     corners, normals = np.empty((len(faces), 3, 3)), np.empty((len(faces), 3))
@@ -332,7 +333,7 @@ def _sag(face, x, y):
     return face.z + (a0 * h0 + a1 * h1 + a2 * h2)
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _distance_from_face(a, b, c, parts, face):
     """Return the largest distance along z (mm) of a face from the triangle a b c, with 2 * parts steps per edge."""
     n = 2 * parts
@@ -346,7 +347,7 @@ def _distance_from_face(a, b, c, parts, face):
     return worst
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _chordal_error(vertices, faces, max_parts, radius, back, front):
     """Return the largest distance (mm) of the lens from triangles, along the triangles' normals.
 
@@ -434,7 +435,7 @@ def read_stl(path: str | Path) -> Mesh:
     return Mesh(corners[first].astype(np.float64), same.reshape(-1, 3))
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _weld(bits):
     """Group equal corners, float32 as uint32 (n, 3), by hash; return each group's first corner and each corner's group.
 

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numba import njit
 
 from bstcad.optics.kernels.reductions import on_threads
+from bstcad.runs.kernel_cache import compiled_kernel
 from bstcad.toolpath.machined_face import MachinedFace
 from bstcad.toolpath.raster import Raster
 from bstcad.toolpath.spiral import Spiral
@@ -103,7 +103,7 @@ def _divided(kernel, scene, count: int) -> None:  # type: ignore[no-untyped-def]
     on_threads(lambda *part: kernel(*scene, *part), list(zip(ends, ends[1:], strict=False)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled_kernel(error_model="numpy")
 def _to_moves(points, begin, end, starts, grid, radius, half, clearance, first, last):
     """Store the distance of each point from the nearest straight move, less the radius; moves are sorted by cells."""
     low_x, low_y, cell, columns, rows = grid
@@ -125,7 +125,7 @@ def _to_moves(points, begin, end, starts, grid, radius, half, clearance, first, 
         clearance[k] = math.sqrt(best) - radius
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled_kernel(error_model="numpy")
 def _to_nose(points, turn, x, z, radius, clearance, first, last):
     """Store the distance of each point from the nearest centre of the nose in its plane, less the radius."""
     for k in range(first, last):

@@ -31,8 +31,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
-from numba import njit, prange
+from numba import prange
 
+from bstcad.runs.kernel_cache import compiled_kernel
 from bstcad.transport.density import BLOCKS, Density, inner, pushforward, threads, threads_for
 
 LINES_PER_BLOCK = 8  # lines transformed together: eight doubles fill a cache line of the transposed output
@@ -60,7 +61,7 @@ def legendre(v: np.ndarray) -> np.ndarray:
     return conjugate
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled_kernel(error_model="numpy")
 def _line(v, out, hull, slope, first):
     """Compute out[i] = max_j (i + 1/2)(j + 1/2) - v[j]; hull, slope (n) and first (n + 1) are scratch.
 
@@ -86,7 +87,7 @@ def _line(v, out, hull, slope, first):
         out[i] = (i + 0.5) * (hull[k] + 0.5) - v[hull[k]]
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@compiled_kernel(parallel=True)
 def _transform_lines(v, out, sign, blocks):
     """Compute out = `sign` times the transposed matrix of the Legendre transforms of the rows of v."""
     n = v.shape[0]
@@ -148,7 +149,7 @@ def _pivots(s: np.ndarray) -> np.ndarray:
     return pivots
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@compiled_kernel(parallel=True)
 def _eliminate(r, g, pivots, keep, share, blocks):
     """Replace each column of r by keep (D + s)^-1 r - share r; g: scratch."""
     n = r.shape[0]
@@ -287,7 +288,7 @@ def _half_step(a, b, rho, nu, *, poisson, sigma, dual):
     return conjugate, trial, sigma, dual + gain, error
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc"})
+@compiled_kernel(fastmath={"reassoc"})
 def _dual(u, v, rho, nu):
     """Return J = ∫ psi drho + ∫ phi dnu in cell units; u, v: see `_ascend`."""
     n = u.shape[0]

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from scipy.sparse import csr_array
+
+from bstcad.runs.kernel_cache import compiled_kernel
 
 BLOCKS = 8  # number of independent blocks of a loop, fixed so that no sum depends on the number of threads
 MAX_SINGLE_THREAD_CELLS = 128  # largest grid, in cells per side, solved by one thread
@@ -147,7 +149,7 @@ def resample_flux(flux: np.ndarray, x: np.ndarray, y: np.ndarray, n: int, parts:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled_kernel(error_model="numpy")
 def _resample(flux, x, y, along_x, along_y, out):
     n = out.shape[0]
     for k in range(flux.shape[0]):
@@ -175,7 +177,7 @@ def _resample(flux, x, y, along_x, along_y, out):
                     out[below, right] += part * u * v
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@compiled_kernel(parallel=True)
 def _gradient(u, x, y):
     n = u.shape[0]
     for i in prange(n - 1):
@@ -184,7 +186,7 @@ def _gradient(u, x, y):
             y[i + 1, j + 1] = 0.5 * (u[i, j + 1] - u[i, j] + u[i + 1, j + 1] - u[i + 1, j])
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _rows_reached(x):
     """Return the range (first, last + 1) of the rows of cells that boxes centred between the corners x can touch."""
     n = x.shape[1] - 1
@@ -195,7 +197,7 @@ def _rows_reached(x):
     return max(int(least) - 1, 0), min(int(most) + 3, n + 1)
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
+@compiled_kernel(parallel=True, error_model="numpy", fastmath={"contract"})
 def _splat(rho, x, y, parts, reach):
     """Add the images of the cells of each block of rows to parts[block], and store the rows reached in reach[block]."""
     n, blocks = rho.shape[0], parts.shape[0]
@@ -219,7 +221,7 @@ def _splat(rho, x, y, parts, reach):
                 out[n - 1, j] += out[n, j]
 
 
-@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+@compiled_kernel(inline="always", error_model="numpy")
 def _lay_cell(out, n, mass, x, y, i, j):
     """Add the pieces of the image of cell (i, j) to out (n + 1, n + 1)."""
     # edge vectors of the image of the cell (e: along i, f: along j) and its twist (t)
@@ -281,7 +283,7 @@ def inner(a: np.ndarray, b: np.ndarray) -> float:
     return float(_inner(a, b))
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@compiled_kernel(fastmath={"reassoc", "contract"})
 def _inner(a, b):
     total = 0.0
     for i in range(a.shape[0]):  # sum each row first, for accuracy

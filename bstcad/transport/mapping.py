@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import ArrayLike
 
+from bstcad.runs.kernel_cache import compiled_kernel
 from bstcad.transport.bfm import Listener, Transport, back_and_forth, half_square, ladder, legendre
 from bstcad.transport.density import Density, gradient_at_corners
 from bstcad.transport.monge_ampere import ROUGH_MASS_ERROR, MongeAmpere, corners, newton_on_grids
@@ -164,13 +165,13 @@ def mass_error(mapping: Mapping) -> float:
     return float(np.abs(flux - mapping.target.values).mean())
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _bilinear(s, i, j, a, b):
     """Return s, interpolated bilinearly, at (i + a, j + b)."""
     return (1 - a) * ((1 - b) * s[i, j] + b * s[i, j + 1]) + a * ((1 - b) * s[i + 1, j] + b * s[i + 1, j + 1])
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@compiled_kernel(parallel=True)
 def _forward(sx, sy, points, out):
     n, px, py = sx.shape[0] - 1, points[0], points[1]
     for k in prange(px.size):
@@ -183,7 +184,7 @@ def _forward(sx, sy, points, out):
         out[1, k] = _bilinear(sy, i, j, a, b)
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _residual(sx, sy, x, y, p, q):
     """Return (x, y) - S(p, q) and ∂S_x/∂p, ∂S_x/∂q, ∂S_y/∂p, ∂S_y/∂q; S: (sx, sy), bilinear at array indices p, q."""
     i, j = min(int(p), sx.shape[0] - 2), min(int(q), sx.shape[1] - 2)
@@ -197,7 +198,7 @@ def _residual(sx, sy, x, y, p, q):
     return rx, ry, ex + b * tx, fx + a * tx, ey + b * ty, fy + a * ty
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def solve_point(sx, sy, x, y, p, q):
     """Return (p, q) where S = (sx, sy) is (x, y), and True if found outside a fold; Levenberg-Marquardt from (p, q)."""
     rows, columns = sx.shape[0] - 1.0, sx.shape[1] - 1.0
@@ -231,7 +232,7 @@ def solve_point(sx, sy, x, y, p, q):
     return p, q, residual2 < 1e-16 and a * d - b * c > 0.0
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _best_pixel(phi, x, y, p, q):
     """Return the centre of the pixel with the largest phi(y) - |x - y|²/2, by steps of up to two pixels from (p, q)."""
     n = phi.shape[0]
@@ -250,7 +251,7 @@ def _best_pixel(phi, x, y, p, q):
     return i + 0.5, j + 0.5
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@compiled_kernel(parallel=True)
 def _invert(phi, sx, sy, gx, gy, points, out):
     n, px, py = sx.shape[0] - 1, points[0], points[1]
     for block in prange((px.size + INVERTED_TOGETHER - 1) // INVERTED_TOGETHER):
@@ -279,7 +280,7 @@ def grid_coordinates(grid_x: np.ndarray, grid_y: np.ndarray, x: np.ndarray, y: n
     return out[0], out[1]
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@compiled_kernel(parallel=True)
 def _search(grid_x, grid_y, x, y, out):
     """Solve point by point along rows, from the neighbour's solution or the position in an evenly spaced grid."""
     rows, columns = grid_x.shape[0] - 1.0, grid_x.shape[1] - 1.0

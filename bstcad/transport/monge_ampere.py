@@ -17,9 +17,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from scipy.ndimage import gaussian_filter
 
+from bstcad.runs.kernel_cache import compiled_kernel
 from bstcad.transport.bfm import Listener, PoissonWithoutCheckerboard, TransportStep, prolong
 from bstcad.transport.density import Density, inner, threads
 
@@ -143,7 +144,7 @@ def _dual_norm(r: np.ndarray, smoothed: np.ndarray) -> float:
     return float(np.sqrt(max(0.0, inner(r, smoothed))))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compiled_kernel(inline="always")
 def _interpolate(rho, x, y, last):
     """Interpolate rho bilinearly between cell centres, constant outside, in cell units; last: the float below n - 1."""
     x = min(max(x - 0.5, 0.0), last)
@@ -156,7 +157,7 @@ def _interpolate(rho, x, y, last):
     return density + a * (below - density)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@compiled_kernel(parallel=True)
 def _corners(phi, x, y):
     n = phi.shape[0]
     for k in prange(n + 1):
@@ -168,7 +169,7 @@ def _corners(phi, x, y):
             y[i, j] = j - 0.5 * (phi[a, d] - phi[a, c] + phi[b, d] - phi[b, c])
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
+@compiled_kernel(parallel=True, error_model="numpy", fastmath={"contract"})
 def _flux(rho, x, y, out):
     """Integrate rho over the signed area of each bilinear tube; midpoints half a cell apart or nearer, up to 400²."""
     n = out.shape[0]
@@ -196,7 +197,7 @@ def _flux(rho, x, y, out):
             out[i, j] = total * (da * db)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@compiled_kernel(parallel=True)
 def _metric(rho, x, y, metric, softening):
     """Compute rho cof(D²v) + softening, made positive, at pixel corners: (xx, xy, yy) along the last axis."""
     n = x.shape[0] - 1
@@ -217,7 +218,7 @@ def _metric(rho, x, y, metric, softening):
             metric[i, j, 2] = density * vxx + softening
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _update(eta, r, d, image, step):
     """Update the solution eta and the residual r with a step of conjugate gradients along d; image: operator at d."""
     n = eta.shape[0]
@@ -227,7 +228,7 @@ def _update(eta, r, d, image, step):
             r[i, j] -= step * image[i, j]
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@compiled_kernel(parallel=True)
 def _apply(metric, eta, p, q, out):
     """Compute out = -div(metric ∇eta); gradients at corners, no flux through the rim; p, q: scratch."""
     n = eta.shape[0]

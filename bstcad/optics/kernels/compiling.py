@@ -1,6 +1,6 @@
 """Compilation of kernels with a cache that depends on all files of this folder.
 
-numba's own cache depends on a kernel's own file only: a change of a function imported from another file would not
+A cache of numba depends on a kernel's own file only: a change of a function imported from another file would not
 recompile the kernel.  So the caches lie in a folder named after the contents of all files of this folder.
 """
 
@@ -15,19 +15,21 @@ from typing import Any
 
 import numba
 
+from bstcad.runs.kernel_cache import compiled_kernel
+
 FOLDER = Path(__file__).parent
 PREFIX = "kernels-"  # prefix of the name of a folder of caches
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return the decorator numba.njit(cache=True, nogil=True, …) for a kernel that Python calls."""
+    """Return the decorator `compiled_kernel` for a kernel that Python calls."""
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         config: Any = numba.config  # its settings are attributes that numba makes
         before = config.CACHE_DIR
         config.CACHE_DIR = str(_caches(before))  # numba reads it only when the kernel is created
         try:
-            return numba.njit(cache=True, nogil=True, **options)(function)
+            return compiled_kernel(**options)(function)
         finally:
             config.CACHE_DIR = before
 
