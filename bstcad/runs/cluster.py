@@ -11,6 +11,7 @@ import logging
 import tempfile
 import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -106,19 +107,40 @@ class Cluster:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._client.cancel(list(self._keys))
-        self._client.close(timeout=JOB_INTERVAL)
+        with contextlib.suppress(*self._lost):
+            if self._client.status == "running":  # else no scheduler has jobs, and an answer would be awaited for long
+                self._client.cancel(list(self._keys))
+        with contextlib.suppress(*self._lost):
+            self._client.close(timeout=JOB_INTERVAL)
+
+    @property
+    def _lost(self) -> tuple[type[BaseException], ...]:
+        """Errors of a connection whose scheduler has ended; CommClosedError of distributed is an OSError."""
+        return OSError, CancelledError, self._distributed.TimeoutError, self._distributed.client.ClosedClientError
+
+    @contextlib.contextmanager
+    def _connection(self) -> Iterator[None]:
+        """Raise MachineError if the scheduler has ended, or ends within the block."""
+        ended = f"--scheduler {self.address}: the scheduler has ended; start it again"
+        if self._client.status != "running":
+            raise MachineError(ended)
+        try:
+            yield
+        except self._lost as error:
+            raise MachineError(ended) from error
 
     @property
     def capacity(self) -> int:
         """Current number of workers; 1 if all are lost, since one may come back."""
-        return max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1)  # all of them, not the first five
+        with self._connection():
+            workers = self._client.scheduler_info(n_workers=-1)["workers"]  # all of them, not the first five
+        return max(len(workers), 1)
 
     def start(self, key: Any, work: Callable[..., Any], *arguments: Any) -> None:
         """Start the job work(*arguments) on a worker; key: as in Machines."""
-        self._check()
         version = environment.version()
-        future = self._client.submit(answer, version, key, work, *arguments, pure=False, retries=RETRIES)
+        with self._connection():
+            future = self._client.submit(answer, version, key, work, *arguments, pure=False, retries=RETRIES)
         self._keys[future] = key
 
     def next(self, tick: Callable[[], None] = lambda: None) -> Answer:
@@ -131,8 +153,8 @@ class Cluster:
             for future in [future for future in futures if future.done()]:
                 return self._answer(self._keys.pop(future), future)
             tick()
-            self._check()
-            with contextlib.suppress(TimeoutError, self._distributed.TimeoutError), self._client.as_current():
+            timeout = contextlib.suppress(TimeoutError, self._distributed.TimeoutError)
+            with self._connection(), timeout, self._client.as_current():
                 self._distributed.wait(list(futures), timeout=JOB_INTERVAL, return_when="FIRST_COMPLETED")
 
     def spread(self, work: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]) -> Iterator[Any]:
@@ -142,7 +164,7 @@ class Cluster:
         """
         import dask
 
-        with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GB"}):
+        with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GB"}), self._connection():
             stored = self._client.submit(lambda value: value, shared, pure=False)
         for item in items:
             self.start(None, work, stored, item)
@@ -152,17 +174,14 @@ class Cluster:
                 raise MachineError(f"{self.address}: a worker failed ({answered.reason}); run the command again")
             yield answered.value
 
-    def _check(self) -> None:
-        if self._client.status != "running":
-            raise MachineError(f"--scheduler {self.address}: the scheduler has ended; start it again")
-
     def _answer(self, key: Any, future: Any) -> Answer:
         if future.status == "cancelled":  # the scheduler was restarted
             raise MachineError(f"--scheduler {self.address}: the scheduler has lost its jobs; run the command again")
         if future.status == "error":
             error = future.exception()
             return Answer(key, self.address, reason=f"{type(error).__name__}: {first_line(error)}")
-        return future.result()
+        with self._connection():
+            return future.result()
 
 
 def answer(wanted: str, key: Any, work: Callable[..., Any], *arguments: Any) -> Answer:

@@ -205,6 +205,7 @@ def _design_all(
         done = len(remaining) - len(waiting) - len(under_way)
         progress("batch", done, len(remaining), ", ".join(rows[k].name for k in under_way))
 
+    write(rows, folder)
     while waiting or under_way:
         while waiting and len(under_way) < machines.capacity:
             under_way.append(k := waiting.pop(0))
@@ -213,10 +214,10 @@ def _design_all(
                 machines.start(k, design, contents, (folder / rows[k].name).absolute(), variables)
             else:
                 machines.start(k, design_remotely, contents)
-        write(rows, folder)
         answer = machines.next(tick)
         under_way.remove(answer.key)
         rows[answer.key] = _finished_entry(rows[answer.key], answer, folder, local)
+        write(rows, folder)
     tick()
 
 

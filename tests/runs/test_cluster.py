@@ -1,14 +1,22 @@
 """Work that spreads over workers of dask.distributed: answers, errors, other versions, lost workers."""
 
+import json
+import os
+import subprocess
 import sys
+import time
+from pathlib import Path
 from unittest import mock
 
 import distributed
 import pytest
+from distributed.comm import CommClosedError
 
 from bstcad.runs import cluster, environment
 from bstcad.runs.cluster import Cluster
 from bstcad.runs.files import MachineError, SceneError
+
+ROOT = Path(__file__).parent.parent.parent
 
 
 def add(shared, number):
@@ -82,5 +90,54 @@ def test_a_scheduler_that_goes_away_is_a_sentence(future, client, sentence):
     waiting, submitted = object.__new__(Cluster), mock.Mock(status=future)
     submitted.done.return_value = future != "pending"
     waiting._keys, waiting.address, waiting._client = {submitted: "a"}, "tcp://here", mock.Mock(status=client)
+    waiting._distributed = distributed
     with pytest.raises(MachineError, match=f"the scheduler {sentence}"):
         waiting.next()
+
+
+@pytest.fixture
+def scheduler(tmp_path):
+    """Start a scheduler and a worker in processes of their own; yield address and process of the scheduler."""
+    command, started = [sys.executable, "-m", "distributed.cli.dask_scheduler"], []
+    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(tmp_path / "at.json")]
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--nthreads", "1", "--no-dashboard", "--no-nanny"]
+    quiet = {"cwd": tmp_path, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    try:
+        started.append(subprocess.Popen([*command, *options], **quiet))
+        for _ in range(300):
+            if (tmp_path / "at.json").exists() and (text := (tmp_path / "at.json").read_text()):
+                break
+            time.sleep(0.1)
+        address = json.loads(text)["address"]
+        started.append(subprocess.Popen([*worker, address], **quiet, env={**os.environ, "PYTHONPATH": str(ROOT)}))
+        yield address, started[0]
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+
+
+def test_a_killed_scheduler_ends_in_a_sentence(scheduler):
+    address, process = scheduler
+    with pytest.raises(MachineError, match="the scheduler has ended; start it again"), Cluster(address) as found:
+        found.start("a", time.sleep, 300)
+        process.kill()
+        process.wait()
+        found.next()
+
+
+@pytest.mark.parametrize("fault", [CommClosedError("closed"), ConnectionResetError(104, "reset"), OSError()])
+@pytest.mark.parametrize("asked", ["submit", "scheduler_info", "wait", "cancel"])
+def test_a_lost_connection_is_a_sentence_wherever_it_is_found(monkeypatch, fault, asked):
+    found, pending = object.__new__(Cluster), mock.Mock(status="pending", done=lambda: False)
+    client = mock.MagicMock(status="running", **({f"{asked}.side_effect": fault} if asked != "wait" else {}))
+    found._keys, found.address, found._client = {pending: "a"}, "tcp://here", client
+    found._distributed = mock.Mock(wraps=distributed, TimeoutError=distributed.TimeoutError, client=distributed.client)
+    found._distributed.wait.side_effect = fault
+    with pytest.raises(MachineError, match="the scheduler has ended"), found:
+        if asked == "submit":
+            found.start("a", add)
+        elif asked == "scheduler_info":
+            assert found.capacity
+        found.next()
+    assert client.close.called
