@@ -407,7 +407,7 @@ def _arrays(folder: Path, shapes: Mapping[str, tuple[int, ...]], scene: scenes.S
     points = sum(math.prod(as_pair(net)) for net in scene.lens.nets())
     try:
         found = files.arrays(path, shapes, 33 * points + 17 * pixels + 3_000_000)  # limit in bytes
-    except Exception as error:  # numpy, zipfile, zlib and tokenize raise various errors for a damaged file
+    except ValueError as error:
         raise SceneError(f"{path}: cannot be read ({files.first_line(error)}); {REMEDY}") from None
     for name, shape in shapes.items():
         if not np.isfinite(found[name]).all():

@@ -8,28 +8,89 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from bstcad.report import record, tolerances
+from bstcad.report.record import Rrmsd, Size
 from bstcad.report.units import environment
 from bstcad.runs import files
 
 PAGE, ROUNDS, FIGURES, FIGURE = "production.html", "compensated", "compensation.json", "correction.png"
+ROUND_REMEDY = "remove the folder of this round and the later ones to begin again from the round before"
 SIGNATURES = "Cut by", "Measured by", "Released by"
 
 
+@dataclass(frozen=True)
+class DeviationFigures:
+    """Sizes of a deviation over the face, along z."""
+
+    __pydantic_config__ = record.STRICT
+    pv_mm: Size
+    rms_mm: Size
+
+
+@dataclass(frozen=True)
+class CloudFigures:
+    """Cloud of points that was measured for a round."""
+
+    __pydantic_config__ = record.STRICT
+    file: str
+    sha256: str
+    points: int
+
+
+@dataclass(frozen=True)
+class RoundLight:
+    """RRMSD of the picture: of the design, with the deviation measured, and with the one expected to remain."""
+
+    __pydantic_config__ = record.STRICT
+    design: Rrmsd
+    measured: Rrmsd
+    expected: Rrmsd
+    expected_by_form: Rrmsd | None = None  # with the deviation expected to remain after a correction by form
+
+
+@dataclass(frozen=True)
+class RoundFigures:
+    """Contents of compensation.json, of which each number is finite."""
+
+    __pydantic_config__ = record.STRICT
+    round: int
+    parts: int
+    clouds: tuple[CloudFigures, ...]
+    gain: Size
+    filter: str
+    cutoff_mm: Size
+    deviation: DeviationFigures
+    correction: DeviationFigures
+    expected_deviation: DeviationFigures
+    by: Literal["form", "light"]
+    volume_mm3: Size
+    volume_by_form_mm3: Size
+    may_stay: DeviationFigures | None
+    standard_error_mm: Size
+    noise_mm: Size
+    rrmsd: RoundLight
+
+
+def read_round(place: Path) -> RoundFigures:
+    """Return the figures of a round from its folder; ValueError, in one sentence, if they are missing or damaged."""
+    return record.read_as(RoundFigures, place / FIGURES, ROUND_REMEDY)
+
+
 def rounds_in(folder: Path) -> list[dict[str, Any]]:
-    """Return the figures of each round of a design's folder, in order, with its `place` and its figure as base64."""
+    """Return the figures of each round of a design's folder, in order, with its `place` and its figure as base64.
+
+    ValueError, in one sentence, for a round whose figures are damaged.
+    """
     found: list[dict[str, Any]] = []
     while (place := folder / ROUNDS / f"round-{len(found) + 1}").is_dir():
-        figures = _entries(place / FIGURES)
-        if figures is None:
-            break
         picture = place / FIGURE
         drawn = base64.b64encode(picture.read_bytes()).decode() if picture.is_file() else ""
-        found.append(figures | {"place": f"{ROUNDS}/{place.name}", "picture": drawn})
+        found.append(record.plain(read_round(place)) | {"place": f"{ROUNDS}/{place.name}", "picture": drawn})
     return found
 
 
@@ -47,21 +108,17 @@ def production_page(
 
 
 def write_production_page(folder: Path) -> Path | None:
-    """Write production.html to a design's folder, from its files; None if it has no report."""
-    report = _entries(folder / "report.json")
-    if report is None:
+    """Write production.html to a design's folder, from its files; None if it has no valid report."""
+    try:
+        report = record.read(folder / "report.json").facts()
+    except ValueError:
         return None
+    try:
+        study = tolerances.read(folder / "tolerance.json").facts()
+    except ValueError:
+        study = None
     step = folder / "lens.step"
     digest = hashlib.sha256(step.read_bytes()).hexdigest() if step.is_file() else "unknown"
-    page = production_page(report, rounds_in(folder), _entries(folder / "tolerance.json"), digest)
+    page = production_page(report, rounds_in(folder), study, digest)
     files.put(folder / PAGE, page.encode())
     return folder / PAGE
-
-
-def _entries(path: Path) -> dict[str, Any] | None:
-    """Return the entries of a JSON file; None if it is missing or damaged."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return found if isinstance(found, dict) else None

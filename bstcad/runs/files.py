@@ -147,36 +147,60 @@ def arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], largest: int) -> d
     """Return arrays as float64, by name, from an .npz archive of at most `largest` bytes; shapes: their shapes by name.
 
     An archive may unpack to a million times its size, and an array's header may claim any size: both are checked
-    against the shape before memory is allocated.  Raises ValueError, or errors of zipfile, zlib or numpy.
+    against the shape before memory is allocated.  ValueError for a damaged archive.
     """
-    with zipfile.ZipFile(io.BytesIO(contents(path, largest))) as archive:
+    with _archive(path, largest) as archive:
         return {name: _array(archive, name, shape) for name, shape in shapes.items()}
 
 
 def names(path: Path) -> list[str]:
     """Return the names of the arrays in an .npz archive; [] for other files."""
     try:
-        with zipfile.ZipFile(io.BytesIO(contents(path, MAX_ARCHIVE_SIZE))) as archive:
+        with _archive(path, MAX_ARCHIVE_SIZE) as archive:
             return [name.removesuffix(".npy") for name in archive.namelist()]
-    except (ValueError, zipfile.BadZipFile):
+    except ValueError:
         return []
 
 
 def net(path: Path, most: int) -> np.ndarray:
-    """Return control_points (m, n, 3) of an .npz archive; raises as `arrays`, and ValueError if m or n > `most`."""
-    with zipfile.ZipFile(io.BytesIO(contents(path, MAX_ARCHIVE_SIZE))) as archive:
-        with archive.open("control_points.npy") as file:
+    """Return control_points (m, n, 3) of an .npz archive; ValueError if damaged, not finite, or if m or n > `most`."""
+    import numpy as np
+
+    with _archive(path, MAX_ARCHIVE_SIZE) as archive:
+        with archive.open(_member(archive, "control_points")) as file:
             (m, n, *_), _ = _header(file, "control_points")
-        return _array(archive, "control_points", (min(m, most), min(n, most), 3))
+        found = _array(archive, "control_points", (min(m, most), min(n, most), 3))
+    if not np.isfinite(found).all():
+        raise ValueError("its control points are not finite")
+    return found
+
+
+@contextlib.contextmanager
+def _archive(path: Path, largest: int) -> Iterator[zipfile.ZipFile]:
+    """Yield an .npz archive of at most `largest` bytes; ValueError for any fault of it within the block."""
+    data = io.BytesIO(contents(path, largest))
+    try:
+        with zipfile.ZipFile(data) as archive:
+            yield archive
+    except (ValueError, MemoryError):
+        raise
+    except Exception as error:  # zipfile, zlib, struct, numpy and tokenize raise errors of their own
+        raise ValueError(first_line(error)) from error
+
+
+def _member(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
+    member = archive.getinfo(f"{name}.npy")
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others unpack to more than they state
+        raise ValueError(f"{name} is compressed by an unknown method")
+    return member
 
 
 def _array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> np.ndarray:
     import numpy as np  # loaded late, since --help needs this module without numpy
 
-    member = archive.getinfo(f"{name}.npy")
-    known = member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # unpack to the stated size
-    if member.file_size > 8 * math.prod(shape) + MAX_ARRAY_HEADER or not known:
-        raise ValueError(f"{name} is larger than an array of shape {shape}, or compressed by an unknown method")
+    member = _member(archive, name)
+    if member.file_size > 8 * math.prod(shape) + MAX_ARRAY_HEADER:
+        raise ValueError(f"{name} is larger than an array of shape {shape}")
     file = io.BytesIO(archive.read(member))
     found, kind = _header(file, name)
     if found != shape or kind not in "fiu":

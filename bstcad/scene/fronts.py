@@ -102,13 +102,13 @@ def read_net(path: Path) -> FileNet:
         raise SceneError(f"lens.front.file: {name} not found; {NET_REMEDY}, relative to the scene file")
     try:
         net = _net_of_step(path) if path.suffix.lower() in (".step", ".stp") else files.net(path, MAX_CONTROL_POINTS)
-    except Exception as error:  # numpy, zipfile, zlib and tokenize raise errors of their own for a damaged file
+    except ValueError as error:
         raise SceneError(f"lens.front.file: {name} cannot be read ({files.first_line(error)}); {NET_REMEDY}") from None
     shape = net.shape[:2]
     axes = (np.linspace(net[0, 0, i], net[-1, -1, i], count) for i, count in enumerate(shape))
     uniform = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     deviation = np.abs(net[..., :2] - uniform).max()
-    if min(shape) < MIN_SIDE or not np.isfinite(net).all() or not deviation <= UNIFORM_TOLERANCE:
+    if min(shape) < MIN_SIDE or not deviation <= UNIFORM_TOLERANCE:
         raise SceneError(f"lens.front.file: {name} does not contain the net of a design; {NET_REMEDY}")
     return FileNet.of(BSplineSurface.from_control_points(net, 0.0))
 

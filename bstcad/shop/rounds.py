@@ -24,7 +24,7 @@ from bstcad.measured.compensation import Round, Settings, Statistics
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import FULL, Effort
-from bstcad.report.production import write_production_page
+from bstcad.report.production import FIGURES, ROUND_REMEDY, ROUNDS, read_round, write_production_page
 from bstcad.report.shop_figures import correction_figure
 from bstcad.report.units import quantity
 from bstcad.runs import files
@@ -32,7 +32,6 @@ from bstcad.runs.files import SceneError
 from bstcad.scene.schema import MAX_CONTROL_POINTS
 from bstcad.shop import by_light
 
-ROUNDS, FIGURES = "compensated", "compensation.json"  # folder of the rounds, and file of a round
 FILTER = "Gaussian, ISO 16610-61"
 RATING_ACCURACY = 0.05  # relative error of the RRMSDs from which the cutoff is chosen
 Progress = Callable[[str, int, int, str], None]
@@ -118,13 +117,15 @@ def _last(folder: Path, lens: Lens) -> tuple[BSplineSurface, list[Statistics], s
     before, used, cut, number = [], set(), lens.back_net, 1
     while (place := folder / ROUNDS / f"round-{number}").is_dir():
         try:
-            figures = json.loads((place / FIGURES).read_text(encoding="utf-8"))
-            before.append(Statistics(float(figures["deviation"]["pv_mm"]), float(figures["deviation"]["rms_mm"])))
-            used |= {each["sha256"] for each in figures["clouds"]}
+            figures = read_round(place)
+        except ValueError as error:
+            raise SceneError(error) from None
+        before.append(Statistics(figures.deviation.pv_mm, figures.deviation.rms_mm))
+        used |= {each.sha256 for each in figures.clouds}
+        try:
             net = files.net(place / folders.DESIGN, MAX_CONTROL_POINTS)
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            remedy = "remove this folder and the later rounds to begin again from the round before"
-            raise SceneError(f"{place}: cannot be read ({files.first_line(error)}); {remedy}") from None
+        except ValueError as error:
+            raise SceneError(f"{place / folders.DESIGN}: cannot be read ({error}); {ROUND_REMEDY}") from None
         if net.shape[:2] != cut.shape:
             raise SceneError(f"{place}: is of another design; remove the folder {folder / ROUNDS}")
         cut = BSplineSurface.from_control_points(net, lens.back_net.z)

@@ -61,6 +61,24 @@ def test_arrays_come_back_as_numbers(tmp_path, kind, save):
     assert files.names(tmp_path / "x.npz") == ["net", "flat", "one", "more"] and files.names(tmp_path / "none") == []
 
 
+def test_every_damage_of_an_archive_is_a_value_error(tmp_path):
+    path, rng = tmp_path / "x.npz", np.random.default_rng(1)
+    np.savez_compressed(path, control_points=rng.normal(size=(9, 9, 3)), flat=np.zeros((3, 4)))
+    whole, refused = path.read_bytes(), 0
+    for _ in range(300):
+        content = bytearray(whole[: rng.integers(1, len(whole) + 1)] if rng.random() < 0.3 else whole)
+        for place in rng.integers(0, len(content), 4):
+            content[place] = rng.integers(256)
+        path.write_bytes(content)
+        for read in (lambda: files.net(path, 100), lambda: files.arrays(path, {"flat": (3, 4)}, 10_000)):
+            try:
+                read()
+            except ValueError:
+                refused += 1
+        assert isinstance(files.names(path), list)
+    assert refused > 300  # the others have changed bytes that the checksums of the archive do not cover
+
+
 # --- one run at a time ------------------------------------------------------------------------------------------------
 
 

@@ -1,6 +1,7 @@
 """Rounds of cutting and measuring in a simulated shop, whose errors the code under test does not know."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -23,6 +24,7 @@ from bstcad.optics.bspline import BSplineSurface, interpolating_net
 from bstcad.optics.measure import Effort
 from bstcad.optics.surfaces import sag
 from bstcad.shop import by_light
+from bstcad.shop import rounds as rounds_of_shop
 from tests.conftest import quick_effort
 
 POINTS, GAUGE, MISPLACED, TURNED = 10_000, 20e-6, 0.03, 0.05  # number, noise (mm), mm, degrees
@@ -224,3 +226,70 @@ def test_a_folder_remembers_its_rounds(lens, small_design, tmp_path, capsys, mon
     with pytest.raises(SystemExit) as ended:
         cli.main(["compensate", str(folder), "--measured", str(path)])
     assert ended.value.code == 2 and "an earlier round has used this cloud" in capsys.readouterr().err
+
+
+def put(folder, **changes):
+    """Write a first round of the design in `folder`, with these entries changed."""
+    place = folder / "compensated" / "round-1"
+    place.mkdir(parents=True)
+    size = {"pv_mm": 1e-3, "rms_mm": 1e-4}
+    figures = {
+        "round": 1, "parts": 1, "clouds": [{"file": "a.csv", "sha256": "ab", "points": 100}], "gain": 1.0,
+        "filter": "Gaussian", "cutoff_mm": 1.0, "deviation": size, "correction": size, "expected_deviation": size,
+        "by": "form", "volume_mm3": 1.0, "volume_by_form_mm3": 1.0, "may_stay": None, "standard_error_mm": 1e-5,
+        "noise_mm": 1e-5, "rrmsd": {"design": 0.01, "measured": 0.02, "expected": 0.01},
+    }  # fmt: skip
+    (place / "compensation.json").write_text(json.dumps(figures | changes))
+    shutil.copy(folder / "design.npz", place / "design.npz")
+    return place
+
+
+def size_of(text):
+    return lambda place: rewrite(place, lambda whole: whole.replace("0.001", text, 1))
+
+
+def rewrite(place, change):
+    path = place / "compensation.json"
+    path.write_text(change(path.read_text()))
+
+
+def flipped(place):
+    """Change a byte in the compressed control points."""
+    content = bytearray((place / "design.npz").read_bytes())
+    content[200] ^= 255
+    (place / "design.npz").write_bytes(content)
+
+
+def net_of_nan(place):
+    np.savez_compressed(place / "design.npz", control_points=np.full((33, 33, 3), np.nan))
+
+
+DAMAGED_ROUNDS = {
+    "NaN": size_of("NaN"),
+    "a text NaN": size_of('"NaN"'),
+    "beyond floats": size_of("1e400"),
+    "a long integer": size_of("9" * 400),
+    "negative": size_of("-0.001"),
+    "true": size_of("true"),
+    "deep": lambda place: rewrite(place, lambda whole: "[" * 200_000),
+    "a hash that is a list": lambda place: rewrite(place, lambda whole: whole.replace('"ab"', "[1]")),
+    "no figures": lambda place: rewrite(place, lambda whole: '{"deviation": {"pv_mm": 1e-3, "rms_mm": 1e-4}}'),
+    "not UTF-8": lambda place: (place / "compensation.json").write_bytes(b'{"round": "\xff"}'),
+    "missing": lambda place: (place / "compensation.json").unlink(),
+    "a cut net": lambda place: os.truncate(place / "design.npz", 3000),
+    "an empty net": lambda place: os.truncate(place / "design.npz", 0),
+    "a changed byte": flipped,
+    "a net of NaN": net_of_nan,
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED_ROUNDS)
+def test_a_damaged_round_is_refused_in_one_sentence(small_design, lens, tmp_path, damage):
+    folder = tmp_path / "design"
+    folder.mkdir()
+    shutil.copy(small_design.folder / "design.npz", folder)
+    place = put(folder)
+    assert rounds_of_shop._last(folder, lens)[1:] == ([Statistics(1e-3, 1e-4)], {"ab"})
+    DAMAGED_ROUNDS[damage](place)
+    with pytest.raises(bstcad.SceneError, match=r"round-1/\S+: cannot be read .*; remove the folder of this round"):
+        rounds_of_shop._last(folder, lens)
