@@ -210,7 +210,7 @@ def _write_and_prove(
     began = time.perf_counter()
     progress("write", 0, 1, "STEP, STL, 3MF")
     drawn.solid(made.lens)  # the designed lens is drawn while OCC writes and reads the file
-    with scene_errors(f"{made.scene.name}: "):  # raised if the tailored faces do not bound a solid
+    with scene_errors(made.scene.name):  # raised if the tailored faces do not bound a solid
         write_3mf = folders.write_geometry(made, folder, processes.submit)
     processes.return_freed()
     with ThreadPoolExecutor(1) as beside:
@@ -278,12 +278,13 @@ def _second_process_ended() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def scene_errors(where: str = "") -> Iterator[None]:
-    """Raise a ValueError of the block as a SceneError, with `where` before its sentence."""
+def scene_errors(subject: Path | str = "") -> Iterator[None]:
+    """Raise a ValueError of the block as a SceneError, with `subject`, such as a file, once at the beginning."""
     try:
         yield
     except ValueError as error:
-        raise SceneError(f"{where}{error}") from error
+        sentence = str(error).removeprefix(f"{Path(subject).name}: ")
+        raise SceneError(f"{subject}: {sentence}" if subject else sentence) from error
 
 
 # --- verify -----------------------------------------------------------------------------------------------------------
@@ -315,7 +316,7 @@ def verify(
         with scene_errors():  # reads the cloud first, since the next steps are slow
             cloud, part = clouds.load(measured, made.lens.apertures[1]) if measured else None, None
         with (options.drawing or Pictures)(made.scene, processes.submit) as drawn:
-            with scene_errors(f"{path}: "):
+            with scene_errors(path):
                 proof = _prove_files(made, path, drawn, options, progress=progress)
             drawn.solid(proof.lens)
             judged: list[Comparison] = []
@@ -388,7 +389,7 @@ def retailor(
 def examine(path: Path) -> Examined:
     """Examine a single STEP file: checks and dimensions of the solid, without a design."""
     beginning.check(path)
-    with scene_errors(f"{path}: "):
+    with scene_errors(path):
         found = checks.examine(path, processes.submit)
     passed = all(check.passed for check in found.checks)
     stated = [check.value for check in found.checks if check.id == "stated-density"]
@@ -557,7 +558,7 @@ def export(
     """
     with folders.amending(folder) as amended:
         made = read(folder)
-        with scene_errors("export: "):
+        with scene_errors("export"):
             tiling = exports.DEFAULT_TILING if tiles is None else Tiling.parse(tiles)
             written = _export(made, kinds, amended, points=points, cutting=_cutting(cutting), tiling=tiling)
         if exports.SHEET in kinds:

@@ -103,7 +103,8 @@ def read_net(path: Path) -> FileNet:
     try:
         net = _net_of_step(path) if path.suffix.lower() in (".step", ".stp") else files.net(path, MAX_CONTROL_POINTS)
     except ValueError as error:
-        raise SceneError(f"lens.front.file: {name} cannot be read ({files.first_line(error)}); {NET_REMEDY}") from None
+        reason = files.first_line(error).removeprefix(f"{path.name}: ")
+        raise SceneError(f"lens.front.file: {name} cannot be read ({reason}); {NET_REMEDY}") from None
     shape = net.shape[:2]
     axes = (np.linspace(net[0, 0, i], net[-1, -1, i], count) for i, count in enumerate(shape))
     uniform = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)

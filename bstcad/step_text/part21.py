@@ -39,6 +39,7 @@ SURFACE = re.compile(
     rf"(\d{{1,9}}),(\d{{1,9}}),\(\((.*?)\)\),\.\w+\.,{FLAG},{FLAG},{FLAG},"
     rf"\(({COUNTS})\),\(({COUNTS})\),\(({REALS})\),\(({REALS})\),\.\w+\.\)"
 )
+KNOT_SPECIFICATION = re.compile(r"\.\w+\.\)")  # last attribute of a B_SPLINE_SURFACE_WITH_KNOTS
 VALIDATION, MATERIAL = "geometric validation property", "material property"  # names of two kinds of properties
 PREFIXES = {"$": 1.0, ".MICRO.": 1e-6, ".MILLI.": 1e-3, ".CENTI.": 1e-2, ".DECI.": 1e-1, ".KILO.": 1e3}
 UNITS = {"METRE": 1e3, "GRAM": 1.0}  # SI units in mm and g
@@ -50,7 +51,7 @@ UNREADABLE = (LookupError, AttributeError, TypeError, ArithmeticError)  # errors
 
 @dataclass(frozen=True)
 class FreeformSurface:
-    """A B_SPLINE_SURFACE_WITH_KNOTS as written.  Rational surfaces are other entities, and are not freeform faces."""
+    """A B_SPLINE_SURFACE_WITH_KNOTS as written, or a rational surface, whose weights are then equal."""
 
     degrees: tuple[int, int]  # degrees in u and v
     control_points: np.ndarray  # control net, (m, n, 3), mm, in the frame of the file, u along the first axis
@@ -271,6 +272,7 @@ def _freeform_surfaces(entities: Entities) -> list[FreeformSurface]:
     """Return the back, then the front if it is a net, in the file's unit, without the placement of the solid."""
     attributes = {n: body.partition("',")[2] for n, body in entities.of("B_SPLINE_SURFACE_WITH_KNOTS").items()}
     bodies = [(number, body) for number, body in attributes.items() if not RULED.match(body)]
+    bodies += _rational_surfaces(entities)
     bodies.sort(key=lambda each: each[1].count("#"), reverse=True)
     if not bodies:
         raise ValueError("the file has no B_SPLINE_SURFACE_WITH_KNOTS; give a file written by bstcad")
@@ -283,6 +285,31 @@ def _freeform_surfaces(entities: Entities) -> list[FreeformSurface]:
         if (normal + its_normal) @ (middle - other) < 0:
             surfaces.reverse()
     return surfaces
+
+
+def _rational_surfaces(entities: Entities) -> Iterator[tuple[str, str]]:
+    """Yield (number, attributes as of a B_SPLINE_SURFACE_WITH_KNOTS) of rational freeform surfaces with equal weights.
+
+    Such a surface is an entity of several kinds, in the order of their names.  Equal weights cancel out; ValueError for
+    others.
+    """
+    for number, body in entities.of("COMPLEX").items():
+        net, _, rest = body.partition("B_SPLINE_SURFACE(")[2].partition(")B_SPLINE_SURFACE_WITH_KNOTS(")
+        if not rest or RULED.match(net) or net.count("#") <= CONIC_NET:
+            continue
+        end = required(KNOT_SPECIFICATION.search(rest)).end()
+        if "RATIONAL_B_SPLINE_SURFACE(" in rest[end:]:
+            text = rest[end:].partition("RATIONAL_B_SPLINE_SURFACE(((")[2].partition("))")[0].replace("),(", ",")
+            if not re.fullmatch(REALS, text) or text.count(",") != net.count("#") - 1:
+                raise damaged(f"the weights of the surface #{number} are malformed, or not one per control point")
+            weights = np.fromstring(text, dtype=np.float64, sep=",")
+            low, high = weights.min(), weights.max()
+            if not 0 < low == high:
+                raise ValueError(
+                    f"the freeform surface #{number} is rational with weights from {low:.6g} to {high:.6g}, and a face "
+                    "by bstcad has none; give a file written by bstcad"
+                )
+        yield number, f"{net},{rest[:end]}"
 
 
 def _middle_and_normal(surface: FreeformSurface) -> tuple[np.ndarray, np.ndarray]:

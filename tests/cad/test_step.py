@@ -11,12 +11,14 @@ import pytest
 import torch
 from scipy.interpolate import NdBSpline
 
+from bstcad import commands
 from bstcad.cad import step_reading, step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.optics.bspline import knots, parameter
 from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.surfaces import Sphere
 from bstcad.runs import processes
+from bstcad.runs.files import SceneError
 from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks
 
@@ -78,6 +80,29 @@ def test_a_net_moved_sideways_is_no_lens_of_ours(make_lens, tmp_path):
     path.write_text(path.read_text().replace("-10.50000000000000", "-10.40000000000000"))
     with pytest.raises(ValueError, match="a uniform grid"):
         step_reading.read(path)
+
+
+@pytest.mark.parametrize(("weight", "fault"), [("1.", ""), ("1.01", "rational with weights from 1 to 1.01")])
+def test_a_face_with_weights_is_the_same_face_or_refused(make_lens, tmp_path, weight, fault):
+    """The file's name is stated once."""
+    path, lens = tmp_path / "lens.step", make_lens(m=9)
+    step_writing.write_lens(lens, path, "lens")
+    written = re.search(r"B_SPLINE_SURFACE_WITH_KNOTS\('',(2,2,.*?\.[FU]\.),(\(3.*?)\);", path.read_text(), re.DOTALL)
+    weights = ",".join(f"({','.join(['1.'] * 9)})" for _ in range(8)) + f",({','.join(['1.'] * 8)},{weight})"
+    complex_entity = (
+        f"(BOUNDED_SURFACE()B_SPLINE_SURFACE({written[1]})B_SPLINE_SURFACE_WITH_KNOTS({written[2]})"
+        f"GEOMETRIC_REPRESENTATION_ITEM()RATIONAL_B_SPLINE_SURFACE(({weights}))REPRESENTATION_ITEM('')SURFACE());"
+    )
+    path.write_text(path.read_text().replace(written[0], complex_entity))
+    if not fault:
+        found = commands.examine(path)
+        assert (
+            found.passed and np.abs(step_reading.read(path).control_points - lens.back.control_points()).max() <= EXACT
+        )
+        return
+    with pytest.raises(SceneError, match=fault) as caught:
+        commands.examine(path)
+    assert str(caught.value).count("lens.step") == 1
 
 
 @pytest.mark.parametrize("name", ["lens", "it's 2\" wide; (a) #1", "Prägelinse 鏡 \\ 𝄞"])

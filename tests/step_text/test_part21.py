@@ -110,6 +110,35 @@ def test_edge_uses_count_the_direction_of_edge_and_bound(loop, second, uses):
     assert (found.solids, found.faces) == (1, 2)
 
 
+def rational(weights) -> str:
+    """The surface as an entity of several kinds, with weights (4, 4), as other programs write it."""
+    rows = ",".join(
+        "(" + ",".join(f"{each:.17G}." if each == 1 else f"{each:.6f}" for each in row) + ")" for row in weights
+    )
+    return (
+        f"#50 = ( BOUNDED_SURFACE() B_SPLINE_SURFACE(2,2,{GRID},.UNSPECIFIED.,.F.,.F.,.U.)\n"
+        f" B_SPLINE_SURFACE_WITH_KNOTS({KNOTS},.UNSPECIFIED.) GEOMETRIC_REPRESENTATION_ITEM()\n"
+        f" RATIONAL_B_SPLINE_SURFACE(({rows})) REPRESENTATION_ITEM('') SURFACE() );\n"
+    )
+
+
+@pytest.mark.parametrize("weight", [1, 0.7])
+def test_a_rational_surface_with_equal_weights_is_the_same_surface(weight):
+    plain, found = (part21.parse(text(each)).surface for each in (SIMPLE, rational(np.full((4, 4), weight))))
+    assert np.array_equal(found.control_points, plain.control_points) and found.degrees == (2, 2)
+    assert all(map(np.array_equal, found.full_knots, plain.full_knots)) and found.entity == "50"
+    assert found.closed == (False, False) and found.self_intersecting is None
+
+
+def test_other_weights_are_named():
+    weights = np.ones((4, 4))
+    weights[1, 2] = 1.01
+    with pytest.raises(ValueError, match="#50 is rational with weights from 1 to 1.01, and a face"):
+        part21.parse(text(rational(weights)))
+    with pytest.raises(ValueError, match="the weights of the surface #50 are malformed, or not one per control point"):
+        part21.parse(text(rational(np.ones((4, 3)))))
+
+
 def test_a_face_outside_the_shell_uses_no_edge():
     found = part21.parse(text(SIMPLE + square().replace("(#87,#88)", "(#87)")))
     assert found.edge_uses == {80: (1, 0)} and not found.closed
