@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,6 +28,7 @@ from OCP.IFSelect import IFSelect_RetDone
 from OCP.Message import Message
 from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 from OCP.STEPControl import STEPControl_Reader
+from OCP.StepShape import StepShape_FaceSurface
 from OCP.TopAbs import TopAbs_EDGE, TopAbs_FACE, TopAbs_Orientation, TopAbs_ShapeEnum, TopAbs_SOLID, TopAbs_VERTEX
 from OCP.TopExp import TopExp
 from OCP.TopLoc import TopLoc_Location
@@ -55,6 +56,20 @@ POINTS_PER_SPAN = 4  # number of points sampled on an edge per knot span of a ne
 OccFace = tuple[TopoDS_Face, BRepAdaptor_Surface]
 
 
+class StatedFace(NamedTuple):
+    """Statements of a file on one face, which OCC reads without using them or corrects silently."""
+
+    name: str  # name of the face; "": none
+    consistent: bool  # True if its sense, .T. or .F., agrees with the directions of its edges
+
+
+class StatedSolid(NamedTuple):
+    """A solid as read from a STEP file, and what the file states on its faces."""
+
+    shape: TopoDS_Solid
+    faces: tuple[StatedFace, ...]  # statements on the faces, in the order of parts_of(shape, TopAbs_FACE)
+
+
 @dataclass(frozen=True)
 class StepLens:
     """A lens as read from a STEP file, in its own frame; lengths in mm."""
@@ -67,6 +82,17 @@ class StepLens:
     edge: np.ndarray | None  # points along the edge of the back, (n, 2), mm; None: a bare lens
     faces: tuple[TopoDS_Face, TopoDS_Face]  # front and back
     placement: Placement = field(default_factory=identity)  # placement of the lens's frame in the file
+    stated: tuple[StatedFace, ...] = ()  # statements on the faces of `shape`, as in StatedSolid
+
+    @property
+    def misnamed(self) -> str:
+        """First name, "back" or "front", that the file gives to another face, in words; "" if there is none."""
+        faces = dict(zip(("front", "back"), self.faces, strict=True))
+        for face, (name, _) in zip(parts_of(self.shape, TopAbs_FACE), self.stated, strict=True):
+            if name in faces and not face.IsSame(faces[name]):
+                own = next((f"the {role}" for role, other in faces.items() if face.IsSame(other)), "another face")
+                return f"the file gives the name '{name}' to {own}"
+        return ""
 
     @property
     def clear(self) -> tuple[Outline, Outline]:
@@ -98,7 +124,7 @@ def parts_of(shape: TopoDS_Shape, kind: TopAbs_ShapeEnum) -> list[TopoDS_Shape]:
     return [parts(i) for i in range(1, parts.Extent() + 1)]
 
 
-def solid(path: Path) -> TopoDS_Solid:
+def solid(path: Path) -> StatedSolid:
     """Read the solid in a STEP file; ValueError if there is not exactly one."""
     reader = STEPControl_Reader()
     with quiet_occ():
@@ -109,15 +135,29 @@ def solid(path: Path) -> TopoDS_Solid:
     solids = [] if shape.IsNull() else parts_of(shape, TopAbs_SOLID)
     if len(solids) != 1:
         raise ValueError(f"{path.name}: OpenCASCADE finds {len(solids)} solids instead of one; write it again")
-    return TopoDS.Solid_s(solids[0])
+    return StatedSolid(TopoDS.Solid_s(solids[0]), tuple(_stated_faces(reader, solids[0])))
 
 
-def read(path: str | Path, shape: TopoDS_Solid | None = None) -> StepLens:
-    """Read the lens in a STEP file; ValueError unless the file has one lens.  shape: its solid, if already read."""
+def _stated_faces(reader: STEPControl_Reader, shape: TopoDS_Shape) -> Iterator[StatedFace]:
+    """Yield the statements on each face; where sense and edges contradict each other, OCC reverses the face."""
+    transfer = reader.WS().TransferReader()
+    for face in parts_of(shape, TopAbs_FACE):
+        stated = transfer.EntityFromShapeResult(face, 1)
+        if not isinstance(stated, StepShape_FaceSurface):  # a face that OCC has divided
+            yield StatedFace("", True)
+            continue
+        name = stated.Name()
+        forward = face.Orientation() != TopAbs_Orientation.TopAbs_REVERSED
+        yield StatedFace("" if name is None else name.ToCString(), forward == stated.SameSense())
+
+
+def read(path: str | Path, stated: StatedSolid | None = None) -> StepLens:
+    """Read the lens in a STEP file; ValueError unless the file has one lens.  stated: its solid, if already read."""
     path = Path(path)
     try:
-        found, placement = in_own_frame(shape or solid(path))
-        return replace(_lens_in(found), placement=placement)
+        shape, faces = stated or solid(path)
+        found, placement = in_own_frame(shape)
+        return replace(_lens_in(found), placement=placement, stated=faces)
     except ValueError as error:
         raise ValueError(f"{path.name}: read by OpenCASCADE: {error}") from error
 

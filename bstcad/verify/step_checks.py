@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from bstcad.analysis.shape import thickness_range
 from bstcad.cad import mounting, solid_properties, step_reading
 from bstcad.cad.solid_properties import WholePart
-from bstcad.cad.step_reading import StepLens
+from bstcad.cad.step_reading import StatedFace, StatedSolid, StepLens
 from bstcad.optics import domes
 from bstcad.optics.bspline import BSplineSurface, is_net
 from bstcad.optics.lens import Lens
@@ -86,6 +86,7 @@ def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, .
     return (
         *_placement_checks(reread, form),
         *_solid_checks(reread.shape),
+        *_face_checks(reread.stated, reread),
         *_edge_checks(reread, nominal),
         *_form_checks(reread, nominal.back_net, form, points),
         *(_form_checks(reread, nominal.front_net, form, points, of="front") if nominal.shapes("front") else ()),
@@ -124,6 +125,7 @@ def examine(path: Path) -> ExaminedFile:
     checks = [
         *text_checks.structure_checks(text, lens_read.back_net.shape, any_unit=True),
         *_solid_checks(reread.shape),
+        *_face_checks(reread.stated, reread),
         *_edge_checks(reread, lens_read, bare=reread.edge is None),
         net_check(name, text.surface.control_points, placed(reread.control_points), id="net-two-readers"),
     ]
@@ -158,6 +160,16 @@ def _solid_checks(solid: Any, of_part: bool = False) -> Iterator[Check]:
     yield Check.true(valid, step_reading.is_valid(solid), id="solid-valid")
     name = f"{prefix}: largest gap at edges and vertices"
     yield Check.at_most(name, step_reading.gaps(solid), GAP_TOLERANCE, "mm", id="gaps")
+
+
+def _face_checks(faces: Sequence[StatedFace], lens: StepLens | None, prefix: str = "solid") -> Iterator[Check]:
+    """Check senses and names that the file states for its faces; lens: the lens with these faces (None: unreadable)."""
+    wrong = [face.name for face in faces if not face.consistent]
+    where = f"{len(wrong)} of {len(faces)} faces are reversed, first the face named '{wrong[0]}'" if wrong else ""
+    yield Check.true(f"{prefix}: senses of the faces agree with their edges", not wrong, where, id="face-senses")
+    if lens is not None:
+        name = f"{prefix}: faces with the names 'back' and 'front' are the back and the front"
+        yield Check.true(name, not lens.misnamed, lens.misnamed, id="face-names")
 
 
 def _edge_checks(reread: StepLens, lens: Lens, bare: bool = True) -> Iterator[Check]:
@@ -225,7 +237,7 @@ def _front_checks(reread: Surface, lens: Lens, tolerance: float) -> Iterator[Che
 
 
 @functools.lru_cache(maxsize=1)
-def _part(path: Path, stamp: object) -> tuple[StepText, Any]:
+def _part(path: Path, stamp: object) -> tuple[StepText, StatedSolid]:
     """Read the text of a part, then its solid by OCC; cached, because three jobs use them; stamp: see `_read`."""
     return part21.read_lens(path), step_reading.solid(path)
 
@@ -233,13 +245,19 @@ def _part(path: Path, stamp: object) -> tuple[StepText, Any]:
 @functools.lru_cache(maxsize=1)
 def _properties(path: Path, stamp: object) -> MassProperties | None:
     """Return area, volume and centroid of the solid of a part; cached, as in `_part`."""
-    return solid_properties.of_solid(_part(path, stamp)[1])
+    return solid_properties.of_solid(_part(path, stamp)[1].shape)
+
+
+@functools.lru_cache(maxsize=1)
+def _lens_in_part(path: Path, stamp: object) -> StepLens:
+    """Read the lens of a part by OCC; cached, as in `_part`."""
+    return step_reading.read(path, _part(path, stamp)[1])
 
 
 @one_sentence
 def whole_part(path: Path) -> tuple[Lens, WholePart | None]:
     """Read the lens of a part, with an arbitrary refractive index, and the part around it (None: a bare lens)."""
-    reread = step_reading.read(path, _part(path, _stamp(path))[1])
+    reread = _lens_in_part(path, _stamp(path))
     return step_reading.lens(reread, index=1.5), solid_properties.whole_part(reread, _properties(path, _stamp(path)))
 
 
@@ -252,7 +270,7 @@ def lens_of_part(folder: Path, designed: Lens, mount: Mount) -> Lens:
     path = folder / PART_FILE
     if not path.exists():
         raise ValueError(f"{PART_FILE}: is missing; generate the design again")
-    reread, up = step_reading.read(path, _part(path, _stamp(path))[1]), mount.origin(designed.front_vertex)
+    reread, up = _lens_in_part(path, _stamp(path)), mount.origin(designed.front_vertex)
     front, back, clear = reread.front, reread.back, reread.clear
     if domes.is_dome(designed):
         back, aperture = domes.in_chart_of(domes.radial_back(designed), back, clear[1])
@@ -272,9 +290,12 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
     if not path.exists():
         return (Check.true(f"{PART_FILE}: written", False, why, id="part-written"),)
     try:
-        text, solid = _part(path, _stamp(path))
+        text, (solid, faces) = _part(path, _stamp(path))
     except ValueError as error:
         return (Check.true(f"{PART_FILE}: can be read", False, str(error), id="part-readable"),)
+    reread = None
+    with contextlib.suppress(ValueError):  # the check of the clear apertures gives the reason
+        reread = _lens_in_part(path, _stamp(path))
     down = np.array([0.0, 0.0, mount.origin(lens.front_vertex)])
     net = lens.back_net.control_points() - down
     of_front = []
@@ -293,6 +314,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
         net_check(name, text.surface.control_points, net, id="control-points"),
         *of_front,
         *_solid_checks(solid, of_part=True),
+        *_face_checks(faces, reread, PART_FILE),
         _part_edge_check(wanted, solid, why),
         *stated,
         *text_checks.part_checks(text, part, PART_FILE),

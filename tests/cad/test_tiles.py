@@ -47,7 +47,7 @@ def lens_of(name, m=25):
 def reread(tile, path):
     """The solid in the file of a tile, and its faces by the names that the tile has for them."""
     path.write_bytes(tile.step("plate", Part()))
-    solid = step_reading.solid(path)
+    solid = step_reading.solid(path).shape
     assert step_reading.is_valid(solid) and step_reading.gaps(solid) <= 1e-7
     return solid, dict(zip(tile.faces, map(TopoDS.Face_s, step_reading.parts_of(solid, TopAbs_FACE)), strict=True))
 

@@ -161,7 +161,7 @@ def test_the_placement_of_a_step_file_is_applied(earlier, how):
 
 def placed(earlier, place):
     """The lens of a folder as an assembly of another program has it."""
-    solid = cadquery.Shape.cast(step_reading.solid(earlier / "lens.step"))
+    solid = cadquery.Shape.cast(step_reading.solid(earlier / "lens.step").shape)
     cadquery.Assembly(name="whole").add(solid, name="lens", loc=place).export(str(earlier / "placed.step"))
     return earlier / "placed.step"
 
