@@ -146,9 +146,10 @@ def _stated_faces(reader: STEPControl_Reader, shape: TopoDS_Shape) -> Iterator[S
         if not isinstance(stated, StepShape_FaceSurface):  # a face that OCC has divided
             yield StatedFace("", True)
             continue
-        name = stated.Name()
-        forward = face.Orientation() != TopAbs_Orientation.TopAbs_REVERSED
-        yield StatedFace("" if name is None else name.ToCString(), forward == stated.SameSense())
+        name, forward = "", face.Orientation() != TopAbs_Orientation.TopAbs_REVERSED
+        with contextlib.suppress(UnicodeDecodeError, AttributeError):  # AttributeError: the face has no name
+            name = stated.Name().ToCString()
+        yield StatedFace(name, forward == stated.SameSense())
 
 
 def read(path: str | Path, stated: StatedSolid | None = None) -> StepLens:

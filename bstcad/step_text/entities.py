@@ -6,6 +6,7 @@ readers read it as zero or hang.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -36,6 +37,10 @@ TOKENS = re.compile(  # tokens without blanks: separators, references, numbers, 
     r"|[-+]?\d{1,99}+(?:\.\d{0,99}+(?:[Ee][-+]?\d{1,9}+)?)?(?=[,)])|\"[0-9A-F]*+\""
 )  # matching takes linear time: a failed match has a bounded length, or contains its first character only once
 LONG_NUMBER = re.compile(rf"(?<=[(,])[-+.\d][-+.\dEe]{{{MAX_NUMBER_LENGTH},}}")
+DIRECTIVE = re.compile(  # \X2\, \X4\, \X\ with hexadecimal digits, page of ISO 8859, character of this page, backslash
+    r"\\X2\\((?:[0-9A-F]{4})*+)\\X0\\|\\X4\\((?:[0-9A-F]{8})*+)\\X0\\|\\X\\([0-9A-F]{2})|\\P([A-I])\\|\\S\\([ -~])|\\\\"
+)
+CHINESE = re.compile(r"[\u4e00-\u9fff]{2}")  # two letters of Windows-1252, such as öß, can be one Chinese character
 HUGE_NUMBER = re.compile(r"(?<=[(,])[-+]?\d++\.\d*+[Ee]\+?\d{3,}+")  # number with an exponent of 100 or more
 
 
@@ -139,11 +144,36 @@ def damaged(fault: str) -> ValueError:
 
 
 def decode(string: str) -> str:
-    """Decode a string of Part 21 (without its quotes) into one line of text."""
-    text = re.sub(r"[\r\n]", "", string).replace("''", "'")
-    wide, byte = re.compile(r"\\X2\\((?:[0-9A-F]{4})*)\\X0\\"), re.compile(r"\\X\\([0-9A-F]{2})")
-    text = wide.sub(lambda hit: bytes.fromhex(hit[1]).decode("utf-16-be", "replace"), text)
-    return one_line(byte.sub(lambda hit: chr(int(hit[1], 16)), text))
+    """Decode a string of Part 21 (without its quotes; a character per byte) into one line of text."""
+    page = "iso8859-1"
+
+    def character(hit: re.Match[str]) -> str:
+        nonlocal page
+        two_bytes, four_bytes, byte, letter, shifted = hit.groups()
+        if letter:
+            page = f"iso8859-{ord(letter) - ord('A') + 1}"
+            return ""
+        if shifted:
+            return bytes([ord(shifted) + 128]).decode(page, "replace")
+        if byte:
+            return chr(int(byte, 16))
+        if two_bytes is None and four_bytes is None:
+            return "\\"
+        return bytes.fromhex(two_bytes or four_bytes or "").decode(f"utf-{32 if four_bytes else 16}-be", "replace")
+
+    text = _text_of_bytes(re.sub(r"[\r\n]", "", string)).replace("''", "'")
+    return one_line(DIRECTIVE.sub(character, text))
+
+
+def _text_of_bytes(string: str) -> str:
+    """Decode bytes above 127, which Part 21 does not allow and some programs write: UTF-8, GB18030 or Windows-1252."""
+    data = string.encode("latin-1", "replace")
+    for encoding in () if data.isascii() else ("utf-8", "gb18030", "cp1252"):
+        with contextlib.suppress(UnicodeDecodeError):
+            text = data.decode(encoding)
+            if encoding != "gb18030" or CHINESE.search(text):
+                return text
+    return string
 
 
 def _check_tokens(rest: str, hits: Sequence[re.Match[str]]) -> None:

@@ -114,6 +114,16 @@ def test_any_name_survives(make_lens, tmp_path, name):
     assert (tmp_path / "lens.step").read_bytes().isascii()
 
 
+@pytest.mark.parametrize("encoding", ["cp1252", "gb18030"])
+def test_names_in_raw_bytes_are_read(make_lens, tmp_path, encoding):
+    """OCC takes them for UTF-8, which they are not."""
+    path, name = tmp_path / "lens.step", {"cp1252": "Größe 3 – étui", "gb18030": "自由曲面"}[encoding]
+    step_writing.write_lens(make_lens(m=9), path, "lens")
+    raw = name.encode(encoding)
+    path.write_bytes(path.read_bytes().replace(b"'lens'", b"'" + raw + b"'").replace(b"('rim'", b"('" + raw + b"'"))
+    assert part21.read(path).product == name and commands.examine(path).passed
+
+
 DAMAGES = {
     "empty": (lambda t: "", "not a STEP file"),
     "truncated": (lambda t: t[: len(t) // 2], "truncated"),

@@ -55,6 +55,27 @@ def test_names_units_and_schema():
     assert (found.unit, found.schema, found.solids) == ("millimetre", "AP242_X", 0)
 
 
+TITLE = "Größe 3 – étui"
+STRINGS = {  # strings of a file and their text, in the forms that programs write
+    "UTF-8": (TITLE.encode(), TITLE),
+    "Windows-1252": (TITLE.encode("cp1252"), TITLE),
+    "GB18030": ("自由曲面透镜 3号".encode("gb18030"), "自由曲面透镜 3号"),
+    "GB18030 with a quote": ("透镜''𠀀".encode("gb18030"), "透镜'𠀀"),
+    "X2": (b"Gr\\X2\\00F600DF\\X0\\e 3 \\X2\\2013\\X0\\ \\X2\\00E9\\X0\\tui", TITLE),
+    "X4": (b"\\X4\\0001D11E00000041\\X0\\", "𝄞A"),
+    "X": (b"Gr\\X\\F6\\X\\DFe, \\X\\E9tui", "Größe, étui"),
+    "S": (b"Gr\\S\\v\\S\\_e, \\S\\itui \\PE\\\\S\\0", "Größe, étui А"),  # page E: ISO 8859-5, Cyrillic
+    "backslash": (b"a\\\\X2\\\\b", r"a\X2\b"),
+}
+
+
+@pytest.mark.parametrize("form", STRINGS)
+def test_names_are_read_whole_in_each_form(form):
+    written, name = STRINGS[form]
+    head, tail = text(product="#60 = PRODUCT('?','','',());\n").encode().split(b"?")
+    assert part21.parse(head + written + tail).product == name
+
+
 MILLI = "SI_UNIT(.MILLI.,.METRE.)"
 INCH = UNITS.replace(MILLI, "CONVERSION_BASED_UNIT('INCH',#902)") + (
     "#902 = LENGTH_MEASURE_WITH_UNIT(LENGTH_MEASURE(2.54),#903);\n"
