@@ -168,6 +168,7 @@ def verify(
     read_part = None if mount is None else submit(jobs.read_lens_of_part, path.parent, nominal.lens, mount)
     solid_checks = _check_solids(path, nominal, part, effort.points, submit=submit)
     text = _read_text(path, read)
+    text_checks.check_size(text, nominal.lens, path.name)
     mesh = meshes.read_stl(folder / "lens.stl")
     closed = Check.true("STL: watertight, winding consistent", meshes.is_closed(mesh), id="mesh-closed")
     return_freed()  # memory of the texts

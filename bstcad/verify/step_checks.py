@@ -270,6 +270,7 @@ def lens_of_part(folder: Path, designed: Lens, mount: Mount) -> Lens:
     path = folder / PART_FILE
     if not path.exists():
         raise ValueError(f"{PART_FILE}: is missing; generate the design again")
+    text_checks.check_size(_part(path, _stamp(path))[0], designed, PART_FILE)
     reread, up = _lens_in_part(path, _stamp(path)), mount.origin(designed.front_vertex)
     front, back, clear = reread.front, reread.back, reread.clear
     if domes.is_dome(designed):
@@ -291,6 +292,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
         return (Check.true(f"{PART_FILE}: written", False, why, id="part-written"),)
     try:
         text, (solid, faces) = _part(path, _stamp(path))
+        text_checks.check_size(text, lens, PART_FILE)
     except ValueError as error:
         return (Check.true(f"{PART_FILE}: can be read", False, str(error), id="part-readable"),)
     reread = None

@@ -22,6 +22,8 @@ from bstcad.verify.verdict import Check
 SOURCE = "STEP text"  # source of the checked values, at the beginning of the checks' names
 NET_TOLERANCE = 1e-11  # absolute tolerance of control points (mm), larger than their rounding in the text
 RELATIVE_ROUNDING = 2e-15  # relative tolerance of coordinates, larger than NET_TOLERANCE beyond 5 m from the origin
+MIN_SCALE_ERROR = 1e-6  # smallest difference from 1 of a scale that is named
+SCALED_ROUNDING = 1e-9  # largest rounding error of a scaled net, relative to its largest coordinate
 MEASURE_TOLERANCE = 1e-6  # relative tolerance of area and volume, and of centroid / diagonal; integrals err by 1e-9
 VALUE_TOLERANCE = 1e-12  # absolute tolerance of stated numbers (mm or g/cm³), more than their rounding in the text
 
@@ -37,6 +39,25 @@ def lens_checks(text: StepText, lens: Lens) -> list[Check]:
         name, front = f"{SOURCE}: deviation of the control points of the front", lens.front_net.control_points()
         checks.append(net_check(name, net_of_front(text), front, id="control-points"))
     return checks
+
+
+def check_size(text: StepText, lens: Lens, file: str) -> None:
+    """Raise ValueError if the back in a file is the designed one at another scale, about any point.
+
+    A lens and its light scale together, so that many checks would fail and none would name the scale.
+    """
+    read, designed = text.surface.control_points, lens.back_net.control_points()
+    if read.shape != designed.shape:
+        return
+    read, designed = (net - net.mean(axis=(0, 1)) for net in (read, designed))
+    scale = float((read * designed).sum() / (designed * designed).sum())
+    size = float(np.abs(read).max())
+    if abs(scale - 1) > MIN_SCALE_ERROR and np.abs(read - scale * designed).max() <= SCALED_ROUNDING * size:
+        times = f"{scale:.6g} times"
+        raise ValueError(
+            f"{file}: it is {times} as large as the design, so that its picture stands at {times} the distance; "
+            "export it without scaling, or generate the design again"
+        )
 
 
 def net_of_front(text: StepText) -> np.ndarray:

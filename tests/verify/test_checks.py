@@ -17,7 +17,7 @@ import bstcad
 from bstcad import cli
 from bstcad.analysis import shape
 from bstcad.cad import mesh as meshes
-from bstcad.cad import step_reading
+from bstcad.cad import step_reading, step_writing
 from bstcad.folder import read_nominal
 from bstcad.optics import measure
 from bstcad.optics.measure import CellError, Effort, Light
@@ -224,6 +224,16 @@ def test_a_step_file_that_holds_no_such_lens_is_one_sentence(folder, nominal, ch
     with pytest.raises(ValueError, match=rf"lens\.step: .*{sentence}") as caught:
         checks.verify(folder, nominal)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0])
+def test_a_scaled_lens_is_named_by_its_scale(folder, nominal, scale):
+    path = folder / "lens.step"
+    solid = cadquery.Shape.cast(step_reading.solid(path).shape).scale(scale)
+    step_writing.write(solid, path, "lens")
+    sentence = f"lens.step: it is {scale:g} times as large as the design, so that its picture stands at {scale:g} times"
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        checks.verify(folder, nominal)
 
 
 def test_a_solid_that_occ_calls_invalid_fails(folder, nominal, monkeypatch):
