@@ -14,7 +14,8 @@ import io
 import math
 import zipfile
 from collections.abc import Callable
-from typing import Any
+from typing import IO, Any
+from xml.parsers import expat
 
 import numpy as np
 import sdfio
@@ -24,6 +25,10 @@ from bstcad.measured.point_text import UNITS_IN_MM, MeasuredPoints, make_points
 
 MAX_MAP_POINTS = 20_000_000  # largest number of points of a height map, for which 1 GB of memory is enough
 MAX_UNPACKED_SIZE = 1_000_000_000  # largest size (bytes) of the unpacked contents of a zip archive
+MAX_XML_SIZE = 10_000_000  # largest size (bytes) of the XML of an X3P file outside its list of data, as it is text
+MAX_XML_POINTS = 2_000_000  # largest number of elements of that list, each of which takes 96 bytes and 2 µs twice
+BYTES_PER_XML_POINT = 100  # largest mean size (bytes) of an element of that list
+XML_BLOCK = 1 << 16  # number of bytes of XML that are parsed at a time
 METRE = 1e3  # length of a metre (mm)
 FORMATS = (  # (offset of the first bytes that identify a format, these bytes, its name in sentences)
     (0, b"PK\x03\x04", "X3P"),
@@ -108,8 +113,12 @@ def _read_x3p(data: bytes) -> MeasuredPoints:
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         unpacked = sum(part.file_size for part in archive.infolist())
-    if unpacked > MAX_UNPACKED_SIZE:
-        raise _NotAMap(f"has {unpacked} bytes after decompression, and {MAX_UNPACKED_SIZE} are possible")
+        if unpacked > MAX_UNPACKED_SIZE:
+            raise _NotAMap(f"has {unpacked} bytes after decompression, and {MAX_UNPACKED_SIZE} are possible")
+        for part in archive.infolist():
+            if part.filename.endswith("main.xml"):
+                with archive.open(part) as file:
+                    _check_xml(file)
     info = x3pio.info(io.BytesIO(data), verify=False)
     _check_count(info.shape)
     if info.layer_count != 1:
@@ -124,6 +133,42 @@ def _read_x3p(data: bytes) -> MeasuredPoints:
         return _measured(METRE * points, f"{points.size // 3} points in the coordinates of the file")
     x_pitch, y_pitch = layer.spacing
     return _map_points(METRE * layer.z, METRE * x_pitch, METRE * y_pitch)
+
+
+def _check_xml(file: IO[bytes]) -> None:
+    """Raise _NotAMap if main.xml, which x3pio reads into memory as a whole, is too large or declares entities.
+
+    It is parsed in blocks, without a tree, up to the first excess.
+    """
+    parser, within, elements, listed = (
+        expat.ParserCreate(),
+        False,
+        0,
+        0,
+    )  # listed: bytes in lists of data; ends add, starts subtract
+
+    def begin(name: str, attributes: dict[str, str]) -> None:
+        nonlocal within, elements, listed
+        elements += within * (1 + len(attributes))
+        if name.rpartition(":")[2] == "DataList" and not within:
+            within, listed = True, listed - parser.CurrentByteIndex
+
+    def end(name: str) -> None:
+        nonlocal within, listed
+        if name.rpartition(":")[2] == "DataList" and within:
+            within, listed = False, listed + parser.CurrentByteIndex
+
+    def refuse(*declaration: object) -> None:
+        raise _NotAMap(f"declares entities in its main.xml; {EXPORT_HINT}")
+
+    parser.StartElementHandler, parser.EndElementHandler, parser.EntityDeclHandler = begin, end, refuse
+    while block := file.read(XML_BLOCK):
+        parser.Parse(block)
+        outside = -listed if within else parser.CurrentByteIndex - listed
+        if outside > MAX_XML_SIZE:
+            raise _NotAMap(f"has more than {MAX_XML_SIZE} bytes of XML besides its points; {EXPORT_HINT}")
+        if elements > MAX_XML_POINTS or parser.CurrentByteIndex > MAX_XML_SIZE + BYTES_PER_XML_POINT * MAX_XML_POINTS:
+            raise _NotAMap(f"lists more than {MAX_XML_POINTS} values as XML; export them in binary form")
 
 
 def _read_sdf(data: bytes) -> MeasuredPoints:

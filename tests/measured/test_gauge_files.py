@@ -1,6 +1,7 @@
 """Files of gauges: each format is read back with the truth it was written from, and each fault is one sentence."""
 
 import io
+import time
 import tracemalloc
 import zipfile
 
@@ -216,6 +217,46 @@ def test_a_profile_a_layer_too_many_and_a_bomb_are_refused(tmp_path):
     entry = bomb.index(b"PK\x01\x02")  # of main.xml in the directory of the archive
     bomb[entry + 24 : entry + 28] = (4 * 10**9).to_bytes(4, "little")
     assert "bytes after decompression, and 1000000000 are possible" in one_sentence(tmp_path, "x3p", bytes(bomb))
+
+
+def with_xml(change):
+    """An X3P file whose main.xml is changed."""
+    stream, data = io.BytesIO(), WRITERS["x3p"](map_of(), 0.3)
+    with (
+        zipfile.ZipFile(io.BytesIO(data)) as given,
+        zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+    ):
+        for name in given.namelist():
+            content = given.read(name)
+            archive.writestr(name, change(content) if name == "main.xml" else content)
+    return stream.getvalue()
+
+
+def test_xml_without_bounds_is_refused_before_it_is_read(tmp_path):
+    """40 MB of elements took a minute and 1 GB."""
+    begun = time.perf_counter()
+    outside = with_xml(lambda xml: xml.replace(b"</Record2>", b"<a/>" * 10_000_000 + b"</Record2>"))
+    assert "has more than 10000000 bytes of XML besides its points" in one_sentence(tmp_path, "x3p", outside)
+    within = with_xml(
+        lambda xml: xml.replace(b"<DataLink>", b"<DataList>" + b"<D/>" * 2_000_001 + b"</DataList><DataLink>")
+    )
+    assert "lists more than 2000000 values as XML; export them in binary" in one_sentence(tmp_path, "x3p", within)
+    assert time.perf_counter() - begun < 60
+    declared = b'<!DOCTYPE a [<!ENTITY b "c">]><p:ISO'
+    bomb = with_xml(lambda xml: xml.replace(b"<p:ISO", declared, 1))
+    assert "declares entities in its main.xml" in one_sentence(tmp_path, "x3p", bomb)
+
+
+def test_a_list_of_data_may_be_longer_than_other_xml(tmp_path, monkeypatch):
+    """Its bytes do not count among those of other XML."""
+    heights, stream = map_of(40), io.BytesIO()
+    x3pio.Surface.from_array(1e-3 * heights, x_scale=1e-4, y_scale=1e-4).save(stream, storage=x3pio.DataStorage.XML)
+    monkeypatch.setattr(point_grid, "MAX_XML_SIZE", 8_000)
+    monkeypatch.setattr(point_grid, "XML_BLOCK", 500)
+    found = loaded(tmp_path, "x3p", stream.getvalue())
+    assert found.points[:, 2] == pytest.approx(heights.ravel())
+    monkeypatch.setattr(point_grid, "MAX_XML_SIZE", 800)
+    assert "has more than 800 bytes of XML" in one_sentence(tmp_path, "x3p", stream.getvalue())
 
 
 def test_other_files_are_no_height_maps():
