@@ -224,6 +224,7 @@ def _write_and_prove(
         proof = _prove_files(made, folder, drawn, options, progress=progress)
         for work in parallel:
             work.result()
+    proof = replace(proof, checks=(*proof.checks, *checks.unit_checks(folder)))
     verified = time.perf_counter()
     last = (
         StageRecord("write", written - began),
@@ -318,6 +319,7 @@ def verify(
         with (options.drawing or Pictures)(made.scene, processes.submit) as drawn:
             with scene_errors(path):
                 proof = _prove_files(made, path, drawn, options, progress=progress)
+            proof = replace(proof, checks=(*proof.checks, *checks.unit_checks(path)))
             drawn.solid(proof.lens)
             judged: list[Comparison] = []
             for number, goal in enumerate(made.goals):

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import zipfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -381,6 +382,8 @@ TRIANGLE_XML = b'<triangle v1="%d" v2="%d" v3="%d"/>\n'
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 MAX_PROBES = 4096  # largest number of occupied slots that a corner may meet in the hash table (a fifth or more is free)
 STL_HEADER = b"bstcad, binary STL, lengths in mm"  # header, which must not start with "solid"
+MODEL_3MF = "3D/3dmodel.model"  # name of the model in a 3MF package
+MODEL_HEAD_BYTES = 4096  # number of bytes of the model that are searched for its unit of length
 MAX_LINE_BYTES = 90  # upper bound of the length of a line of a 3MF model (bytes)
 CLEAR_RGBA, MIRROR_RGBA = "#A9D3EE80", "#C9CED4FF"  # sRGB and opacity of clear material and of a mirror
 ARCHIVE_TIME = (1980, 1, 1, 0, 0, 0)  # time of the files in a 3MF package, so that equal meshes give equal bytes
@@ -513,9 +516,26 @@ def write_3mf(mesh: Mesh, path: str | Path | IO[bytes], label: Label = DEFAULT_L
     with zipfile.ZipFile(path, "w") as package:
         for name, text in (("[Content_Types].xml", PACKAGE_CONTENT_TYPES), ("_rels/.rels", RELATIONSHIPS)):
             package.writestr(_archive_member(name), text)
-        with package.open(_archive_member("3D/3dmodel.model"), "w", force_zip64=large) as model:
+        with package.open(_archive_member(MODEL_3MF), "w", force_zip64=large) as model:
             for part in model_3mf(mesh, label):
                 model.write(part)
+
+
+def unit_of_3mf(path: Path) -> str:
+    """Return the unit of length that a 3MF file states; ValueError if the file is damaged or states none."""
+    try:
+        if not path.is_file():
+            raise ValueError("it is no regular file")
+        with zipfile.ZipFile(path) as package, package.open(MODEL_3MF) as model:
+            head = model.read(MODEL_HEAD_BYTES)
+    except Exception as error:  # zipfile and zlib raise various errors for a damaged file
+        raise ValueError(
+            f"{path.name}: cannot be read ({files.first_line(error)}); generate the design again"
+        ) from error
+    stated = re.search(rb"<model\b[^>]*\sunit=[\"'](\w+)[\"']", head)
+    if stated is None:
+        raise ValueError(f"{path.name}: states no unit of length; generate the design again")
+    return stated[1].decode()
 
 
 def _archive_member(name: str) -> zipfile.ZipInfo:

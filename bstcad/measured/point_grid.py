@@ -117,8 +117,8 @@ def _read_x3p(data: bytes) -> MeasuredPoints:
             raise _NotAMap(f"has {unpacked} bytes after decompression, and {MAX_UNPACKED_SIZE} are possible")
         for part in archive.infolist():
             if part.filename.endswith("main.xml"):
-                with archive.open(part) as file:
-                    _check_xml(file)
+                with archive.open(part) as main:
+                    _check_xml(main)
     info = x3pio.info(io.BytesIO(data), verify=False)
     _check_count(info.shape)
     if info.layer_count != 1:

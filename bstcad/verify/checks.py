@@ -432,6 +432,18 @@ def _mesh_checks(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal)
     ]
 
 
+def unit_checks(folder: Path) -> list[Check]:
+    """Check the unit of lens.3mf, which other programs believe; empty if the file was deleted."""
+    if not (path := folder / "lens.3mf").exists():
+        return []
+    try:
+        unit = meshes.unit_of_3mf(path)
+        where = f"the file states {unit}; generate the design again"
+    except ValueError as error:
+        unit, where = "", str(error)
+    return [Check.true("3MF: lengths in millimetres", unit == "millimeter", where, id="mesh-unit")]
+
+
 def _light_checks(light: Light, accept: Accept, optic: str = "lens", of: str = "", why: str = "") -> list[Check]:
     """Check the irradiance of the re-read lens, computed with rays and with flux tubes, which share only the trace.
 

@@ -6,6 +6,7 @@ import itertools
 import json
 import re
 import shutil
+import zipfile
 from dataclasses import replace
 
 import cadquery
@@ -224,6 +225,20 @@ def test_a_step_file_that_holds_no_such_lens_is_one_sentence(folder, nominal, ch
     with pytest.raises(ValueError, match=rf"lens\.step: .*{sentence}") as caught:
         checks.verify(folder, nominal)
     assert "\n" not in str(caught.value)
+
+
+def test_the_unit_of_the_3mf_is_compared(small_design, tmp_path):
+    path, stream = tmp_path / "lens.3mf", zipfile.ZipFile(small_design.folder / "lens.3mf")
+    assert checks.unit_checks(tmp_path) == []
+    with stream, zipfile.ZipFile(path, "w") as changed_file:
+        for name in stream.namelist():
+            changed_file.writestr(name, stream.read(name).replace(b'unit="millimeter"', b'unit="inch"'))
+    assert [check.passed for check in checks.unit_checks(small_design.folder)] == [True]
+    [check] = checks.unit_checks(tmp_path)
+    assert not check.passed and check.where == "the file states inch; generate the design again"
+    path.write_bytes(path.read_bytes()[:1000])
+    [check] = checks.unit_checks(tmp_path)
+    assert not check.passed and check.where.startswith("lens.3mf: cannot be read (File is not a zip file)")
 
 
 @pytest.mark.parametrize("scale", [0.5, 2.0])
