@@ -229,17 +229,20 @@ class Design:
             return mounting.part_of(self.lens, self.scene.mount).solid
 
     def export(
-        self, *kinds: str, points: int | None = None, tiles: str | tuple[int, int] | None = None, **cutting: float | str
+        self, *kinds: str, points: int | None = None, tiles: str | tuple[int, int] | None = None,
+        folder: AnyPath | None = None, **cutting: float | str,
     ) -> list[Path]:  # fmt: skip
         """Write additional files, by names such as "zemax", into the folder of the design; return their paths.
 
         points: number of grid points along the wider side (default: number of control points; for "zemax", a grid
         through the knots).  tiles: numbers of tiles along x and along y, such as "2x3" or (2, 3); None: 2x2.
-        cutting: settings of "spiral" and "raster": tool_radius, cusp, pitch, tolerance, stock and
-        depth in mm, feed in mm/min, along ("x" or "y").  SceneError if a name is unknown or a value impossible, or if
-        the design has not been written.
+        folder: another folder for the files.  cutting: settings of "spiral" and "raster": tool_radius, cusp, pitch,
+        tolerance, stock and depth in mm, feed in mm/min, along ("x" or "y"), zero ("top" or "bottom" of the blank),
+        units ("mm" or "inch") and rapid ("G0" or "G1") of the G-code.  SceneError if a name is unknown or a value
+        impossible, or if the design has not been written.
         """
-        return commands.export(self._own_folder(), kinds, points, cutting, tiles=tiles).paths
+        place = None if folder is None else Path(folder).expanduser()
+        return commands.export(self._own_folder(), kinds, points, cutting, tiles=tiles, place=place).paths
 
     def write(
         self, folder: AnyPath, *, progress: bool = True, effort: Effort | None = None,

@@ -44,6 +44,7 @@ with signals.exit_on_signal():  # loading these libraries takes a quarter of a s
         Depth,
         Device,
         Distance,
+        ExportFolder,
         Feed,
         Folder,
         Gain,
@@ -69,6 +70,7 @@ with signals.exit_on_signal():  # loading these libraries takes a quarter of a s
         Points,
         Port,
         Quality,
+        Rapid,
         ReachPng,
         Report,
         Resume,
@@ -84,11 +86,13 @@ with signals.exit_on_signal():  # loading these libraries takes a quarter of a s
         ToolRadius,
         Topic,
         Trial,
+        Units,
         Verbose,
         Version,
         Workers,
         Written,
         Yield,
+        Zero,
         examples,
         user_path,
     )
@@ -449,24 +453,25 @@ def tolerance(
     epilog=examples(
         "export outputs/thu --as zemax,dxf",
         "export outputs/thu --as points --points 1001",
-        "export outputs/thu --as raster --tool-radius 1.5 --cusp 0.01",
-        "export outputs/sun_caustic --as tiles --tiles 2x3",
+        "export outputs/thu --as raster --tool-radius 1.5 --cusp 0.01 --zero bottom -o shop",
+        "export outputs/sun_caustic --as raster,tiles --tiles 2x3",
     )
 )
 def export(
     folder: Folder, kinds: Kinds = None, points: Points = None, tool_radius: ToolRadius = None, cusp: Cusp = None,
     pitch: Pitch = None, tolerance: PathTolerance = None, stock: Stock = None, depth: Depth = None, feed: Feed = None,
-    along: Along = None, tiles: Tiles = None,
+    along: Along = None, zero: Zero = None, units: Units = None, rapid: Rapid = None, tiles: Tiles = None,
+    output: ExportFolder = None,
 ) -> int:  # fmt: skip
     """Write files for a workshop: tables, Zemax grid sag, tool paths, tiles, outlines, previews, data sheet."""
     if kinds is None:
         raise SceneError(f"--as: is missing; give one or more kinds of files: {EXPORT_NAMES}")
     settings = {
         "tool_radius": tool_radius, "cusp": cusp, "pitch": pitch, "tolerance": tolerance, "stock": stock,
-        "depth": depth, "feed": feed, "along": along,
+        "depth": depth, "feed": feed, "along": along, "zero": zero, "units": units, "rapid": rapid,
     }  # fmt: skip
     given = {name: value for name, value in settings.items() if value is not None}
-    written = load_commands().export(folder, split_names(kinds), points, given, tiles=tiles)
+    written = load_commands().export(folder, split_names(kinds), points, given, tiles=tiles, place=output)
     print(*written.notes, "Files: " + ", ".join(map(str, written.paths)), sep="\n")
     return 0
 

@@ -120,6 +120,12 @@ Stock = option(float | None, "MM", "Stock that the roughing of a raster leaves (
 Depth = option(float | None, "MM", "Depth of cut of roughing (default: 1).")
 Feed = option(float | None, "MM/MIN", "Feed of a raster (default: 800).")
 Along = option(str | None, "AXIS", "Axis along which the lines of a raster run: x (default) or y.")
+Zero = option(str | None, "SIDE", "Side of the blank on which Z of a raster is 0: top (default) or bottom.")
+Units = option(str | None, "UNIT", "Unit of length of the G-code: mm (default) or inch.")
+Rapid = option(
+    str | None, "G0|G1", "Command of rapid moves in the G-code: G0 (default), or G1 for machines without it."
+)
+ExportFolder = path_option("DIR", "Folder for the files (default: that of the design).", "--output", "-o")
 Tiles = option(str | None, "NxM", "Number of tiles along x and along y (default: 2x2).")
 Png = path_option("FILE", "PNG file to write (default: a window is opened).", "--png", "-o")
 ReachPng = path_option("FILE", "PNG of the target and of the area that light can reach (target[1]: FILE_2).", "--png")

@@ -67,7 +67,7 @@ from bstcad.step_text import beginning
 from bstcad.sweep.estimates import diagnosis, left_out
 from bstcad.sweep.net_choice import with_net
 from bstcad.tailoring.run import NO_HOOKS, Hooks, Progress, no_progress
-from bstcad.toolpath.cutting import DEFAULTS, Cutting
+from bstcad.toolpath.cutting import CHOICES, DEFAULTS, Cutting
 from bstcad.verify import checks
 from bstcad.verify.checks import Proof
 from bstcad.verify.verdict import Check, verdict
@@ -77,7 +77,8 @@ if TYPE_CHECKING:
     from bstcad.tolerance.lit_by import LitBy
     from bstcad.tolerance.study import StudySettings
 
-TILE_FILES = "tile-*-*.step"  # pattern of the names of tiles
+# Patterns of the names of the files of tiles.
+TILE_FILES = "tile-*-*.step", "toolpath-raster*tile-*-*.*", "heightmap-tile-*-*.*"
 # In a run with a time limit: time reserved for the report, and smallest time for the rays of the verification (s).
 REPORT_TIME, MIN_RAY_TIME = 2.0, 0.5
 
@@ -551,14 +552,18 @@ def _draw_changed(png: Path, scene: Scene, pictures: Iterable[tuple[Any, Any, An
 
 def export(
     folder: Path, kinds: Sequence[str], points: int | None = None, cutting: Mapping[str, Any] = MappingProxyType({}),
-    *, tiles: str | tuple[int, int] | None = None,
+    *, tiles: str | tuple[int, int] | None = None, place: Path | None = None,
 ) -> Exported:  # fmt: skip
-    """Write files for a shop to the design's folder `folder`; kinds and points as in bstcad.report.exports.export.
+    """Write files for a shop from the design in `folder`; kinds and points as in bstcad.report.exports.export.
 
     cutting: settings of tool paths, by the names of the fields of bstcad.toolpath.cutting.Cutting.
     tiles: numbers of tiles along x and along y, such as "2x3" or (2, 3); None: 2x2.  Older tiles are removed.
+    place: folder for the files, which is created if necessary; None: the design's folder.
     """
-    with folders.amending(folder) as amended:
+    into = folder if place is None else place
+    if into.exists() and not into.is_dir():
+        raise SceneError(f"export: {into} is a file; give another folder")
+    with folders.amending(folder, into=into) as amended:
         made = read(folder)
         with scene_errors("export"):
             tiling = exports.DEFAULT_TILING if tiles is None else Tiling.parse(tiles)
@@ -568,9 +573,9 @@ def export(
             files.put(written.paths[-1], data_sheet.draw(_sheet_again(made, folder)))
     if "tiles" in kinds:
         new = {path.name for path in written.paths}
-        for old in (path for path in folder.glob(TILE_FILES) if path.name not in new):
+        for old in (path for pattern in TILE_FILES for path in into.glob(pattern) if path.name not in new):
             old.unlink()
-    return replace(written, paths=[folder / path.name for path in written.paths])
+    return replace(written, paths=[into / path.name for path in written.paths])
 
 
 def _cutting(settings: Mapping[str, Any]) -> Cutting:
@@ -578,7 +583,7 @@ def _cutting(settings: Mapping[str, Any]) -> Cutting:
     for name, value in settings.items():
         if name not in known:
             raise ValueError(f"'{name}' is no setting of a tool path; give {', '.join(known)}")
-        if name != "along" and (isinstance(value, bool) or not isinstance(value, int | float)):
+        if name not in CHOICES and (isinstance(value, bool) or not isinstance(value, int | float)):
             raise ValueError(f"{name} = {value!r} is not a number; give it in mm (feed: mm/min)")
     return Cutting(**settings)
 
@@ -605,6 +610,8 @@ def _export(
     far = far_field_of(scene)
     if cutting.tool_radius is None and not scene.lens.mould:  # the tool for which the faces were designed
         cutting = replace(cutting, tool_radius=scene.lens.tool_radius)
+    if cutting.zero is None:
+        cutting = replace(cutting, zero=scene.output.zero)
     return exports.export(
         lens, kinds, folder, points=points, label=folders.label(scene), mount=scene.mount, light=light, far=far,
         cutting=cutting, moulding=scene.moulding, part=scene.part.of(scene.lens), tiling=tiling,

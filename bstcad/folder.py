@@ -179,9 +179,10 @@ def _flush(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
+def amending(folder: Path, place: Path | None = None, *, into: Path | None = None) -> Iterator[Path]:
     """Yield a temporary folder; its files are moved to the design's folder `folder` if the block ends without an error.
 
+    into: folder to which the files are moved instead, beside its other files; it is created if necessary.
     place: folder for the report of a made part; the temporary folder then replaces `place`, and `folder` is unchanged.
     SceneError if `place` has files of another kind, or if the design has changed meanwhile; nothing is then written.
     """
@@ -197,11 +198,13 @@ def amending(folder: Path, place: Path | None = None) -> Iterator[Path]:
         if _stamps(folder) != before:
             changed = "the design was replaced during this command, so nothing is written"
             raise SceneError(f"{folder}: {changed}; run the command again")
+        goal = folder if into is None else into
+        goal.mkdir(parents=True, exist_ok=True)
         for path in sorted(Path(building).rglob("*")) if place is None else ():
             if path.is_dir():
-                files.folder_in_place(folder / path.relative_to(building))
+                files.folder_in_place(goal / path.relative_to(building))
             else:
-                files.put(folder / path.relative_to(building), path.read_bytes())
+                files.put(goal / path.relative_to(building), path.read_bytes())
 
 
 def _stamps(folder: Path) -> list[tuple[object, ...]]:

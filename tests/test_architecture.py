@@ -33,7 +33,7 @@ MAY_IMPORT = {
     "runs": {"bstcad"},  # the ground: files, processes, signals, checkpoints; it knows no lens
     "step_text": {"runs"},
     "optics": {"runs"},  # the cache of kernels
-    "photometry": {"optics"},  # its hash, by which rays are drawn
+    "photometry": {"runs", "optics"},  # transliterated names; the hash by which rays are drawn
     "transport": {"runs"},  # the cache of kernels
     "scene": {"runs", "optics", "photometry", "step_text"},
     "tailoring": {"scene", "optics", "transport"},

@@ -20,6 +20,7 @@ from bstcad.photometry.intensity import (
     mirrored,
     symmetry,
 )
+from bstcad.runs.transliteration import transliterate
 
 FIRST_SET, RATIOS = 26, 10  # line of the first set of lamps, from 0; direct ratios after the sets
 LINES_PER_SET, MAX_SETS = 6, 20
@@ -90,7 +91,7 @@ def write(table: Intensity, luminaire: Luminaire, lamp_lumens: float | None = No
         -1 if absolute else 1, luminaire.lamp, lumens, "", "", luminaire.watts, *RATIOS * (0,),
     ]  # fmt: skip
     lines = [_text(value) for value in [*numbers, *whole, *table.along, *(KLM / lumens * stated).ravel()]]
-    return ("\r\n".join(lines) + "\r\n").encode("latin-1", "replace")
+    return ("\r\n".join(lines) + "\r\n").encode("latin-1")
 
 
 def _even(around: np.ndarray, kind: str) -> int:
@@ -102,7 +103,7 @@ def _even(around: np.ndarray, kind: str) -> int:
 
 
 def _text(value: float | str) -> str:
-    return " ".join(value.split())[:78] if isinstance(value, str) else f"{value:.7g}"
+    return " ".join(transliterate(value, "latin-1").split())[:78] if isinstance(value, str) else f"{value:.7g}"
 
 
 def _number(lines: list[str], k: int) -> float:

@@ -24,6 +24,7 @@ from bstcad.photometry.intensity import (
     mirrored,
     symmetry,
 )
+from bstcad.runs.transliteration import transliterate
 
 Table = tuple[np.ndarray, np.ndarray, np.ndarray]  # horizontal angles, vertical angles, intensities
 TYPES = {1: "C", 2: "B", 3: "A"}
@@ -94,7 +95,7 @@ def write(table: Intensity, luminaire: Luminaire, version: str = "2002", lamp_lu
 
 def _plain(text: str) -> str:
     """Return a text in ASCII, of one line."""
-    return " ".join(text.encode("ascii", "replace").decode().split())
+    return " ".join(transliterate(text).split())
 
 
 def _wrapped(numbers: np.ndarray) -> list[str]:

@@ -21,6 +21,7 @@ import numpy as np
 from bstcad.photometry.intensity import Luminaire, PhotometricError
 from bstcad.photometry.ray_set import RaySet, scaled
 from bstcad.photometry.ray_table import RayTable, Source, bytes_of, plain, rows_of, rows_of_text, stated_or_none
+from bstcad.runs.transliteration import transliterate
 
 IDENTIFIERS = 1010, 8675309
 HEADER = struct.Struct("<2I100s7fI13f4I")
@@ -95,7 +96,7 @@ def write(rays: RaySet, luminaire: Luminaire) -> bytes:
     wavelength = rays.wavelength / NANOMETRES if isinstance(rays.wavelength, float) else 0.0
     form = FLUX_ONLY if own is None else SPECTRAL
     head = HEADER.pack(
-        IDENTIFIERS[0], len(rays), plain(luminaire.name).encode("ascii", "replace")[:99],
+        IDENTIFIERS[0], len(rays), transliterate(plain(luminaire.name)).encode("ascii")[:99],
         *(rays.flux, rays.flux, wavelength), *(0.0, 180.0, 0.0, 360.0), 4,
         *(0.0,) * 6, *(1.0,) * 3, *(0.0,) * 4, form, int(rays.unit == "lm"), 0, 0,
     )  # fmt: skip

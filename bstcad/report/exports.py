@@ -21,7 +21,7 @@ import torch
 
 from bstcad.analysis.far_field import NOMINAL_LUMENS, FarField
 from bstcad.cad.mesh import DEFAULT_LABEL, Label, preview_files
-from bstcad.cad.tiling import Tiling
+from bstcad.cad.tiling import Cell, Tiling
 from bstcad.optics import domes
 from bstcad.optics.bspline import is_net
 from bstcad.optics.lens import Lens
@@ -98,7 +98,7 @@ def export(
     show the outline of the lens.  light: light that is traced to compute the error of grids and tables; None: the error
     is not computed.  far: light for intensity files; None: they cannot be exported.  cutting: settings of tool paths.
     moulding: shrinkage for the cavity; None: it cannot be exported.  part: data of the part that STEP files state.
-    tiling: numbers of tiles along x and along y.
+    tiling: numbers of tiles along x and along y; with the kind "tiles", each tile has a raster and a height map.
     ValueError: a kind is unknown, points is out of range, or a tool path or a tile is not possible.
     """
     for kind in kinds:
@@ -111,6 +111,7 @@ def export(
         kinds, domes.is_dome(lens), lens.passes.index_before, front_ends=lens.front.outline is not None
     ):  # fmt: skip
         raise ValueError(complaint)
+    cells = tiling.cells(lens.plan) if "tiles" in kinds else ()
     for kind in dict.fromkeys(kinds):
         if kind == CAVITY:
             if moulding is None:
@@ -128,7 +129,7 @@ def export(
             intensity = Stated(far.table(lens), far.lumens)
         for name, data in _files(
             kind, lens, points, label=label, mount=mount, light=light, intensity=intensity, cutting=cutting,
-            tiling=tiling, part=part or Part(),
+            tiling=tiling, cells=cells, part=part or Part(),
         ):  # fmt: skip
             files.put(folder / name, data.encode("utf-8") if isinstance(data, str) else data)
             paths.append(folder / name)
@@ -148,6 +149,7 @@ def _files(
     intensity: Stated | None,
     cutting: Cutting,
     tiling: Tiling,
+    cells: Sequence[Cell],
     part: Part,
 ) -> Iterator[tuple[str, str | bytes]]:
     count = min(max(lens.back_net.shape), MAX_POINTS) if points is None else points
@@ -175,12 +177,14 @@ def _files(
             if lens.front.is_net:
                 yield "turning-front.csv", turning_cloud(lens, (count + 1) // 2, lens.front)
         case "spiral" | "raster":
-            yield from toolpath_files(kind, lens, cutting, label.title or label.name)
+            yield from toolpath_files(kind, lens, cutting, label.title or label.name, cells=cells)
         case "heightmap":
-            picture = HeightMap.of(lens.back, lens.plan, default_pixels(count) if points is None else points)
-            yield "heightmap.png", picture.png()
-            yield "heightmap.tif", picture.tiff()
-            yield f"heightmap{SIDECAR}", picture.words() + "\n"
+            for cell in cells or (None,):
+                pixels = default_pixels(count) if points is None else points
+                picture = HeightMap.of(lens.back, lens.plan, pixels, cell)
+                yield f"{picture.name}.png", picture.png()
+                yield f"{picture.name}.tif", picture.tiff()
+                yield f"{picture.name}{SIDECAR}", picture.words() + "\n"
         case "tiles":
             yield from tile_files(lens, tiling, label.name, part)
             yield "tiles.svg", tiles_svg(lens.outline, tiling)

@@ -2,9 +2,9 @@
 
 A pixel of the row r and the column c shows the face at the middle of its square, seen from the back:
 
-    x = (c + 1/2) p - w / 2,   y = h / 2 - (r + 1/2) p,
+    x = x_m + (c + 1/2) p - w / 2,   y = y_m + h / 2 - (r + 1/2) p,
 
-p: mm per pixel, w and h: width and height of the picture (mm).
+p: mm per pixel, w and h: width and height of the picture (mm), x_m and y_m: its middle, the axis except for a tile.
 
 The PNG has 16 bits, z = z_low + g · (z_high - z_low) / 65535 for the grey g.  The TIFF has heights z - z_low in mm as
 32-bit floats.  Pixels outside the outline have the grey 0.
@@ -21,6 +21,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
+from bstcad.cad.tiling import Cell
 from bstcad.optics.outlines import Outline
 from bstcad.optics.surfaces import Surface, sag
 
@@ -37,18 +38,26 @@ class HeightMap:
 
     z: np.ndarray  # (rows, columns) mm; NaN outside the outline
     pixel: float  # side of a pixel, mm
+    name: str = "heightmap"  # name of the files, without suffix
+    centre: tuple[float, float] = (0.0, 0.0)  # x and y of the middle of the picture, mm
 
     @classmethod
-    def of(cls, face: Surface, outline: Outline, pixels: int) -> HeightMap:
-        """Return the heights inside an outline with `pixels` pixels along its longer side."""
-        half_x, half_y = outline.half_extent
+    def of(cls, face: Surface, outline: Outline, pixels: int, cell: Cell | None = None) -> HeightMap:
+        """Return the heights inside an outline with `pixels` pixels along its longer side.
+
+        cell: tile to which the picture is limited, with pixels of the same size; None: no limit.
+        """
+        (half_x, half_y), centre, name = outline.half_extent, (0.0, 0.0), "heightmap"
         p = 2 * max(half_x, half_y) / pixels
+        if cell is not None:
+            half_x, half_y = ((high - low) / 2 for low, high in cell.extent)
+            centre, name = tuple(sum(span) / 2 for span in cell.extent), f"heightmap-{cell.name}"
         columns, rows = (max(round(2 * half / p), 1) for half in (half_x, half_y))
-        x = (np.arange(columns) + 0.5 - columns / 2) * p
-        y = (rows / 2 - np.arange(rows) - 0.5) * p
+        x = centre[0] + (np.arange(columns) + 0.5 - columns / 2) * p
+        y = centre[1] + (rows / 2 - np.arange(rows) - 0.5) * p
         x, y = (at.copy() for at in np.broadcast_arrays(x[None, :], y[:, None]))
         inside = outline.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
-        return cls(np.where(inside, sag(face, x, y), np.nan), p)
+        return cls(np.where(inside, sag(face, x, y), np.nan), p, name, centre)
 
     @property
     def range(self) -> tuple[float, float]:
@@ -73,7 +82,7 @@ class HeightMap:
     def tiff(self) -> bytes:
         """Return a TIFF of 32-bit floats: the height (mm) above the lowest point."""
         tags = ImageFileDirectory_v2()
-        tags[DESCRIPTION] = self.words().encode("ascii", "replace").decode()
+        tags[DESCRIPTION] = self.words()
         tags[RESOLUTION_X] = tags[RESOLUTION_Y] = 10 / self.pixel
         tags[UNIT] = CENTIMETRE
         heights = np.nan_to_num(self.z - self.range[0]).astype(np.float32)
@@ -83,11 +92,12 @@ class HeightMap:
         """Return the scale of the pictures in one sentence each."""
         rows, columns = self.z.shape
         low, high = self.range
+        middle = f" Its middle is x = {self.centre[0]:.9g} mm, y = {self.centre[1]:.9g} mm." * any(self.centre)
         return (
-            f"heightmap: {columns} x {rows} pixels of {self.pixel:.9g} mm, {columns * self.pixel:.9g} mm x "
-            f"{rows * self.pixel:.9g} mm, seen from the back with x to the right and y up. "
-            f"heightmap.png: grey 0 is z = {low:.9g} mm, grey {WHITE} is z = {high:.9g} mm, {self.per_grey:.9g} mm "
-            "per grey. heightmap.tif: height in mm above the lowest point, as 32-bit floats. Both are 0 outside the "
+            f"{self.name}: {columns} x {rows} pixels of {self.pixel:.9g} mm, {columns * self.pixel:.9g} mm x "
+            f"{rows * self.pixel:.9g} mm, seen from the back with x to the right and y up.{middle} "
+            f"{self.name}.png: grey 0 is z = {low:.9g} mm, grey {WHITE} is z = {high:.9g} mm, {self.per_grey:.9g} mm "
+            f"per grey. {self.name}.tif: height in mm above the lowest point, as 32-bit floats. Both are 0 outside the "
             "outline."
         )
 

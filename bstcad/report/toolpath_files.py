@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from bstcad.cad.tiling import Cell, Span
 from bstcad.optics.bspline import require_net
 from bstcad.optics.lens import Lens
 from bstcad.report.shop_figures import left_figure
@@ -29,28 +30,56 @@ ANGLE_DIGITS = 7  # decimals of C (degrees): a tenth of a nanometre at 50 mm fro
 ROWS_AT_A_TIME = 100_000  # rows of a table that are formatted at a time
 
 
-def toolpath_files(kind: str, lens: Lens, cutting: Cutting, name: str) -> Iterator[tuple[str, str | bytes]]:
+def toolpath_files(
+    kind: str, lens: Lens, cutting: Cutting, name: str, cells: Sequence[Cell] = ()
+) -> Iterator[tuple[str, str | bytes]]:
     """Yield (name, content) of the files of a path, "spiral" or "raster", over each face of a lens that is a net.
 
     If the tool does not reach a part of the face, a picture shows where.
-    name: of the lens, for the heading.  ValueError if a face is too steep for the tool, or the path too long.
+    name: of the lens, for the heading.  cells: tiles, each of which has a raster of its own; empty: the whole lens.
+    ValueError if a face is too steep for the tool, or the path too long.
     """
-    for side, face in machined_faces(lens):
+    faces = dict(machined_faces(lens))
+    for side, face in faces.items():
         file = f"toolpath-{kind}" + ("" if side == "back" else f"-{side}")
         if kind == "spiral":
             turned = spiral(face, cutting)
-            found, cusp = check_spiral(turned), turned.passes.cusp
-            sentences = [*_of_part(name, side), *spiral_words(turned), *_of_check(found, turned.tool)]
+            found, sentences = check_spiral(turned), [*_of_part(name, side), *spiral_words(turned)]
             yield f"{file}.csv", _table("c_deg,x_mm,z_mm", _formats(turned), *_columns(turned, face))
-        else:
-            milled = raster(face, cutting)
-            found, cusp = check_raster(milled), milled.spacing.cusp
-            sentences = [*_of_part(name, side), *raster_words(milled, lens), *_of_check(found, milled.tool)]
-            yield f"{file}.nc", gcode.gcode(milled, sentences)
-            yield f"{file}.csv", raster_table(milled)
-        if found.unreached:
-            yield f"{file}-unreached.png", left_figure(found.points, found.clearance, LEFT * cusp)
-        yield f"{file}.txt", " ".join(sentences) + "\n"
+            yield from _check_files(file, found, turned.tool, sentences, cusp=turned.passes.cusp)
+            continue
+        levels = -_farthest(lens, faces, side), face.highest
+        for cell in cells or (None,):
+            part = face if cell is None else face.part(*_extent(cell, side))
+            milled = raster(part, levels, cutting)
+            found, sentences = check_raster(milled), [*_of_part(name, side), *raster_words(milled, cell)]
+            own = file if cell is None else f"{file}-{cell.name}"
+            yield f"{own}.nc", gcode.gcode(milled, [*sentences, *_of_check(found, milled.tool)])
+            yield f"{own}.csv", raster_table(milled)
+            yield from _check_files(own, found, milled.tool, sentences, cusp=milled.spacing.cusp)
+
+
+def _check_files(
+    file: str, found: Swept, tool: RoundTool, sentences: Sequence[str], cusp: float
+) -> Iterator[tuple[str, str | bytes]]:
+    """Yield the picture of what the tool does not reach, if any, and the text with all sentences about a path."""
+    if found.unreached:
+        yield f"{file}-unreached.png", left_figure(found.points, found.clearance, LEFT * cusp)
+    yield f"{file}.txt", " ".join([*sentences, *_of_check(found, tool)]) + "\n"
+
+
+def _farthest(lens: Lens, faces: Mapping[str, MachinedFace], side: str) -> float:
+    """Return how far (mm) the face opposite to a side reaches from z = 0 of the frame, away from the tool."""
+    opposite = "front" if side == "back" else "back"
+    if opposite in faces:
+        return faces[opposite].highest
+    return -(lens.front.z + lens.front.sags(lens.plan)[0])
+
+
+def _extent(cell: Cell, side: str) -> tuple[Span, Span]:
+    """Return x and y (mm) of the ends of a tile in the frame of a machined face."""
+    x, y = cell.extent
+    return (x, y) if side == "back" else ((-x[1], -x[0]), y)
 
 
 def machined_faces(lens: Lens) -> Iterator[tuple[str, MachinedFace]]:
@@ -80,7 +109,7 @@ def raster_table(path: Raster) -> str:
     """
     counts = [len(each.points) for each in path.passes]
     number, rough = np.repeat(np.arange(len(counts)), counts), np.repeat([each.rough for each in path.passes], counts)
-    points = np.concatenate([each.points for each in path.passes])
+    points = np.concatenate([each.points for each in path.passes]) + (0.0, 0.0, path.lift)
     places = digits(path.cutting.finish[1])
     return _table("pass,roughing,x_mm,y_mm,z_mm", ("%d", "%d", *[f"%.{places}f"] * 3), number, rough, *points.T)
 
@@ -118,23 +147,34 @@ def spiral_words(path: Spiral) -> Iterator[str]:
         yield f"The face is tilted on the axis, where the nose touches it up to {quantity(beyond, 'mm')} beyond."
 
 
-def raster_words(path: Raster, lens: Lens) -> Iterator[str]:
-    """Yield sentences on the tool, the blank, the zero point and the time of a raster."""
+def raster_words(path: Raster, cell: Cell | None = None) -> Iterator[str]:
+    """Yield sentences on the tool, the blank, the zero point and the time of a raster over a lens, or over a tile."""
     stock, depth = path.cutting.roughing
     yield f"Ball end mill of radius {path.tool.radius:g} mm; Z is the lowest point of the ball."
-    width, height = (2 * half for half in lens.plan.half_extent)
+    width, height = (2 * half for half in path.tool.face.outline.half_extent)
+    part, axis = ("lens", "on the axis of the lens") if cell is None else (cell.name, _middle(cell))
     yield (
-        f"Zero point: X0 Y0 on the axis of the lens, Z0 on the top of the flat blank; the lens is {width:g} mm x "
-        f"{height:g} mm, and its highest point lies {stock:g} mm below Z0."
+        f"Blank: flat, {path.thickness:.6g} mm thick, larger than the {part} of {width:g} mm x {height:g} mm by the "
+        f"room to hold it; its top lies {stock:g} mm above the highest point of the lens, its bottom at the outermost "
+        "point of the other face."
     )
+    yield f"Zero point: X0 Y0 {axis}, Z0 on the {path.cutting.zero} of the blank."
+    if path.cutting.units == "inch":
+        yield "The moves of the G-code are in inches; this text is in millimetres."
     cut = f"Roughing in steps of {depth:g} mm leaves {stock:g} mm. " if stock else "There is no roughing. "
     lines = f"Finish in lines along {path.cutting.along} with a pitch of {quantity(path.spacing.pitch, 'mm')}"
     yield f"{cut}{lines}, straight moves within {_tolerance(path.cutting)}. The lowest Z is {path.deepest:.3f} mm."
     yield (
-        f"Feed {path.cutting.speed:g} mm/min, a third of it downwards; rapid moves at Z = {SAFE_HEIGHT:g} mm. Time "
-        f"without acceleration about {_time(path.minutes)}, with rapid moves of {RAPID_FEED:g} mm/min."
+        f"Feed {path.cutting.speed:g} mm/min, a third of it downwards; rapid moves at Z = "
+        f"{SAFE_HEIGHT + path.lift:.6g} mm. Time without acceleration about {_time(path.minutes)}, with rapid moves of "
+        f"{RAPID_FEED:g} mm/min."
     )
     yield "Start the spindle first: the file has no commands for the spindle."
+
+
+def _middle(cell: Cell) -> str:
+    x, y = (round(sum(span) / 2, 9) + 0.0 for span in cell.extent)
+    return f"at the middle of the tile, x = {x:g} mm, y = {y:g} mm of the lens"
 
 
 def _of_check(found: Swept, tool: RoundTool) -> Iterator[str]:

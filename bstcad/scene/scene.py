@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 import tomli_w
@@ -64,6 +64,7 @@ class Output(Record):
 
     mesh_tolerance: Annotated[float | None, Key("Maximum distance of meshes from the lens.", "mm", 1e-6, 1e3)] = None
     export: Annotated[tuple[files.Export, ...], Key("Additional files for the shop.", example=["zemax", "dxf"])] = ()
+    zero: Annotated[Literal["top", "bottom"], Key("Side of the blank on which Z of a raster is 0.")] = "top"
 
 
 class Scene(Record):

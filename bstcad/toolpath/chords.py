@@ -2,7 +2,8 @@
 
 A path is a height z(t) over a parameter t.  A move from t_k to t_(k+1) is a chord; its largest distance from a smooth
 path is near its middle, and falls as the square of its length.  Chords beyond the tolerance are divided into
-sqrt(deviation / tolerance) equal parts, and each part is measured again.
+sqrt(deviation / tolerance) equal parts, and each part is measured again.  Points that lie on a straight line with their
+neighbours are left out at the end.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+from numba import njit
 
 MAX_POINTS = 20_000_000  # largest number of points of a path
 MAX_ROUNDS = 12  # largest number of subdivisions, one after the other
 MAX_PARTS = 64  # largest number of parts of a chord in one round
-MARGIN = (
-    0.5  # deviation at the middle of an accepted chord, in tolerances: a kink beside it deviates by up to twice as much
-)
+STRAIGHT = 0.1  # largest distance of a point that is left out from the straight move over it, in tolerances
+# Deviation at the middle of an accepted chord, in tolerances: a kink beside it deviates by up to twice as much.
+MARGIN = (1 - STRAIGHT) / 2
 
 Height = Callable[[np.ndarray], np.ndarray]
 
@@ -54,6 +56,27 @@ def within_tolerance(t: np.ndarray, height: Height, tolerance: float) -> tuple[n
         begin, end = starts, stops
     order = np.argsort(t, kind="stable")
     return t[order], z[order]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def bends(t, z, corner, height):  # type: ignore[no-untyped-def]  # a compiled function
+    """Return True for the points of a path z(t) (mm) that straight moves need to pass all others within a height (mm).
+
+    corner: True for points that are needed in any case.  The moves from an anchor whose slopes lie in [low, high] pass
+    all points since the anchor; a point outside this cone makes the point before it the next anchor.
+    """
+    needed = np.zeros(len(t), np.bool_)
+    needed[0] = needed[-1] = True
+    anchor, low, high = 0, -math.inf, math.inf
+    for k in range(1, len(t)):
+        slope = (z[k] - z[anchor]) / (t[k] - t[anchor])
+        if not low <= slope <= high or (corner[k - 1] and k - 1 > anchor):
+            anchor, low, high = k - 1, -math.inf, math.inf
+            needed[anchor] = True
+            slope = (z[k] - z[anchor]) / (t[k] - t[anchor])
+        width = height / (t[k] - t[anchor])
+        low, high = max(low, slope - width), min(high, slope + width)
+    return needed
 
 
 def refuse_many(count: float) -> None:

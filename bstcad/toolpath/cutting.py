@@ -17,6 +17,7 @@ LIMITS = {
     "tool_radius": (*RADII, "mm"), "cusp": (*HEIGHTS, "mm"), "pitch": (*STEPS, "mm"), "tolerance": (*HEIGHTS, "mm"),
     "stock": (*STEPS, "mm"), "depth": (*STEPS, "mm"), "feed": (*FEEDS, "mm/min"),
 }  # fmt: skip
+CHOICES = {"along": ("x", "y"), "zero": ("top", "bottom"), "units": ("mm", "inch"), "rapid": ("G0", "G1")}
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,9 @@ class Cutting:
     depth: float | None = None  # depth of cut of roughing, mm
     feed: float | None = None  # feed, mm/min
     along: Literal["x", "y"] = "x"  # axis along which the lines of a raster run
+    zero: Literal["top", "bottom"] | None = None  # side of the blank on which the Z of a raster is 0
+    units: Literal["mm", "inch"] = "mm"  # unit of length of the G-code
+    rapid: Literal["G0", "G1"] = "G0"  # command of rapid moves in the G-code
 
     def __post_init__(self) -> None:
         """Raise ValueError with a sentence for a value out of range."""
@@ -40,8 +44,9 @@ class Cutting:
                 continue
             if not (math.isfinite(value) and least <= value <= most):
                 raise ValueError(f"{name} = {value:g} {unit} is not possible; give a value from {least:g} to {most:g}")
-        if self.along not in ("x", "y"):
-            raise ValueError(f"along = {self.along!r} is not possible; give x or y")
+        for name, choices in CHOICES.items():
+            if (value := getattr(self, name)) not in choices and not (name == "zero" and value is None):
+                raise ValueError(f"{name} = {value!r} is not possible; give {' or '.join(choices)}")
 
     def completed(self, defaults: Cutting) -> Cutting:
         """Return the settings with the values of `defaults` in the place of None."""
@@ -77,6 +82,6 @@ def _stated(value: float | None) -> float:
 DEFAULTS = Cutting()  # settings that are those of the machine
 # A lathe with a diamond of 0.5 mm: cusps of 50 nm and moves of 5 nm are below what a polished face scatters.  The
 # roughing of a blank is turned by the program of the shop, so that a spiral has no stock.
-LATHE = Cutting(tool_radius=0.5, cusp=5e-5, tolerance=5e-6, stock=0.0, depth=1.0, feed=50.0)
+LATHE = Cutting(tool_radius=0.5, cusp=5e-5, tolerance=5e-6, stock=0.0, depth=1.0, feed=50.0, zero="top")
 # A router with a ball end mill of 3 mm diameter: cusps of 10 µm, which sanding and polishing remove.
-ROUTER = Cutting(tool_radius=1.5, cusp=0.01, tolerance=5e-4, stock=0.2, depth=1.0, feed=800.0)
+ROUTER = Cutting(tool_radius=1.5, cusp=0.01, tolerance=5e-4, stock=0.2, depth=1.0, feed=800.0, zero="top")

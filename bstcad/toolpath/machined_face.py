@@ -22,7 +22,7 @@ from torch import Tensor
 from bstcad.optics import bspline
 from bstcad.optics.bspline import BSplineSurface, Jet, Spans, span_points
 from bstcad.optics.kernels.tool_contact import MAX_LATTICE, NetFrame, Search, ball_heights, nose_heights
-from bstcad.optics.outlines import Outline
+from bstcad.optics.outlines import Outline, Rectangle
 
 ROLLING = 0.98  # radius of the tool times the largest curvature of a valley, up to which each place has one contact
 POINTS_PER_SPAN = 4  # lattice places per knot span along x and y
@@ -60,6 +60,12 @@ class MachinedFace:
         """Return the front of a lens, turned over about the y axis: x and z are those of the scene times -1."""
         net, (low, high) = net.plain(), net.x
         return cls(replace(net, z=-net.z, heights=-net.heights.flip(0), x=(-high, -low)), outline)
+
+    def part(self, x: tuple[float, float], y: tuple[float, float]) -> MachinedFace:
+        """Return the face over the rectangle from x[0] to x[1] and y[0] to y[1] (mm), with the axis at its centre."""
+        (x0, x1), (y0, y1), at_x, at_y = self.net.x, self.net.y, sum(x) / 2, sum(y) / 2
+        net = replace(self.net, x=(x0 - at_x, x1 - at_x), y=(y0 - at_y, y1 - at_y))
+        return MachinedFace(net, Rectangle(x[1] - x[0], y[1] - y[0]))
 
     def spans(self) -> tuple[Tensor, Tensor]:
         """Return the numbers (i, j) of the knot spans inside the outline and in the strip around it."""

@@ -1,8 +1,9 @@
 """Raster for a router with three axes: roughing in steps down, then a finish in lines to and fro, with a ball.
 
 The height of the ball without gouge decides all: finishing follows it, roughing follows that of a ball that is larger
-by the stock left on the face, and cuts at most one depth at a time from the blank, which is flat.  Z = 0 is the top of
-the blank; the highest point of the finished face lies below it by the stock.  X and Y are those of the face.
+by the stock left on the face, and cuts at most one depth at a time from the blank, which is flat.  The points of the
+passes have Z = 0 at the top of the blank; the highest point of the part lies below it by the stock.  X and Y are those
+of the face.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ ROUGH_PITCH = 0.5  # pitch of roughing, as a fraction of the radius of the ball
 ROUGH_TOLERANCE = 0.1  # tolerance of roughing, as a fraction of the stock
 SAFE_HEIGHT = 5.0  # Z of rapid moves, above the top of the blank (mm)
 RAPID_FEED = 3000.0  # feed that the estimate of the time assumes for rapid moves (mm/min)
+STRAIGHT_PLAN = 1e-9  # difference from 1 of the cosine between two moves that are one line in the plan
 PLUNGE = 1 / 3  # feed of moves straight down, as a fraction of the feed
 
 
@@ -42,12 +44,23 @@ class Raster:
     tool: RoundTool
     cutting: Cutting  # completed settings
     spacing: Passes  # spacing of the finishing lines, and their cusp
-    top: float  # z of the face's frame at Z = 0 of the path, the top of the blank (mm)
+    top: float  # z of the face's frame at Z = 0 of the passes, the top of the blank (mm)
+    bottom: float  # z of the face's frame at the bottom of the blank, the outermost point of the other face (mm)
+
+    @property
+    def thickness(self) -> float:
+        """Thickness of the blank (mm)."""
+        return self.top - self.bottom
+
+    @property
+    def lift(self) -> float:
+        """Z of the top of the blank in the written files (mm)."""
+        return self.thickness if self.cutting.zero == "bottom" else 0.0
 
     @property
     def deepest(self) -> float:
-        """Lowest Z of the path (mm)."""
-        return min(float(each.points[:, 2].min()) for each in self.passes)
+        """Lowest Z of the path in the written files (mm)."""
+        return self.lift + min(float(each.points[:, 2].min()) for each in self.passes)
 
     @property
     def length(self) -> float:
@@ -67,8 +80,11 @@ class Raster:
         return self.length / speed + plunge / (PLUNGE * speed) + rapid / RAPID_FEED
 
 
-def raster(face: MachinedFace, wanted: Cutting) -> Raster:
-    """Return the raster that cuts a face; ValueError if the face is too steep for a ball or the path too long."""
+def raster(face: MachinedFace, levels: tuple[float, float], wanted: Cutting) -> Raster:
+    """Return the raster that cuts a face; ValueError if the face is too steep for a ball or the path too long.
+
+    levels: z of the lowest and of the highest point of the finished part in the frame of the face (mm).
+    """
     cutting = wanted.completed(ROUTER)
     tool, (cusp, tolerance), stock = RoundTool(face, cutting.radius), cutting.finish, cutting.roughing[0]
     steepest = math.degrees(math.atan(face.shape.slope))
@@ -76,7 +92,7 @@ def raster(face: MachinedFace, wanted: Cutting) -> Raster:
         steep = f"the face is {steepest:.3g} degrees steep, and a ball reaches {MAX_BALL_SLOPE:g} degrees"
         raise ValueError(f"{steep}; limit lens.max_slope, or cut the face on a machine with more axes")
     spacing = cusps.raster_passes(tool, cusps.for_passes(cusp, tolerance), pitch=cutting.pitch, along=cutting.along)
-    top = face.highest + stock
+    bottom, top = levels[0], levels[1] + stock
 
     def tip(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return tool.ball(x, y) - tool.radius - top
@@ -85,8 +101,10 @@ def raster(face: MachinedFace, wanted: Cutting) -> Raster:
     lines = 2 * max(face.outline.half_extent) / spacing.pitch
     chords.refuse_many(lines * 2 * min(face.outline.half_extent) / tool.spacing(tolerance))
     zigzag = np.concatenate(list(_lines(face, spacing.pitch, tool.reach + spacing.pitch, cutting.along)))
-    passes.append(Pass(_followed(zigzag, tip, tool.spacing(tolerance), tolerance), rough=False))
-    return Raster(tuple(passes), tool, cutting, spacing=spacing, top=top)
+    passes.append(
+        Pass(_straightened(_followed(zigzag, tip, tool.spacing(tolerance), tolerance), tolerance), rough=False)
+    )
+    return Raster(tuple(passes), tool, cutting, spacing=spacing, top=top, bottom=bottom)
 
 
 def _lines(face: MachinedFace, pitch: float, overrun: float, along: str) -> Iterator[np.ndarray]:
@@ -117,6 +135,16 @@ def _followed(
     return np.column_stack([*place(t), z])
 
 
+def _straightened(points: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return the points (n, 3) of a path without those on straight moves; the corners of its plan are kept."""
+    step = np.diff(points[:, :2], axis=0)
+    length = np.hypot(*step.T)
+    along = (step[1:] * step[:-1]).sum(1) > (1 - STRAIGHT_PLAN) * length[1:] * length[:-1]
+    corner = np.concatenate([[True], ~along, [True]])
+    at = np.append(0.0, np.cumsum(length))
+    return points[chords.bends(at, points[:, 2], corner, chords.STRAIGHT * tolerance)]
+
+
 def _roughing(face: MachinedFace, cutting: Cutting, top: float) -> Iterator[Pass]:
     """Yield the passes that take the blank down to the stock on the face, level by level from Z = 0."""
     stock, depth = cutting.roughing
@@ -134,7 +162,8 @@ def _roughing(face: MachinedFace, cutting: Cutting, top: float) -> Iterator[Pass
     for level in range(1, math.ceil(-lowest / depth) + 1):
         above, floor = -(level - 1) * depth, -level * depth
         for line in lines:
-            yield from (Pass(run, rough=True) for run in _runs(line, above=above, floor=floor))
+            for run in _runs(line, above=above, floor=floor):
+                yield Pass(_straightened(run, ROUGH_TOLERANCE * stock), rough=True)
 
 
 def _runs(line: np.ndarray, above: float, floor: float) -> Iterator[np.ndarray]:

@@ -51,6 +51,7 @@ def check_raster(path: Raster) -> Swept:
     lift = (0.0, 0.0, path.top + radius)
     begin = np.concatenate([each.points[:-1] for each in path.passes]) + lift
     end = np.concatenate([each.points[1:] for each in path.passes]) + lift
+    begin, end = _pieces(begin, end, radius)
     half = float(np.linalg.norm(end - begin, axis=1).max(initial=0.0)) / 2
     middle, cell = (begin + end)[:, :2] / 2, radius / CELLS_PER_RADIUS
     low = middle.min(0)
@@ -66,6 +67,16 @@ def check_raster(path: Raster) -> Swept:
     scene = points, begin[order], end[order], starts, (low[0], low[1], cell, columns, rows), radius, half, clearance
     _divided(_to_moves, scene, len(points))
     return _summary(points, clearance, path.spacing.cusp)
+
+
+def _pieces(begin: np.ndarray, end: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends of the moves (n, 3), divided into equal pieces of at most `longest` mm."""
+    step = end - begin
+    parts = np.maximum(np.ceil(np.linalg.norm(step, axis=1) / longest), 1).astype(np.int64)
+    which = np.repeat(np.arange(len(parts)), parts)
+    piece = np.arange(len(which)) - np.repeat(np.cumsum(parts) - parts, parts)
+    first, last = (begin[which] + step[which] * (k / parts[which])[:, None] for k in (piece, piece + 1))
+    return first, last
 
 
 def check_spiral(path: Spiral) -> Swept:

@@ -47,7 +47,20 @@ def test_the_command_and_python_state_the_tool(small_design, tmp_path, capsys):
     assert "mm per grey" in out and "leaves 0.3 mm" in out and "Feed 500 mm/min" in out
     text = (folder / "toolpath-raster.nc").read_text()
     assert "F500" in text and "(Roughing)" in text and "Zero point: X0 Y0" in text
+    shop, spec = tmp_path / "new" / "shop", ["--as", "raster,heightmap,tiles", "--tiles", "2x1", "--zero", "bottom"]
+    before = {path.name for path in folder.iterdir()}
+    for columns, expected in (("3x1", 3), ("2x1", 2)):  # older tiles are removed
+        spec[3] = columns
+        assert cli.run(["export", str(folder), *spec, "--cusp", "0.05", "-o", str(shop)]) == 0
+        for pattern in ("tile-*-*.step", "toolpath-raster-tile-*-*.nc", "heightmap-tile-*-*.png"):
+            assert len(list(shop.glob(pattern))) == expected
+    assert not (shop / "toolpath-raster.nc").exists() and before == {path.name for path in folder.iterdir()}
+    assert "Z0 on the bottom of the blank" in capsys.readouterr().out
+    assert cli.run(["export", str(folder), "--as", "svg", "-o", str(shop / "tiles.csv")]) == 2
+    assert "tiles.csv is a file; give another folder" in capsys.readouterr().err
     design = bstcad.open(folder)
+    [*_, words] = design.export("raster", cusp=0.05, folder=tmp_path / "python")
+    assert words.parent == tmp_path / "python" and "Z0 on the top" in words.read_text()
     names = {path.name for path in design.export("spiral", tool_radius=2.0, cusp=1e-3)}
     assert names == {"toolpath-spiral.csv", "toolpath-spiral.txt"}
     assert "radius 2 mm" in (folder / "toolpath-spiral.txt").read_text()
