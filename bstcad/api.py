@@ -177,6 +177,19 @@ class Design:
         """
         return self._named_solid(trim, holes, body, (draft, bevel)).solid
 
+    @property
+    def wall(self) -> tuple[float, float]:
+        """Lower and upper z (mm) of the wall of the lens, between the rims of front and back; a flange has to meet it.
+
+        SceneError if the faces cross.
+        """
+        from bstcad.cad import solid
+
+        with commands.scene_errors():
+            lens = solid.prepared(self.lens)
+            back, front = solid.rim_heights(lens, solid.rim_loop(lens))
+        return float(front.max()), float(back.min())
+
     def write_part(
         self, path: AnyPath, trim: Any = None, holes: Sequence[Any] = (), body: Any = None, *,
         draft: float = 0.0, bevel: float = 0.0,

@@ -8,6 +8,7 @@ from pathlib import Path
 import cadquery as cq
 import pytest
 import skimage
+import torch
 
 import bstcad
 import bstcad.cad.plugin
@@ -77,9 +78,71 @@ def test_the_insert_of_a_mould_is_the_negative_of_the_back(design):
     assert top == pytest.approx(-scale * float(back), abs=1e-7)
 
 
-def _tensors(*values):
-    import torch
+OTHER = {  # designs of other kinds than the lens for which the scripts were written, as changes of a template
+    "plate": ("sun_caustic", {
+        "lens.back.z": 1.5, "lens.min_thickness": 0.5, "target.image": None, "target.text": "A", "target.fit": None,
+        **{f"{table}.{key}": {"shape": "rectangle", "width": 24.0, "height": 30.0}
+           for table, key in (("source", "aperture"), ("lens", "outline"))},
+        "target.x": [-12.0, 12.0], "target.y": [-15.0, 15.0], "target.z": 78.0,
+    }),
+    "round": ("disk", {"lens.outline": {"shape": "circle", "diameter": 10.0}}),
+    "dome": ("dome_even", {}),
+}  # fmt: skip
+REFUSED = {("plate", "housing.py"): "has no place for an LED", ("dome", "mould_insert.py"): "use bstcad export"}
+FEW = {  # settings that take no time
+    "lens.back.control_points": 33, "target.pixels": 24, "tailoring.quality": "draft", "tailoring.rays": 64,
+    "tailoring.transport_grid": 64, "tailoring.stage1_iterations": 100, "tailoring.rounds": 2,
+    "tailoring.stage2_iterations": 4,
+}  # fmt: skip
 
+
+@pytest.fixture(scope="module", params=OTHER)
+def other(request, tmp_path_factory):
+    """Kind and folder of a design of another kind."""
+    template, changes = OTHER[request.param]
+    folder = tmp_path_factory.mktemp("other") / request.param
+    with pytest.MonkeyPatch.context() as patch:
+        draws_nothing(patch)
+        scene = bstcad.load(TEMPLATES / f"{template}.toml").changed({"name": request.param, **changes, **FEW})
+        bstcad.design(scene).write(folder, progress=False, effort=Effort(64, places=65, points=1024))
+    return request.param, folder
+
+
+@pytest.mark.parametrize("script", ["housing.py", "flanged_lens.py", "lens_array.py", "mould_insert.py"])
+def test_a_script_makes_a_part_of_any_design_or_says_why_not(other, script):
+    kind, folder = other
+    if words := REFUSED.get((kind, script)):
+        with pytest.raises(SystemExit) as end:
+            run(script, folder)
+        assert str(end.value).startswith(f"{folder}: ") and words in str(end.value)
+    else:
+        run(script, folder)
+        assert written(folder / script.replace(".py", ".step"))
+
+
+@pytest.mark.parametrize("script", ["housing.py", "flanged_lens.py", "lens_array.py", "mould_insert.py"])
+def test_a_script_without_a_design_ends_in_a_sentence(script, tmp_path):
+    with pytest.raises(SystemExit) as end:
+        run(script, tmp_path / "none")
+    assert "none" in str(end.value) and "\n" not in str(end.value)
+
+
+def test_a_folder_without_pictures_is_a_sentence(tmp_path):
+    for arguments, words in (((), "give a scene"), (("a.toml", tmp_path, tmp_path), "has no picture")):
+        with pytest.raises(SystemExit, match=words):
+            run("picture_folder.py", *arguments)
+    (tmp_path / "a.png").write_text("no picture")
+    with pytest.raises(SystemExit, match=r"a\.png: .*disk"):
+        run("picture_folder.py", TEMPLATES / "missing-disk.toml", tmp_path, tmp_path)
+
+
+def test_the_wall_lies_between_the_rims(design):
+    x, y = (torch.from_numpy(each) for each in design.lens.outline.rim_points())
+    front, back = (face.plain().sag_and_slope(x, y)[0] for face in (design.lens.front, design.lens.back))
+    assert design.wall == pytest.approx((float(front.max()), float(back.min())), abs=1e-3)
+
+
+def _tensors(*values):
     return [torch.tensor([value], dtype=torch.float64) for value in values]
 
 
