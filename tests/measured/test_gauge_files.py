@@ -248,7 +248,7 @@ def test_xml_without_bounds_is_refused_before_it_is_read(tmp_path):
 
 
 def test_a_list_of_data_may_be_longer_than_other_xml(tmp_path, monkeypatch):
-    """Its bytes do not count among those of other XML."""
+    """The bytes of the list do not count among those of other XML."""
     heights, stream = map_of(40), io.BytesIO()
     x3pio.Surface.from_array(1e-3 * heights, x_scale=1e-4, y_scale=1e-4).save(stream, storage=x3pio.DataStorage.XML)
     monkeypatch.setattr(point_grid, "MAX_XML_SIZE", 8_000)

@@ -57,7 +57,7 @@ def of_part(report):
 
 def test_a_design_with_a_mount_has_its_part_and_the_proof_of_it(written):
     scene, folder, report = written
-    assert len(of_part(report)) == 17 and all(check["passed"] for check in of_part(report))
+    assert len(of_part(report)) == 19 and all(check["passed"] for check in of_part(report))
     assert bstcad.open(folder).part().isValid()
 
 
