@@ -11,6 +11,7 @@ import numpy as np
 from bstcad.photometry.intensity import (
     MAX_ANGLES,
     MAX_INTENSITIES,
+    MAX_NUMBERS,
     SAME_ANGLE,
     TURN,
     Intensity,
@@ -30,7 +31,8 @@ STATED = {0: (0, 1), 1: (0, None), 2: (0, 2), 3: (3, 2), 4: (0, 4)}  # quarter o
 
 def read(data: bytes) -> Intensity:
     """Return the intensities of a file; PhotometricError if it cannot be used."""
-    lines = data.removeprefix(b"\xef\xbb\xbf").decode("latin-1").replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    text = data.removeprefix(b"\xef\xbb\xbf").decode("latin-1").replace("\r\n", "\n").replace("\r", "\n")
+    lines = text.split("\n", MAX_NUMBERS)
     symmetry, planes, angles = (_whole(lines, k) for k in (2, 3, 5))
     if symmetry not in STATED:
         raise PhotometricError(f"has the symmetry {symmetry} in line 3; 0 to 4 are known")
@@ -50,7 +52,8 @@ def read(data: bytes) -> Intensity:
     stated = 1 if part is None else planes if part == 1 else planes // part + 1
     values = _numbers(lines, first, planes + angles + stated * angles)
     around, along = values[:planes], values[planes : planes + angles]
-    candela = factor * lumens / KLM * values[planes + angles :].reshape(stated, angles)
+    with np.errstate(over="ignore", invalid="ignore"):  # `checked` refuses infinite intensities
+        candela = factor * lumens / KLM * values[planes + angles :].reshape(stated, angles)
     rated = None if lamps < 0 else lumens
     if part is None:
         return checked("C", np.zeros(1), along, candela, rated=rated)
@@ -129,7 +132,7 @@ def _whole(lines: list[str], k: int) -> int:
 
 def _numbers(lines: list[str], first: int, count: int) -> np.ndarray:
     """Return so many numbers from line `first` on; some programs write several in a line."""
-    text = " ".join(lines[first:]).replace(",", ".").split()
+    text = " ".join(lines[first:]).replace(",", ".").split(maxsplit=count)
     if len(text) < count:
         raise PhotometricError(f"has {len(text)} numbers of {count} angles and intensities; it is not complete")
     try:

@@ -20,6 +20,8 @@ import numpy as np
 
 MAX_ANGLES = 100_000  # largest number of angles along each coordinate of a file
 MAX_INTENSITIES = 4_000_000  # largest number of intensities of a file
+MAX_NUMBERS = MAX_INTENSITIES + 2 * MAX_ANGLES  # largest number of angles and intensities that are read from a file
+MAX_CANDELA = 1e15  # largest intensity (cd), far above lamps; sums of intensities and of their squares are finite
 SYMMETRIC = 1e-3  # largest difference of intensities of a symmetric table, as a fraction of the largest intensity
 MAX_GAP = 1.5  # largest gap between the last plane and the first / largest step of the planes
 TURN, SAME_ANGLE = 360.0, 1e-6  # degrees: full turn; difference of angles that are equal
@@ -138,6 +140,8 @@ def checked(
         around, candela = around[:-1], candela[:-1]  # the last plane repeats the first
     for fault in _faults(kind, around, along, candela):
         raise PhotometricError(fault)
+    if rated is not None and not math.isfinite(rated):
+        raise PhotometricError("has a flux of the lamps that is not finite; correct it")
     table = Intensity(kind, around, along, candela, rated_lumens=rated)
     if not table.lumens > 0:
         raise PhotometricError("has no light; give a file with intensities above 0")
@@ -161,6 +165,8 @@ def _faults(kind: str, around: np.ndarray, along: np.ndarray, candela: np.ndarra
         yield f"has horizontal angles from {around[0]:g} to {around[-1]:g}, which neither close nor span a symmetry"
     if (candela < 0).any():
         yield "has a negative intensity; correct it"
+    if candela.max() > MAX_CANDELA:
+        yield f"has an intensity of {candela.max():.3g} cd, and {MAX_CANDELA:g} cd is the maximum; correct its factors"
 
 
 def mirrored(planes: np.ndarray, table: np.ndarray, about: float) -> tuple[np.ndarray, np.ndarray]:

@@ -12,13 +12,15 @@ from pathlib import PurePath
 import numpy as np
 
 from bstcad.photometry import eulumdat, ies
-from bstcad.photometry.intensity import MAX_INTENSITIES, Intensity, PhotometricError, checked
+from bstcad.photometry.intensity import MAX_INTENSITIES, MAX_NUMBERS, Intensity, PhotometricError, checked
 
 CORNER = "gamma\\C"  # first value of a table, above γ and before C
 
 
 def of_csv(data: bytes) -> Intensity:
     """Return the intensities (cd) of a table: C angles in its first row, γ in its first column, degrees."""
+    if sum(map(data.count, (b",", b";", b"\n"))) > MAX_NUMBERS:  # before memory is allocated for each number
+        raise PhotometricError(f"has more than {MAX_NUMBERS} values; give a table over fewer angles")
     rows = [
         line.replace(";", ",").split(",") for line in data.decode("utf-8-sig", "replace").splitlines() if line.strip()
     ]

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import io
 import math
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,6 +32,9 @@ from bstcad.scene.schema import LENGTHS, OneOrTwoWidths, Record, from_file
 
 KEY = "source.profile.image"  # key of the file, for messages
 PREFIX = "beam-"  # beginning of the name of the copy
+MAX_BEAM_PIXELS = 16_000_000  # largest number of pixels of a picture or of numbers of a table; each takes 25 bytes
+MAX_TABLE_LINE = 2_000_000  # largest line of a table (characters), 30 for each of 65 535 numbers
+MAX_TABLE_VALUE = 1e100  # largest size of a number of a table, so that sums of squares are finite
 MAX_TABLE_SIZE = 50_000_000  # largest table of a beam (bytes)
 MIN_SIDE = 5  # smallest number of rows and columns
 MAX_NET = 512  # largest number of control points along a side; pictures with more pixels are averaged
@@ -46,6 +51,7 @@ def values_of(image: Picture) -> np.ndarray:
     if image.name.endswith(".csv"):
         return table(image.data, shown(image))
     with _naming_the_beam(), picture.decoding(image):
+        picture.kind_of(image.data, shown(image), MAX_BEAM_PIXELS)  # before the pixels are decoded
         photo = picture.photo(image, gamma=1.0)
         return np.concatenate([photo.light(box) for box in picture.strips((0, 0, *photo.image.size))])
 
@@ -83,17 +89,26 @@ def shown(image: Picture) -> str:
 
 def table(data: bytes, name: str) -> np.ndarray:
     """Return the numbers of a table, (rows, columns), separated by comma, semicolon or space; # begins a remark."""
-    refused = f"{KEY}: {name!r} is not a table of numbers; give rows of as many numbers each"
+    refused = (
+        f"{KEY}: {name!r} is not a table of numbers up to {MAX_TABLE_VALUE:g}; give rows of as many numbers each, "
+        f"at least {MIN_SIDE} x {MIN_SIDE}, at most {MAX_BEAM_PIXELS // 10**6} million, all finite"
+    )
+    text, values, columns = io.TextIOWrapper(io.BytesIO(data), "utf-8-sig"), array("d"), 0
     try:
-        lines = data.decode("utf-8-sig").splitlines()
-        lines = [line.partition("#")[0].replace(";", " ").replace(",", " ") for line in lines]
-        rows = [line.split() for line in lines if line.strip()]
-        values = np.array([[float(number) for number in row] for row in rows])
+        while line := text.readline(MAX_TABLE_LINE + 1):
+            if len(line) > MAX_TABLE_LINE:
+                raise ValueError
+            row = line.partition("#")[0].replace(";", " ").replace(",", " ").split()
+            columns = columns or len(row)
+            if row and (len(row) != columns or columns < MIN_SIDE or len(values) + columns > MAX_BEAM_PIXELS):
+                raise ValueError
+            values.extend(map(float, row))
     except ValueError:
         raise SceneError(refused) from None
-    if values.ndim != 2 or min(values.shape, default=0) < 5 or not np.isfinite(values).all():
-        raise SceneError(f"{refused}, at least 5 x 5, all finite")
-    return values
+    found = np.array(values).reshape(-1, max(columns, 1))
+    if len(found) < MIN_SIDE or not np.abs(found).max() <= MAX_TABLE_VALUE:
+        raise SceneError(refused)
+    return found
 
 
 @dataclass(frozen=True)

@@ -96,10 +96,13 @@ def read_picture(path: Path) -> Picture:
     return Picture((safe_name(path.stem)[:70] or "picture") + kind_of(data, path.name), data)
 
 
-def kind_of(data: bytes, name: str = "the picture") -> str:
-    """Return the file name suffix of a picture's format, such as ".png"; SceneError if too large or not a picture."""
+def kind_of(data: bytes, name: str = "the picture", largest: int = MAX_PICTURE_PIXELS) -> str:
+    """Return the file name suffix of a picture's format, such as ".png", from its header.
+
+    SceneError if the file is not a picture, or has more than `largest` pixels.
+    """
     with decoding(name):
-        return FORMATS[str(_open_picture(name, data).format)]
+        return FORMATS[str(_open_picture(name, data, largest).format)]
 
 
 def from_array(values: np.ndarray) -> Picture:
@@ -164,7 +167,7 @@ def _silent() -> Iterator[None]:
         os.close(null)
 
 
-def _open_picture(name: str, data: bytes) -> ImageFile.ImageFile:
+def _open_picture(name: str, data: bytes, largest: int = MAX_PICTURE_PIXELS) -> ImageFile.ImageFile:
     """Return the picture in `data` with its header read and its pixels not decoded yet; name: for messages."""
     sizes, kinds = [], f"not a {FORMAT_NAMES} picture; save it in one of these formats"
     try:
@@ -186,8 +189,8 @@ def _open_picture(name: str, data: bytes) -> ImageFile.ImageFile:
     except (OSError, SyntaxError, ValueError, KeyError):  # KeyError: Pillow without AVIF
         raise SceneError(f"target.image: {name!r} is {kinds}") from None
     for width, height in (image.size, *sizes):
-        if width * height > MAX_PICTURE_PIXELS or max(width, height) > MAX_PICTURE_SIDE:
-            limit = f"more than {MAX_PICTURE_PIXELS // 10**6} million, or more than {MAX_PICTURE_SIDE} along a side"
+        if width * height > largest or max(width, height) > MAX_PICTURE_SIDE:
+            limit = f"more than {largest // 10**6} million, or more than {MAX_PICTURE_SIDE} along a side"
             raise SceneError(f"target.image: {name!r} has {width} x {height} pixels, {limit}; shrink it")
     if _tags(image).get(TILE_WIDTH, 1) * _tags(image).get(TILE_LENGTH, 1) > MAX_TILE:
         raise SceneError(f"target.image: {name!r} has tiles of more than {MAX_TILE} pixels; save it as PNG")

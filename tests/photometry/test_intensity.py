@@ -151,6 +151,41 @@ def test_a_table_of_numbers_has_c_in_its_first_row():
     assert found.between(np.array([90.0, 315.0]), np.array([30.0, 30.0])).tolist() == [3.0, 2.5]
 
 
+INFINITE = {
+    "a multiplier": (".ies", FACTORS.replace("1.5", "1e308")),
+    "a product of factors": (".ies", FACTORS.replace("1.5", "1e308").replace(".9 .8 20", "1e10 .8 20")),
+    "a number": (".ies", FACTORS.replace("100 70", "1e400 70")),
+    "an intensity": (".ies", FACTORS.replace("100 70", "1e308 1e308")),
+    "a flux of lamps": (".ies", FACTORS.replace("2 500", "1e200 1e200")),
+    "a table": (".csv", "g,0,90,180,270\n0,1e308,5,5,5\n30,1e308,3,2,1\n"),
+    "too many rows": (".csv", "1\n" * 5_000_000),
+    "too many numbers": (".ies", FACTORS + "1 " * 20_000_000),
+}
+
+
+@pytest.mark.parametrize("case", INFINITE)
+def test_infinite_light_and_endless_tables_are_refused(case):
+    suffix, text = INFINITE[case]
+    tracemalloc.start()
+    try:
+        if case == "too many numbers":  # those after the table are not read
+            assert intensity_files.read(f"a{suffix}", text.encode()).lumens > 0
+        else:
+            with pytest.raises(PhotometricError, match=r"finite|maximum|more than \d+ values"):
+                intensity_files.read(f"a{suffix}", text.encode())
+        assert tracemalloc.get_traced_memory()[1] < 1e9
+    finally:
+        tracemalloc.stop()
+
+
+def test_an_infinite_flux_of_lamps_in_an_eulumdat_file_is_refused():
+    lines = eulumdat.write(table("none"), Luminaire("lens"), 1000.0).split(b"\r\n")
+    assert lines[28] == b"1000"
+    lines[28] = b"1e308"
+    with pytest.raises(PhotometricError, match="finite|maximum"):
+        eulumdat.read(b"\r\n".join(lines))
+
+
 def damaged(data, chance):
     """The file cut short, with bytes changed, lines lost, or numbers replaced."""
     how = chance.randrange(5)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import math
 import random
+import struct
 import tracemalloc
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageFile
 
 import bstcad
 from bstcad.optics.outlines import EVERYWHERE
+from bstcad.scene import beam
 from bstcad.scene.beam import MeasuredBeam, background, lit, moments, read_beam
 from bstcad.scene.errors import SceneError
 
@@ -102,6 +105,10 @@ def test_an_off_centre_beam_that_the_aperture_does_not_show_is_refused(tmp_path)
 @pytest.mark.parametrize(("content", "sentence"), [
     (b"1,2,3\n4,5\n", "is not a table of numbers"),
     (b"a,b\n", "is not a table of numbers"),
+    (b"\n".join([b"1e308,7,7,7,7,7,7,7"] * 8), r"numbers up to 1e\+100"),  # sums and squares would be infinite
+    (b"\n".join([b"1e999,7,7,7,7,7,7,7"] * 8), "all finite"),
+    (b"1\n" * 25_000_000, "at least 5 x 5"),
+    (b"1 " * 5_000_000, "is not a table of numbers"),
     (b"1 2\n3 4\n", "at least 5 x 5"),
     (b"\n".join([b"7,7,7,7,7,7,7,7"] * 8), "shows no light above its background"),
     (b"\n".join([b"nan,7,7,7,7,7,7,7"] * 8), "all finite"),
@@ -109,8 +116,38 @@ def test_an_off_centre_beam_that_the_aperture_does_not_show_is_refused(tmp_path)
 ])  # fmt: skip
 def test_wrong_tables_are_refused(content, sentence, tmp_path):
     (tmp_path / "beam.csv").write_bytes(content)
-    with pytest.raises(SceneError, match=rf"^source\.profile\.image: 'beam.csv' .*{sentence}"):
+    tracemalloc.start()
+    try:
+        with pytest.raises(SceneError, match=rf"^source\.profile\.image: 'beam.csv' .*{sentence}"):
+            scene(tmp_path, "beam.csv")
+        assert tracemalloc.get_traced_memory()[1] < 16 * len(content) + 100e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_table_of_too_many_numbers_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "beam.csv").write_bytes(b"1 1 1 1 9\n" * 21)
+    monkeypatch.setattr(beam, "MAX_BEAM_PIXELS", 100)
+    with pytest.raises(SceneError, match=r"^source\.profile\.image: .*at most"):
         scene(tmp_path, "beam.csv")
+
+
+def claimed(form):
+    """A file of some bytes, of which a decoder makes a picture of 64 million pixels."""
+    if form == "gif":  # one pixel on a canvas
+        head, frame = b"GIF89a" + struct.pack("<HH", 65535, 970), b"," + bytes(4) + b"\1\0\1\0\0"
+        return head + b"\x80\0\0" + bytes(3) + b"\xff" * 3 + frame + b"\2\2D\1\0;"
+    file = io.BytesIO()
+    Image.new("L", (8000, 8000)).save(file, form, **({"compression": "tiff_deflate"} if form == "tiff" else {}))
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("form", ["gif", "png", "tiff", "bmp"])
+def test_a_beam_of_too_many_pixels_is_refused_before_they_are_decoded(form, tmp_path, monkeypatch):
+    (tmp_path / f"beam.{form}").write_bytes(claimed(form))
+    monkeypatch.setattr(ImageFile.ImageFile, "load", lambda image: pytest.fail("the pixels are decoded"))
+    with pytest.raises(SceneError, match=r"^source\.profile\.image: .* pixels, more than 16 million.*; shrink it"):
+        scene(tmp_path, f"beam.{form}")
 
 
 @pytest.mark.parametrize(("changes", "sentence"), [
