@@ -50,7 +50,7 @@ class RoundLight:
     design: Rrmsd
     measured: Rrmsd
     expected: Rrmsd
-    expected_by_form: Rrmsd | None = None  # with the deviation expected to remain after a correction by form
+    expected_by_form: Rrmsd | None = None  # RRMSD expected after a correction by form
 
 
 @dataclass(frozen=True)
