@@ -25,6 +25,7 @@ from bstcad.report.figure_jobs import side_view
 from bstcad.report.light_figures import View
 from bstcad.scene.elements import Mirror, Window, interfaces
 from bstcad.scene.errors import SceneError
+from bstcad.tailoring import slope_map
 from bstcad.tolerance.perturbations import Setup
 from bstcad.verify import step_checks
 from tests.conftest import DISK, draws_nothing, quick_effort
@@ -299,3 +300,15 @@ def test_a_lens_that_is_moved_leaves_them_where_they_are(folder):
 def test_a_screen_of_an_image_is_the_screen_where_nothing_is_behind():
     scene = bstcad.load(DISK)
     assert image_screen(scene.flat_lens(9), screen := scene.target.screen) is screen
+
+
+@pytest.mark.parametrize("place", ["before", "behind"])
+def test_an_element_that_is_narrower_than_a_cell_is_named(place):
+    z = {"before": (1.0, 5.0, 9.0), "behind": (60.0, 70.0, 80.0)}[place]
+    wide, narrow = ({"shape": "circle", "radius": radius} for radius in (30.0, 0.001))
+    elements = [WINDOW | {"z": at, "outline": rim} for at, rim in zip(z, (wide, narrow, wide), strict=True)]
+    lens = bstcad.load(DISK, {place: elements}).flat_lens(33)
+    with pytest.raises(SceneError, match=rf"^{place}\[1\]\.outline: is 0\.002 mm wide, .*; make it wider"):
+        slope_map.light_density(np.zeros((4, 4)), 8.0, lens)
+    with pytest.raises(SceneError, match=r"lens\.outline less oblong"):
+        slope_map.light_density(np.zeros((4, 4)), 8.0)

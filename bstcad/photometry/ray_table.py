@@ -21,6 +21,7 @@ TEXT_PER_BLOCK = 1 << 22  # bytes of text that are parsed at a time
 SAME_TOTAL = 1e-3  # largest difference of a stated total from the sum of the powers, as a fraction of the sum
 UNIT_LENGTH = 1e-3  # largest difference of the length of a direction from 1
 SAME_LENGTH = 1e-6  # largest difference of the length of a direction from 1 that is rounding, and is kept
+MAX_POSITION = 1e6  # largest coordinate of a ray (mm); larger ones are faults of the file or of its unit
 SMALLEST_FLUX = 1e-30  # smallest flux of a header; smaller ones, 0 and NaN state that the flux is not known
 
 Source = Path | bytes  # ray file, or the bytes of one
@@ -110,6 +111,8 @@ class RayTable:
     def _positions(self, block: np.ndarray, first: int) -> np.ndarray:
         position = scaled(block[:, :3], self.millimetres)
         _refuse(~np.isfinite(position).all(axis=1), first, fault="a position that is not finite")
+        far = (np.abs(position) > MAX_POSITION).any(axis=1)
+        _refuse(far, first, fault=f"a position more than {MAX_POSITION:g} mm from the origin")
         return position
 
     def _directions(self, block: np.ndarray, first: int) -> np.ndarray:

@@ -35,6 +35,7 @@ HEIGHT_EXPORTS = {  # kinds that need a back of heights z(x, y), which a dome is
 }  # fmt: skip
 MAX_ARCHIVE_SIZE = 600_000_000  # largest .npz (bytes), enough for a net of 2049 x 2049 and pictures of 4096 x 4096
 MAX_ARRAY_HEADER = 4096  # largest header of an array in an .npz archive (bytes), with a margin
+MAX_FOLDER_NAME = 230  # largest name of a folder of a design (bytes); names beside it are longer, up to 255
 NO_MEMORY = re.compile(  # words of Python, torch, the system and the dynamic loader for a lack of memory
     "not enough memory|out of memory|bad_alloc|can(not|'t) allocate memory|failed to map segment|can't start new thread"
 )
@@ -104,6 +105,8 @@ def sentence_of(error: BaseException) -> str | None:
         except OSError:
             return "the working folder was deleted; change to another folder (cd) and try again"
     where = f"{error.filename}: " if error.filename else ""
+    if error.errno == errno.ENAMETOOLONG:
+        return f"{where}is longer than the names of files may be on this system; give a shorter name"
     return f"{where}{error.strerror or error}; check that the path exists, is writable and has free space"
 
 
@@ -226,6 +229,8 @@ def check_free(folder: Path, ours: Sequence[str] = DESIGN_FILES, whose: str = "a
 
     ours: names of files, of which an earlier design's folder has at least one.  whose: their owner, for the message.
     """
+    if (size := len(os.fsencode(folder.name))) > MAX_FOLDER_NAME:
+        raise SceneError(f"{folder.name}: has {size} bytes, and {MAX_FOLDER_NAME} is the maximum; give a shorter name")
     try:
         folder.resolve()
     except (OSError, RuntimeError):  # newer and older versions of pathlib

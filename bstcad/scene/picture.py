@@ -294,6 +294,8 @@ class Photo:
         values = values.astype(np.float64)
         if not (values.min() >= 0 and np.isfinite(values).all()):
             fault = "values that are negative or not finite"
+            if image.mode == "I":  # 32 bits, which Pillow reads with a sign
+                fault = "values that are negative, or above 2147483647 without a sign"
             raise SceneError(f"target.image: {self.name!r} has {fault}; save it with 8 or 16 bits")
         return values[..., None] / self.white, alpha
 

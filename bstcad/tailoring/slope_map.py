@@ -24,7 +24,7 @@ and the aim of each ray.  Stage 1 falls back on this map, and the baselines use 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +36,7 @@ from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.charts import HEIGHTS
 from bstcad.optics.emitters import Emitter
 from bstcad.optics.goal import Goal
+from bstcad.optics.interfaces import Reflect
 from bstcad.optics.irradiance import Screen
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Outline, Rectangle
@@ -376,14 +377,33 @@ def resample_picture(picture: np.ndarray, corners: Points, n: int) -> tuple[Dens
     return Density.from_values(resample_flux(flux, x, y, n=n, parts=(columns, rows)), floor=SLOPE_FLOOR), frame
 
 
-def light_density(values: np.ndarray, side: float) -> Density:
-    """Return the density of light from `values` (n, n) on a square of `side` mm; SceneError if all of them are zero."""
+def light_density(values: np.ndarray, side: float, lens: Lens | None = None) -> Density:
+    """Return the density of light from `values` (n, n) on a square of `side` mm; SceneError if all of them are zero.
+
+    lens: lens whose elements the light has passed; None: light that has not passed them.
+    """
     if not values.any():
+        for key, width in narrow_elements(lens, side / len(values)) if lens else ():
+            raise SceneError(
+                f"{key}.outline: is {width:.3g} mm wide, and no light of the {side:.3g} mm at the lens passes it; "
+                "make it wider"
+            )
         raise SceneError(
             f"source: its light at the lens is a strip narrower than a cell ({side / len(values):.3g} mm) of the "
             "square transport grid; make the lit part of lens.outline less oblong, or raise tailoring.transport_grid"
         )
     return Density.from_values(values)
+
+
+def narrow_elements(lens: Lens, width: float) -> Iterator[tuple[str, float]]:
+    """Yield key and width (mm) of each window and mirror of a scene that is narrower than `width` (mm)."""
+    for name, interfaces in (("before", lens.before), ("behind", lens.behind)):
+        number = 0.0  # of the element: a window has two interfaces, a mirror one
+        for interface in interfaces:
+            across = 2 * min(interface.outline.half_extent)
+            if across < width:
+                yield f"{name}[{int(number)}]", across
+            number += 1.0 if isinstance(interface.law, Reflect) else 0.5
 
 
 def lit_corners(picture: np.ndarray) -> np.ndarray:
@@ -406,7 +426,7 @@ def map_to_target(source: Emitter, lens: Lens, goal: Goal, n: int, solver: Solve
     x, y = (t.to(lens.like.device) for t in sampling.grid(Rectangle(side, side), n * SUBCELLS))
     flux = source.irradiance(x, y, lens.entrance.z)
     flux = flux * is_transmitted(source.rays_through(x, y, lens.entrance.z, 1.0), lens)
-    density = light_density(flux.cpu().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3)), side)
+    density = light_density(flux.cpu().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3)), side, lens)
     if not screen.plane.is_level:
         target, frame = resample_picture(picture, screen.plane.to_level_plane(*pixel_corners(screen), lens.front.z), n)
     else:

@@ -256,7 +256,7 @@ def test_faults_are_refused_and_small_ones_set_right():
     for column, value, clause in (
         (3, 0.1, "no unit vector in ray 2"), (4, np.nan, "no unit vector in ray 2"),
         (6, -1.0, "negative power in ray 2"), (6, np.inf, "power that is not finite in ray 2"),
-        (1, np.nan, "position that is not finite in ray 2"),
+        (1, np.nan, "position that is not finite in ray 2"), (0, 1e20, r"1e\+06 mm from the origin in ray 2"),
     ):  # fmt: skip
         bad = np.array(good)
         bad[1, column] = value

@@ -61,6 +61,16 @@ def test_arrays_come_back_as_numbers(tmp_path, kind, save):
     assert files.names(tmp_path / "x.npz") == ["net", "flat", "one", "more"] and files.names(tmp_path / "none") == []
 
 
+def test_names_that_the_system_does_not_permit_are_refused_by_their_length(tmp_path):
+    files.check_free(tmp_path / ("x" * 230))
+    for length in (231, 250, 300):
+        with pytest.raises(files.SceneError, match=f"has {length} bytes, and 230 is the maximum; give a shorter name"):
+            files.check_free(tmp_path / ("x" * length))
+    with pytest.raises(OSError) as caught:
+        (tmp_path / ("x" * 300)).write_bytes(b"")
+    assert files.sentence_of(caught.value).endswith("on this system; give a shorter name")
+
+
 def test_every_damage_of_an_archive_is_a_value_error(tmp_path):
     path, rng = tmp_path / "x.npz", np.random.default_rng(1)
     np.savez_compressed(path, control_points=rng.normal(size=(9, 9, 3)), flat=np.zeros((3, 4)))

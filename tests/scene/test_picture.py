@@ -279,6 +279,16 @@ def test_values_that_are_no_light_are_refused_and_others_are_parts_of_the_larges
         light(saved(values, "TIFF"), 8)
 
 
+def test_whole_numbers_of_32_bits_are_refused_by_their_sign_or_size():
+    """Pillow reads numbers without a sign as if they had one."""
+    values = np.full((8, 8), 7, np.int32)
+    assert light(saved(values, "TIFF"), 8).max() > 0
+    for value in (-1, np.array(3_000_000_000, np.uint32).astype(np.int32)):
+        values[3, 3] = value
+        with pytest.raises(SceneError, match=r"negative, or above 2147483647 without a sign; save it"):
+            light(saved(values, "TIFF"), 8)
+
+
 @pytest.mark.parametrize("side", [8001, 20_000])  # over our own limit; over the limit of Pillow itself
 def test_files_that_are_damaged_or_huge_or_of_another_kind_are_refused(tmp_path, side):
     whole, path = saved(RANDOM.integers(0, 256, (64, 64), dtype=np.uint8)), tmp_path / "p.ppm"
