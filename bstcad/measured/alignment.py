@@ -35,7 +35,7 @@ MAX_OUTLIER_ROUNDS = 6  # maximum number of rounds of outlier rejection
 STEP_TOLERANCE = 1e-10  # largest component (mm at the rim) of a step that ends the iteration
 FOOT_ITERATIONS = 3  # iterations for the foot of a perpendicular; each multiplies the error by distance x curvature
 INDEPENDENT_PATCHES = 100  # assumed number of patches of a face with independent form errors
-SCALE_PATCHES = 16  # assumed number of independent patches of form errors that resemble a scale error: errors of power
+LOW_ORDER_FORMS = 1  # assumed number of independent form errors of low order, which resemble a scale or a motion
 MAX_MOTION_UNCERTAINTY = 0.1  # uncertainty of a motion (from form errors) / BackFace.reach, above which it stays zero
 MIN_SENSITIVITY = 1e-7  # smallest RMS change of the distances per motion (mm/mm); smaller ones are rounding errors
 RIM_MARGIN = 2e-3  # width of the ignored strip along the rim / half width of the face; points in it may lie on the edge
@@ -229,20 +229,6 @@ def _undetermined(motions: np.ndarray) -> tuple[str, ...]:
         " with ".join(name for name, part in zip(MOTION_NAMES, direction, strict=True) if abs(part) > 0.3)
         for direction in directions[:, size > 0.5].T
     )
-
-
-def scale(face: BackFace, alignment: Alignment) -> tuple[float, float]:
-    """Return (scale of the cloud relative to the design, fitted as a seventh parameter; its standard uncertainty)."""
-    growth = np.einsum("ij,ij->i", alignment.points - face.pivot, alignment.normals)
-    columns = face.columns(alignment.points, alignment.normals) @ alignment.motions
-    both = np.stack([growth, alignment.distances], axis=1)
-    growth, distances = (both - columns @ np.linalg.solve(columns.T @ columns, columns.T @ both)).T
-    energy = growth @ growth
-    if energy <= (MIN_SENSITIVITY * face.reach) ** 2 * len(growth):  # a plane has no scale
-        return 1.0, np.inf
-    excess = growth @ distances / energy
-    residual = root_mean_square(distances - excess * growth)
-    return 1 + float(excess), float(residual / np.sqrt(energy / len(growth) * SCALE_PATCHES))
 
 
 # --- outliers ---------------------------------------------------------------------------------------------------------

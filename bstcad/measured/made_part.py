@@ -14,7 +14,7 @@ from bstcad.measured import alignment as aligning
 from bstcad.measured.alignment import Alignment, BackFace, Pose
 from bstcad.measured.cloud import Cloud
 from bstcad.measured.form_error import Deviation, FormError, deviation, fit_form_error, minimum_zone
-from bstcad.measured.shrinkage import AxisScales, axis_scales
+from bstcad.measured.shrinkage import AxisScales, axis_scales, low_orders, scale
 from bstcad.optics.goal import Goal, worst
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, Light
@@ -24,7 +24,6 @@ from bstcad.verify.verdict import Check
 
 MAX_RMS_DISTANCE = 3e-3  # RMS distance after alignment / BackFace.reach, above which a part is of another design
 MIN_RELIEF = 0.5  # fine relief, as a fraction of the design's, below which a part is of another design
-COARSE_DEGREE = 4  # degree of the polynomial removed from relief, as lenses of equal power have similar polynomials
 MIN_DESIGN_RELIEF = 3e-5  # RMS fine relief of a design / BackFace.reach, below which a part is not judged by relief
 SCALE_TOLERANCE = 2e-4  # relative tolerance of the scale, about the size of a thermal expansion
 SCALE_SIGMAS = 3.0  # tolerance of the scale, in standard uncertainties, if larger than SCALE_TOLERANCE
@@ -58,16 +57,17 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     figures = deviation(lens, alignment, form)
     cheap = replace(nominal.effort(effort), witness=False)
     lights = [_light(lens, form, nominal, goal, effort=cheap) for goal in nominal.goals]
-    scale, axes = aligning.scale(face, alignment), axis_scales(face, alignment)
+    (size, _), axes = scale(face, alignment), axis_scales(face, alignment)
     checks = (
         *of_cloud,
         *_light_checks(nominal, lights),
         *_wavefront(replace(lens, back=form.add_to(lens.back_net)), nominal),
     )
     facts = _facts(face, alignment, figures, cloud) | {
-        "scale": scale[0],
+        "scale": size,
         **axes.facts(),
-        "moulding_shrinkage": _moulding_shrinkage(nominal, scale[0], axes),
+        "stretch": axes.stretch,
+        "moulding_shrinkage": _moulding_shrinkage(nominal, size, axes),
         "passed": all(check.passed for check in checks),
     }
     predicted = [_predicted(light, high) for light, high in lights]
@@ -86,16 +86,15 @@ def aligned(cloud: Cloud, face: BackFace, decentre: float | None) -> tuple[Align
         alignment, axes = _align(face, cloud.points)
     except ValueError as error:
         raise ValueError(f"{cloud.path}: {error}") from None
-    scale = aligning.scale(face, alignment)
-    return alignment, tuple(_cloud_checks(cloud, face, alignment, axes, scale=scale, decentre=decentre))
+    return alignment, tuple(_cloud_checks(cloud, face, alignment, axes, decentre=decentre))
 
 
 def _cloud_checks(
-    cloud: Cloud, face: BackFace, alignment: Alignment, axes: str, scale: tuple[float, float], decentre: float | None
+    cloud: Cloud, face: BackFace, alignment: Alignment, axes: str, decentre: float | None
 ) -> Iterator[Check]:
     """Check that a cloud is in mm and has the design's axes, and that it is of this face, complete, clean and in place.
 
-    axes: exchange of axes that the cloud needs, in words; scale: (scale, uncertainty); decentre: accept.decentre (mm).
+    axes: exchange of axes that the cloud needs, in words; decentre: accept.decentre (mm).
     """
     extent = f"its extent fits the lens if its unit is {cloud.unit}"
     yield Check.true("made part: the cloud is in mm", cloud.unit == "mm", extent, id="made-unit")
@@ -105,8 +104,9 @@ def _cloud_checks(
     yield Check.at_least(name, measured, MIN_MEASURED_FRACTION, id="made-covered")
     name, where = "made part: fraction of outliers among the points of the face", "clean the part and measure it again"
     yield Check.at_most(name, alignment.outlier_fraction, MAX_OUTLIER_FRACTION, where=where, id="made-outliers")
-    (factor, uncertainty), name = scale, "made part: error of the scale of the cloud"
-    limit, where = max(SCALE_TOLERANCE, SCALE_SIGMAS * uncertainty), f"size of cloud / design: {factor:.5f}"
+    (factor, uncertainty), name = scale(face, alignment), "made part: error of the scale of the cloud"
+    limit, stretch = max(SCALE_TOLERANCE, SCALE_SIGMAS * uncertainty), axis_scales(face, alignment).stretch
+    where = "; ".join(filter(None, (f"size of cloud / design: {factor:.5f}", stretch)))
     yield Check.at_most(name, abs(factor - 1), limit, where=where, id="made-scale")
     x, y, _ = alignment.pose.shift
     name, where = "made part: decentre in the frame of the cloud", f"x {x:+.4g} mm, y {y:+.4g} mm"
@@ -168,8 +168,7 @@ def _identity_checks(face: BackFace, alignment: Alignment) -> tuple[Check, Check
 def _relief(face: BackFace, points: np.ndarray) -> float | None:
     """Return the ratio of fine relief, made face to design, by regression; None if the design has none."""
     points = points[np.random.default_rng(0).permutation(len(points))[:RELIEF_POINTS]]
-    x, y = (points[:, :2] / face.reach).T
-    columns = np.stack([x**i * y**j for i in range(COARSE_DEGREE + 1) for j in range(COARSE_DEGREE + 1 - i)], axis=1)
+    columns = low_orders(points)  # removed, as lenses of equal power have similar polynomials
     off = face.height(points)
     sag = points[:, 2] - off
     fine, change = (part - columns @ shape.least_squares(columns, part) for part in (sag - sag.mean(), off))

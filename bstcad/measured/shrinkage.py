@@ -1,9 +1,15 @@
-"""Fit the scale of a made part along each axis to its cloud: the shrinkage that a moulding had.
+"""Fit the scale of a made part to its cloud, one for all axes or one along each: the shrinkage that a moulding had.
 
 A part that is larger than the design by ε = (ε_x, ε_y, ε_z) about the pivot c has the distances Σ_k ε_k (q_k - c_k) n_k
-from the face, q a point and n its normal.  The three are fitted by least squares beside the motions of the alignment.
-Form errors that resemble a scale limit the accuracy, as in alignment.scale: SCALE_PATCHES independent patches of them
-are assumed.  A face without fine relief does not tell the three apart: a bowl that is wider is also flatter.
+from the face, q a point and n its normal.  A smooth form error resembles a scale, and moves the alignment.  Scales and
+motions are therefore fitted together by generalised least squares, d = B β + form error.  Polynomials of LOW_DEGREE
+split distances and columns B into low orders L and fine relief F, which have the mean squares v_L and v_F of residuals:
+
+    (L_Bᵀ L_B PATCHES_L / v_L + F_Bᵀ F_B PATCHES_F / v_F) β = L_Bᵀ L_d PATCHES_L / v_L + F_Bᵀ F_d PATCHES_F / v_F.
+
+v_L and v_F follow from β, so that low orders that contradict the fine relief lose their weight.  The distances are
+measured again at the new pose.  A face without fine relief does not determine the scales: a bowl that is wider is also
+flatter.
 """
 
 from __future__ import annotations
@@ -12,7 +18,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bstcad.measured.alignment import MIN_SENSITIVITY, SCALE_PATCHES, Alignment, BackFace, root_mean_square
+from bstcad.measured.alignment import (
+    INDEPENDENT_PATCHES,
+    LOW_ORDER_FORMS,
+    MIN_SENSITIVITY,
+    Alignment,
+    BackFace,
+    identity_pose,
+    root_mean_square,
+)  # fmt: skip
+
+LOW_DEGREE = 4  # degree of the polynomials in x and y that describe form errors of low order
+SCALE_POINTS = 20_000  # maximum number of points to which scales are fitted
+MAX_UNCERTAINTY = 3e-3  # standard uncertainty of a scale, above which the face does not determine it
+MAX_MOTION = 0.05  # largest motion beside the alignment / BackFace.reach; a larger one shows that nothing is determined
+MAX_LOW_ENERGY = 4.0  # largest mean square of the low orders of a form error, relative to that after the alignment
+POSE_ROUNDS, WEIGHT_ROUNDS = 4, 30  # maximum numbers of poses, and of estimates of v_L and v_F at each pose
+WEIGHT_TOLERANCE = 1e-7  # change of scales and motions (mm at the rim) that ends the rounds
+MIN_VARIANCE = 1e-18  # lower bound of v_L and v_F, mm²: rounding
+STRETCH_SIGMAS = 3.0  # difference of a scale from another axis, in standard uncertainties, that shows a stretched part
 
 
 @dataclass(frozen=True)
@@ -30,21 +54,99 @@ class AxisScales:
             for name, values in (("scale_xyz", self.scales), ("scale_xyz_uncertainty", self.uncertainties))
         }
 
+    @property
+    def stretch(self) -> str:
+        """Axes along which the part is stretched or shrunk relative to the other two, in words; "" if none is."""
+        s, variance = np.array(self.scales), np.array(self.uncertainties) ** 2
+        apart = np.abs(s[:, None] - s) > STRETCH_SIGMAS * np.sqrt(variance[:, None] + variance)
+        axes = [axis for axis, differs in zip("xyz", apart.sum(axis=1) == 2, strict=True) if differs]
+        sizes = ", ".join(f"{a} {x:.5f} ± {u:.2g}" for a, x, u in zip("xyz", s, self.uncertainties, strict=True))
+        return f"the size differs along {' and '.join(axes)}: {sizes}" if axes else ""
+
 
 def axis_scales(face: BackFace, alignment: Alignment) -> AxisScales:
-    """Return the scales of an aligned cloud along x, y and z, fitted beside its motions, and their uncertainties."""
-    growth = (alignment.points - face.pivot) * alignment.normals
-    columns = face.columns(alignment.points, alignment.normals) @ alignment.motions
-    both = np.column_stack([growth, alignment.distances])
-    both = both - columns @ np.linalg.solve(columns.T @ columns, columns.T @ both)
-    growth, distances = both[:, :3], both[:, 3]
-    energy, directions = np.linalg.eigh(growth.T @ growth / len(growth))
-    determined = energy > (MIN_SENSITIVITY * face.reach) ** 2
-    inverse = np.where(determined, 1 / np.where(determined, energy, 1.0), 0.0)
-    excess = directions @ (inverse * (directions.T @ (growth.T @ distances / len(growth))))
-    residual = root_mean_square(distances - growth @ excess)
-    variance = (directions**2) @ inverse * residual**2 / SCALE_PATCHES
-    variance[(np.abs(directions[:, ~determined]) > 1e-3).any(axis=1)] = np.inf
-    x, y, z = (1 + excess).tolist()
-    u, v, w = np.sqrt(variance).tolist()
+    """Return the scales of an aligned cloud along x, y and z, and their standard uncertainties."""
+    (x, y, z), (u, v, w) = (part.tolist() for part in _fit(face, alignment, np.eye(3)))
     return AxisScales((x, y, z), (u, v, w))
+
+
+def scale(face: BackFace, alignment: Alignment) -> tuple[float, float]:
+    """Return (scale of the cloud relative to the design, its standard uncertainty), one scale for all axes.
+
+    If fine relief does not determine the scale, it is that of ordinary least squares.  Its uncertainty then assumes
+    LOW_ORDER_FORMS form errors that resemble a scale, of which motions and scale take up most (MAX_LOW_ENERGY).
+    """
+    (value,), (uncertainty,) = (part.tolist() for part in _fit(face, alignment, np.ones((3, 1))))
+    if np.isfinite(uncertainty):
+        return value, uncertainty
+    growth = np.einsum("ij,ij->i", alignment.points - face.pivot, alignment.normals)
+    columns = face.columns(alignment.points, alignment.normals) @ alignment.motions
+    both = np.stack([growth, alignment.distances], axis=1)
+    growth, distances = (both - columns @ np.linalg.solve(columns.T @ columns, columns.T @ both)).T
+    energy = growth @ growth
+    if energy <= (MIN_SENSITIVITY * face.reach) ** 2 * len(growth):  # a plane has no scale
+        return 1.0, np.inf
+    excess = growth @ distances / energy
+    residual = np.sqrt(MAX_LOW_ENERGY) * root_mean_square(distances - excess * growth)
+    return 1 + float(excess), float(residual / np.sqrt(energy / len(growth) * LOW_ORDER_FORMS))
+
+
+def low_orders(points: np.ndarray) -> np.ndarray:
+    """Return the products (n, k) of Legendre polynomials up to LOW_DEGREE, of x and y scaled to ±1."""
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    u, v = (2 * (points[:, :2] - low) / (high - low) - 1).T
+    i, j = np.indices((LOW_DEGREE + 1, LOW_DEGREE + 1))
+    return np.polynomial.legendre.legvander2d(u, v, (LOW_DEGREE, LOW_DEGREE))[:, (i + j <= LOW_DEGREE).ravel()]
+
+
+def _fit(face: BackFace, alignment: Alignment, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return scales (p,) and standard uncertainties (p,) of growths along `axes` (3, p)."""
+    cloud = alignment.points[np.random.default_rng(0).permutation(len(alignment.points))[:SCALE_POINTS]]
+    pose, most, undetermined = identity_pose(face), np.inf, (np.ones(axes.shape[1]), np.full(axes.shape[1], np.inf))
+    for turn in range(POSE_ROUNDS):
+        points = pose.to_design(cloud)
+        distances, normals = face.distance(points)
+        growth = ((points - face.pivot) * normals) @ axes
+        motions = face.columns(points, normals) @ alignment.motions
+        if turn == 0:
+            free = growth - motions @ np.linalg.lstsq(motions, growth, rcond=None)[0]
+            energy, directions = np.linalg.eigh(free.T @ free / len(free))
+            determined = energy > (MIN_SENSITIVITY * face.reach) ** 2
+        basis = directions[:, determined]
+        low, fine = _energies(points, np.column_stack([growth @ basis, motions, distances]))
+        most = min(most, MAX_LOW_ENERGY * low[-1, -1])
+        found, covariance = _weighted(low, fine, most)
+        excess, motion = np.split(found, [basis.shape[1]])
+        pose = pose.compose(-alignment.motions @ motion, face.reach)
+        if np.abs(motion).max(initial=0.0) > MAX_MOTION * face.reach:
+            return undetermined
+        if np.abs(motion).max(initial=0.0) < WEIGHT_TOLERANCE:
+            break
+    uncertainty = np.sqrt(np.einsum("ij,jk,ik->i", basis, covariance[: len(excess), : len(excess)], basis))
+    unknown = (np.abs(directions[:, ~determined]) > 1e-3).any(axis=1) | (uncertainty > MAX_UNCERTAINTY)
+    return 1 + basis @ excess, np.where(unknown, np.inf, uncertainty)
+
+
+def _energies(points: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean products (k, k) of the columns' low orders, and those of the rest."""
+    orders, _ = np.linalg.qr(low_orders(points))
+    inside = orders.T @ columns
+    rest = columns - orders @ inside
+    return inside.T @ inside / len(points), rest.T @ rest / len(points)
+
+
+def _weighted(low: np.ndarray, fine: np.ndarray, most: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return β (k,) and its covariance (k, k); low, fine: mean products of the columns B and d; most: largest v_L."""
+    count, found = len(low) - 1, np.zeros(len(low) - 1)
+    for _ in range(WEIGHT_ROUNDS):
+        left = np.append(-found, 1.0)
+        weights = (
+            LOW_ORDER_FORMS / max(min(left @ low @ left, most), MIN_VARIANCE),
+            INDEPENDENT_PATCHES / max(left @ fine @ left, MIN_VARIANCE),
+        )
+        normal = weights[0] * low + weights[1] * fine
+        before, covariance = found, np.linalg.pinv(normal[:count, :count], hermitian=True)
+        found = covariance @ normal[:count, count]
+        if np.abs(found - before).max(initial=0.0) < WEIGHT_TOLERANCE:
+            break
+    return found, covariance

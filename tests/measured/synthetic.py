@@ -66,3 +66,11 @@ def dirty(found, share, sides, heights="even", seed=5):
     off = np.zeros(n)
     off[which] = size * random.choice(sides, len(which))
     return found + off[:, None] * [0.0, 0.0, 1.0], off != 0
+
+
+def low_order(places, kind, size, random):
+    """A form error of low order at points, along z: its amplitude is `size` (mm) at the rim, its direction random."""
+    turn, (x, y) = random.uniform(0, 2 * np.pi), places[:, :2].T / np.abs(places[:, :2]).max()
+    u, v = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
+    shapes = {"astigmatism": u * u - v * v, "coma": (3 * (u * u + v * v) - 2) * u, "cylinder": 2 * u * u - 1}
+    return size * shapes[kind]

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from bstcad.measured.alignment import BackFace, align, identity_pose, scale
+from bstcad.measured.alignment import BackFace, align, identity_pose
 from bstcad.measured.form_error import deviation, fit_form_error, map_files, minimum_zone, robust_pv, zernike
+from bstcad.measured.shrinkage import scale
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import Plane, sag
