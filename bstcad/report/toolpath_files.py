@@ -23,10 +23,9 @@ from bstcad.toolpath.chords import digits
 from bstcad.toolpath.cutting import Cutting
 from bstcad.toolpath.machined_face import MachinedFace, RoundTool
 from bstcad.toolpath.raster import RAPID_FEED, SAFE_HEIGHT, Raster, raster
-from bstcad.toolpath.spiral import Spiral, spiral
+from bstcad.toolpath.spiral import ANGLE_DIGITS, Spiral, spiral
 from bstcad.toolpath.swept_volume import LEFT, Swept, check_raster, check_spiral
 
-ANGLE_DIGITS = 7  # decimals of C (degrees): a tenth of a nanometre at 50 mm from the axis
 ROWS_AT_A_TIME = 100_000  # rows of a table that are formatted at a time
 
 
@@ -165,9 +164,9 @@ def raster_words(path: Raster, cell: Cell | None = None) -> Iterator[str]:
     lines = f"Finish in lines along {path.cutting.along} with a pitch of {quantity(path.spacing.pitch, 'mm')}"
     yield f"{cut}{lines}, straight moves within {_tolerance(path.cutting)}. The lowest Z is {path.deepest:.3f} mm."
     yield (
-        f"Feed {path.cutting.speed:g} mm/min, a third of it downwards; rapid moves at Z = "
-        f"{SAFE_HEIGHT + path.lift:.6g} mm. Time without acceleration about {_time(path.minutes)}, with rapid moves of "
-        f"{RAPID_FEED:g} mm/min."
+        f"Feed {path.cutting.speed:g} mm/min, also along falling parts of the face, and a third of it in plunges "
+        f"straight down at the start of each pass; rapid moves at Z = {SAFE_HEIGHT + path.lift:.6g} mm. Time "
+        f"without acceleration about {_time(path.minutes)}, with rapid moves of {RAPID_FEED:g} mm/min."
     )
     yield "Start the spindle first: the file has no commands for the spindle."
 
@@ -179,7 +178,8 @@ def _middle(cell: Cell) -> str:
 
 def _of_check(found: Swept, tool: RoundTool) -> Iterator[str]:
     yield (
-        f"Check of the moves against the exact face at {len(found.points):,} points: deepest gouge ".replace(",", " ")
+        f"Check of the moves against the exact face at {len(found.points):,} points, and by a search ".replace(",", " ")
+        + "about the worst places: deepest gouge "
         + f"{quantity(found.gouge, 'mm')}, highest cusp {quantity(found.cusp, 'mm')}."
     )
     if found.unreached:

@@ -1,10 +1,11 @@
 """G-code of a raster for controllers with three axes: absolute coordinates, G0 and G1 only, for Grbl and LinuxCNC.
 
 Lengths are in millimetres or inches.  Rapid moves (G0, or G1 with a feed for controllers without G0) run at the safe
-height only, straight up, and across.  Each pass begins with a plunge (G1) at a third of the feed.  A coordinate that
-does not change is omitted.  Comments are in parentheses, in ASCII, with at most 70 characters a line, since Grbl reads
-at most 80.  They have no real-time characters of Grbl, which act even inside a comment: ! holds the feed, ~ resumes,
-and ? asks for the state.  Spindle, coolant and tool change are left to the user, since routers differ in them.
+height only, straight up, and across.  Each pass begins with a plunge (G1) straight down at a third of the feed; moves
+along the face have the full feed, also where the face falls.  A coordinate that does not change is omitted.  Comments
+are in parentheses, in ASCII, with at most 70 characters a line, since Grbl reads at most 80.  They have no real-time
+characters of Grbl, which act even inside a comment: ! holds the feed, ~ resumes, and ? asks for the state.  Spindle,
+coolant and tool change are left to the user, since routers differ in them.
 """
 
 from __future__ import annotations

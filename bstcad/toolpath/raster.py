@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,7 +38,7 @@ class Pass:
 
 @dataclass(frozen=True)
 class Raster:
-    """Passes of a raster, in the order of the cut."""
+    """Passes of a raster, in the order of the cut, with points rounded as they are written."""
 
     passes: tuple[Pass, ...]
     tool: RoundTool
@@ -104,7 +104,9 @@ def raster(face: MachinedFace, levels: tuple[float, float], wanted: Cutting) -> 
     passes.append(
         Pass(_straightened(_followed(zigzag, tip, tool.spacing(tolerance), tolerance), tolerance), rough=False)
     )
-    return Raster(tuple(passes), tool, cutting, spacing=spacing, top=top, bottom=bottom)
+    places = chords.digits(tolerance)
+    written = tuple(replace(each, points=np.round(each.points, places)) for each in passes)
+    return Raster(written, tool, cutting, spacing=spacing, top=top, bottom=bottom)
 
 
 def _lines(face: MachinedFace, pitch: float, overrun: float, along: str) -> Iterator[np.ndarray]:

@@ -24,12 +24,13 @@ from bstcad.toolpath.cutting import LATHE, Cutting
 from bstcad.toolpath.machined_face import MachinedFace, RoundTool
 
 MAX_NOSE_SLOPE = 60.0  # steepest face (degrees) that the round edge of a nose reaches, with an included angle of 120°
+ANGLE_DIGITS = 7  # decimals of C (degrees): a tenth of a nanometre at 50 mm from the axis
 MIN_STEPS = 24  # smallest number of places per turn at which the subdivision starts
 
 
 @dataclass(frozen=True)
 class Spiral:
-    """Points of a spiral, in the order of the cut."""
+    """Points of a spiral, in the order of the cut, rounded as they are written (z: relative to the vertex)."""
 
     angle: np.ndarray  # C, angle of the part under the tool from +x towards +y, running from turn to turn (degrees)
     x: np.ndarray  # distance of the nose's centre, which is that of its lowest point, from the axis (mm)
@@ -71,16 +72,22 @@ def spiral(face: MachinedFace, wanted: Cutting) -> Spiral:
         return np.maximum(start - pitch * turn, 0.0)
 
     def height(turn: np.ndarray) -> np.ndarray:
-        angle = 2 * math.pi * np.remainder(turn, 1.0)
-        return tool.nose(np.minimum(distance(turn), _border(face, angle) + tool.reach), angle)
+        return nose_height(tool, turn, distance(turn))
 
     turn, centre = chords.within_tolerance(_first_places(tool.spacing(tolerance), distance, turns), height, tolerance)
-    x = distance(turn)
+    angle, places = np.round(360 * turn, ANGLE_DIGITS), chords.digits(tolerance)
+    x, z = np.round(distance(turn), places), face.vertex_z + np.round(centre - tool.radius - face.vertex_z, places)
     z_x, z_y = (float(part) for part in face.slopes_on_axis)
     return Spiral(
-        360 * turn, x, centre - tool.radius, tool=tool, cutting=cutting, passes=passes,
+        angle, x, z, tool=tool, cutting=cutting, passes=passes,
         slope_along_cut=_slope_along_cut(face), slope_at_axis=math.hypot(z_x, z_y),
     )  # fmt: skip
+
+
+def nose_height(tool: RoundTool, turn: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return z (mm) of the centre of a nose after so many turns, at distances x (mm) from the axis."""
+    angle = 2 * math.pi * np.remainder(turn, 1.0)
+    return tool.nose(np.minimum(x, _border(tool.face, angle) + tool.reach), angle)
 
 
 def _slope_along_cut(face: MachinedFace) -> float:

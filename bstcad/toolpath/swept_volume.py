@@ -1,18 +1,22 @@
 """Check of a tool path against the exact face: the distance of points of the face from the volume that the tool sweeps.
 
-The check knows the path as it is written, its straight moves, and the heights of the face; it shares no step with the
-computation of the path.  For points P of the face, at one place of each cell of a grid, the clearance is
+The check knows the path as it is written, rounded and with straight moves, and the heights of the face; its distances
+share no step with the computation of the path.  For points P of the face, the clearance is
 
     e = min over the path of |P - c| - r,
 
 c the centre of the ball along its straight moves, or of the nose along Z(C) and X(C) in the plane of P and the axis.  A
 negative clearance is a gouge, -e deep.  A positive one is material that stays: the highest is the cusp, except where
 more than LEFT cusps of the formula stay, because the tool is too large for a valley.  Such places are not reached.
+
+Cusps are those of one point of each cell of a grid.  Gouges are narrow: their depth is that of a local search, which
+begins at the worst of these points and at the contacts of the moves that lie farthest below the tool's exact height.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,9 +24,10 @@ import torch
 
 from bstcad.optics.kernels.reductions import on_threads
 from bstcad.runs.kernel_cache import compiled_kernel
+from bstcad.toolpath.cusps import Passes
 from bstcad.toolpath.machined_face import MachinedFace
 from bstcad.toolpath.raster import Raster
-from bstcad.toolpath.spiral import Spiral
+from bstcad.toolpath.spiral import Spiral, nose_height
 
 LEFT = 2.0  # material that stays, in cusps of the formula, above which a place is not reached
 SAMPLES = 40_000, 200_000  # smallest and largest number of points of the face
@@ -30,7 +35,15 @@ WORK = 1e8  # largest number of pairs of a point and a move near it
 TURN = 40.0  # cost of a turn near a point, in moves near a point
 CELLS_PER_RADIUS = 2  # cells of the grid of moves per radius of the tool
 TASKS = 16  # number of parts of the points, for the threads
+DEEPEST_MOVES, PLACES_ON_MOVE = 2000, (0.25, 0.5, 0.75)  # moves, and places on each, where the search begins
+SEARCH_STARTS, SEARCH_SIDE, SEARCH_ROUNDS = 200, 5, 5  # worst points, points per side of a grid about each, and rounds
+SEARCH_SHRINKAGE = 0.4  # ratio of the widths of the grids of one round to those of the round before
+SLOPE_STEP = 1e-5  # step of the differences that give the slope of the tool's height / radius of the tool
 SEED = 1  # seed of the places of the points in their cells
+
+
+Height = Callable[[np.ndarray, np.ndarray], np.ndarray]  # height of a tool's centre without gouge over its two places
+Measure = Callable[[np.ndarray], np.ndarray]  # clearances (n,) of points (n, 3) of the face, mm
 
 
 @dataclass(frozen=True)
@@ -47,7 +60,7 @@ class Swept:
 
 def check_raster(path: Raster) -> Swept:
     """Return the distances of all moves of a raster, roughing and plunges included, from the face."""
-    radius = path.tool.radius
+    tool, radius = path.tool, path.tool.radius
     lift = (0.0, 0.0, path.top + radius)
     begin = np.concatenate([each.points[:-1] for each in path.passes]) + lift
     end = np.concatenate([each.points[1:] for each in path.passes]) + lift
@@ -62,11 +75,18 @@ def check_raster(path: Raster) -> Swept:
     starts = np.searchsorted(number[order], np.arange(columns * rows + 1))
     area = (columns * cell) * (rows * cell)
     near = len(begin) * (2 * (radius + half + cell)) ** 2 / area
-    points = _points(path.tool.face, near)
-    clearance = np.empty(len(points))
-    scene = points, begin[order], end[order], starts, (low[0], low[1], cell, columns, rows), radius, half, clearance
-    _divided(_to_moves, scene, len(points))
-    return _summary(points, clearance, path.spacing.cusp)
+    scene = begin[order], end[order], starts, (low[0], low[1], cell, columns, rows), radius, half
+
+    def contact(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        z, step = tool.ball(x, y), SLOPE_STEP * radius
+        z_x, z_y = (tool.ball(x + step, y) - z) / step, (tool.ball(x, y + step) - z) / step
+        reach = radius / np.sqrt(1 + z_x**2 + z_y**2)
+        return x + reach * z_x, y + reach * z_y
+
+    finish = _deepest_places(path.passes[-1].points + lift, tool.ball)
+    return _swept(
+        tool.face, lambda points: _measured(_to_moves, points, scene), contact(*finish), work=near, passes=path.spacing
+    )
 
 
 def _pieces(begin: np.ndarray, end: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
@@ -81,11 +101,61 @@ def _pieces(begin: np.ndarray, end: np.ndarray, longest: float) -> tuple[np.ndar
 
 def check_spiral(path: Spiral) -> Swept:
     """Return the distances of a spiral from the face, in the planes of the nose; gouges across them are smaller."""
-    points = _points(path.tool.face, TURN * 2 * path.tool.radius / path.passes.pitch)
-    clearance = np.empty(len(points))
-    table = path.angle / 360, path.x, path.z + path.tool.radius
-    _divided(_to_nose, (points, *table, path.tool.radius, clearance), len(points))
-    return _summary(points, clearance, path.passes.cusp)
+    tool, radius = path.tool, path.tool.radius
+    scene = path.angle / 360, path.x, path.z + radius, radius
+
+    def height(turn: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return nose_height(tool, turn, x)
+
+    def contact(turn: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        step = SLOPE_STEP * radius
+        z_x = (height(turn, x + step) - height(turn, x)) / step
+        s, angle = x + radius * z_x / np.sqrt(1 + z_x**2), 2 * np.pi * turn
+        return s * np.cos(angle), s * np.sin(angle)
+
+    deepest = contact(*_deepest_places(np.column_stack(scene[:3]), height))
+    near = TURN * 2 * radius / path.passes.pitch
+    return _swept(tool.face, lambda points: _measured(_to_nose, points, scene), deepest, work=near, passes=path.passes)
+
+
+def _deepest_places(path: np.ndarray, height: Height) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first two coordinates (k,) of places on the moves that lie farthest below the height without gouge.
+
+    path: points (n, 3) whose last coordinate is the height of the tool's centre.  These places are where the search for
+    the deepest gouge begins; the gouge itself is measured at the face.
+    """
+    middle = (path[:-1] + path[1:]) / 2
+    ends, inner = (height(at[:, 0], at[:, 1]) - at[:, 2] for at in (path, middle))
+    depth = np.maximum(inner, np.maximum(ends[:-1], ends[1:]))
+    chosen = np.argpartition(depth, -min(DEEPEST_MOVES, len(depth)))[-DEEPEST_MOVES:]
+    share = np.array(PLACES_ON_MOVE)[:, None, None]
+    places = (path[chosen] * (1 - share) + path[chosen + 1] * share).reshape(-1, 3)
+    return places[:, 0], places[:, 1]
+
+
+def _swept(
+    face: MachinedFace, measure: Measure, deepest: tuple[np.ndarray, np.ndarray], work: float, passes: Passes
+) -> Swept:
+    """Return the distances at samples of the face, and the deepest gouge by a local search.
+
+    The search begins at the samples, and at the contacts `deepest` (x, y).  work: pairs with a move per point.
+    """
+    points = _points(face, work)
+    clearance = measure(points)
+    starts = _on_face(face, *deepest)
+    places, found = np.concatenate([points, starts]), np.concatenate([clearance, measure(starts)])
+    width = math.sqrt(4 * math.prod(face.outline.half_extent) / max(len(points), 1)) / 2
+    away = np.linspace(-1, 1, SEARCH_SIDE)
+    gouge = max(-float(found.min()), 0.0)
+    for _ in range(SEARCH_ROUNDS):
+        worst = places[np.argsort(found)[:SEARCH_STARTS]]
+        x, y = (worst[:, k, None, None] + width * part for k, part in enumerate(np.meshgrid(away, away)))
+        places = _on_face(face, x.ravel(), y.ravel())
+        found = measure(places)
+        gouge, width = max(gouge, -float(found.min(initial=0.0))), width * SEARCH_SHRINKAGE
+    reached = clearance <= LEFT * passes.cusp
+    highest, left = float(clearance[reached].max(initial=0.0)), max(float(clearance.max()), 0.0)
+    return Swept(gouge, highest, unreached=1 - float(reached.mean()), left=left, points=points, clearance=clearance)
 
 
 def _points(face: MachinedFace, work: float) -> np.ndarray:
@@ -97,21 +167,21 @@ def _points(face: MachinedFace, work: float) -> np.ndarray:
     cell = np.stack(np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"), axis=-1).reshape(-1, 2)
     at = (cell + np.random.default_rng(SEED).random(cell.shape)) / (columns, rows)
     x, y = (2 * at - 1).T * np.array([[half_x], [half_y]])
+    return _on_face(face, x, y)
+
+
+def _on_face(face: MachinedFace, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the points (k, 3) of the face at the places (x, y) that lie inside the outline."""
     inside = face.outline.contains(torch.from_numpy(x), torch.from_numpy(y)).numpy()
     x, y = x[inside], y[inside]
     return np.column_stack([x, y, face.heights(x, y)])
 
 
-def _summary(points: np.ndarray, clearance: np.ndarray, cusp: float) -> Swept:
-    reached = clearance <= LEFT * cusp
-    highest = float(clearance[reached].max(initial=0.0))
-    gouge, left = max(-float(clearance.min()), 0.0), max(float(clearance.max()), 0.0)
-    return Swept(gouge, highest, unreached=1 - float(reached.mean()), left=left, points=points, clearance=clearance)
-
-
-def _divided(kernel, scene, count: int) -> None:  # type: ignore[no-untyped-def]  # a compiled function and its arguments
-    ends = [count * k // TASKS for k in range(TASKS + 1)]
-    on_threads(lambda *part: kernel(*scene, *part), list(zip(ends, ends[1:], strict=False)))
+def _measured(kernel, points: np.ndarray, scene) -> np.ndarray:  # type: ignore[no-untyped-def]  # a compiled function
+    """Return the clearances (n,) of points (n, 3) by a kernel with its arguments, on all threads."""
+    clearance, ends = np.empty(len(points)), [len(points) * k // TASKS for k in range(TASKS + 1)]
+    on_threads(lambda *part: kernel(points, *scene, clearance, *part), list(zip(ends, ends[1:], strict=False)))
+    return clearance
 
 
 @compiled_kernel(error_model="numpy")
