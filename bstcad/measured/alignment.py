@@ -210,6 +210,13 @@ def gauss_newton_step(
     return -motions @ ((motions.T @ (weighted.T @ distances)) / sensitivity2[determined]), motions
 
 
+def precision(face: BackFace, alignment: Alignment) -> np.ndarray:
+    """Return the precision (k, k), 1/mm², of the alignment's motions with the residuals as form errors of low order."""
+    columns = face.columns(alignment.points, alignment.normals) @ alignment.motions
+    variance = max(alignment.rms, MIN_POINT_NOISE) ** 2 / LOW_ORDER_FORMS
+    return columns.T @ columns / (len(columns) * variance)
+
+
 def _face_points(face: BackFace, cloud: np.ndarray, pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (points (n, 3) of the face; masks of the cloud's points: inside the outline; near the face)."""
     points = pose.to_design(cloud)

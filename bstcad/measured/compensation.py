@@ -232,7 +232,7 @@ def best_cutoff(forms: Sequence[FormError], net: BSplineSurface, rate: Callable[
         cutoff, chance = pitches * max(net.pitch), np.random.default_rng(0)
         kept = np.zeros_like(mean)
         for form in forms:
-            sample = form.posterior_sample(chance.normal(size=form.spread.shape))
+            sample = form.posterior_sample(chance)
             kept += _on_nodes(low_passed(sample, cutoff), net) / len(forms)
         left = torch.from_numpy(interpolating_net(mean - kept))
         found[cutoff] = rate(replace(net, heights=net.heights + left))

@@ -4,6 +4,9 @@ The deviation is modelled as a polynomial plus a random field, a spline on a net
 the net's cosine transform are Gaussian with a variance S that depends only on the frequency; the points have white
 noise of variance σ².  S (in bands of a quarter octave) and σ are estimated from the points.  The form error is the
 posterior mean, the minimum-error linear estimate of heights, slopes and curvatures.  The posterior can be sampled.
+
+Where points are sparse, the fine relief between them is the design's at the pose of the alignment.  The uncertainty of
+this pose therefore belongs to the posterior: it adds to the precision of a motion by fine relief that of the alignment.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from scipy.special import eval_jacobi
 
 from bstcad.analysis.shape import least_squares
-from bstcad.measured.alignment import Alignment, BackFace, Pose, root_mean_square
+from bstcad.measured.alignment import Alignment, BackFace, Pose, precision, root_mean_square
 from bstcad.optics.bspline import BSplineSurface, basis_matrix, interpolating_net
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import sag, sampled
@@ -34,6 +37,7 @@ MAX_REFINEMENT = 4  # refinement per side of a lens's net to which a finer field
 BANDS_PER_OCTAVE = 4  # number of bands of the spectrum per octave of frequency
 SPECTRUM_ROUNDS = 8  # number of alternating estimates of field and spectrum
 FIRST_MOTION_ROUND = 3  # round, from 0, in which the motion is fitted; the spectrum is then good enough to weight it
+MOTION_SAFETY = 1.5  # factor on the uncertainty of the motion, as its weights are estimated from the same points
 MAX_FIELD_STEPS, FIELD_TOLERANCE = 30, 1e-4  # maximum steps of conjugate gradients, and their relative tolerance
 DETECTION_SIGMAS = 3.0  # excess over noise, in standard deviations, at which a band of frequencies contains form
 UNDETECTED_VARIANCE = 1e-4  # variance of the form / variance of the noise, in a band without detected form
@@ -41,6 +45,15 @@ MAX_RELIEF_UNCERTAINTY = 0.001  # uncertainty of a motion fitted to fine relief 
 EXTRAPOLATION_BANDS = 6  # number of bands from which the spectrum is extrapolated below the noise
 MIN_NOISE_RATIO = 1e-3  # lower bound of the noise relative to the RMS deviation
 SAMPLING_STRIPS = 32  # number of strips in which a net is sampled, which bounds the memory
+
+
+@dataclass(frozen=True)
+class Displaced:
+    """Changes of a form error by k independent displacements of the alignment, of one standard deviation each."""
+
+    polynomial: np.ndarray  # changes (6, k) of the polynomial's coefficients, mm
+    heights: np.ndarray  # changes (m², k) of the field's heights, mm
+    motion: np.ndarray  # displacements (6, k), mm; see BackFace.columns
 
 
 @dataclass(frozen=True)
@@ -53,6 +66,7 @@ class FormError:
     spread: np.ndarray = field(repr=False)  # standard deviations (m, m) of the field's cosine amplitudes, mm
     noise: float  # RMS noise of the points, mm
     motion: np.ndarray  # correction (6,) of the alignment by fine relief, mm; see BackFace.columns
+    displaced: Displaced = field(repr=False)
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return δz (mm) at (x, y) in mm, relative to the alignment by least squares."""
@@ -73,10 +87,20 @@ class FormError:
         values = np.concatenate([self.at(x.ravel(), y.ravel()).reshape(x.shape) for x, y in strips])
         return replace(finer, heights=finer.heights + torch.from_numpy(interpolating_net(values)))
 
-    def posterior_sample(self, draw: np.ndarray, sign: float = 1.0) -> FormError:
-        """Return a sample of the posterior; draw: standard normal numbers (m, m); sign: ±1, factor of `draw`."""
-        change = torch.from_numpy(scipy.fft.idctn(draw * self.spread, norm="ortho"))
-        return replace(self, random_field=replace(self.random_field, heights=self.random_field.heights + sign * change))
+    def posterior_sample(self, random: np.random.Generator, sign: float = 1.0) -> FormError:
+        """Return a sample of the posterior; sign: ±1, factor of its difference from the mean.
+
+        Each displacement has its standard deviation and a random direction, so that a sample never hides one.
+        """
+        field_change = scipy.fft.idctn(random.normal(size=self.spread.shape) * self.spread, norm="ortho")
+        signs = random.choice((-1.0, 1.0), self.displaced.motion.shape[1])
+        change = sign * (field_change + (self.displaced.heights @ signs).reshape(field_change.shape))
+        return replace(
+            self,
+            polynomial=self.polynomial + sign * self.displaced.polynomial @ signs,
+            random_field=replace(self.random_field, heights=self.random_field.heights + torch.from_numpy(change)),
+            motion=self.motion + sign * self.displaced.motion @ signs,
+        )
 
     def band(self, low: float, high: float) -> BSplineSurface:
         """Return the part of the field between two spatial frequencies (1/mm)."""
@@ -100,10 +124,15 @@ def fit_form_error(face: BackFace, alignment: Alignment) -> FormError:
     m = scipy.fft.next_fast_len(int(np.clip(np.sqrt(n / POINTS_PER_NET_CELL / covered), *FIELD_NET_LIMITS)), real=True)
     net = BSplineSurface(0.0, torch.zeros(m, m, dtype=torch.float64), sides[0], sides[1])
     u, v = ((t - low) / (high - low) * (m - 1) for t, (low, high) in zip((x, y), sides, strict=True))
-    heights, spread, noise, motion = _field(net, _basis_rows(u, v, m), targets[:, 0], targets[:, 1:], reach=face.reach)
+    heights, spread, noise, motion, (displacements, responses) = _field(
+        net, _basis_rows(u, v, m), targets[:, 0], targets[:, 1:], aligned=precision(face, alignment), reach=face.reach
+    )
     polynomial = coefficients[:, 0] - coefficients[:, 1:] @ motion
     random_field = replace(net, heights=torch.from_numpy(heights))
-    return FormError(face, polynomial, random_field, spread, noise=noise, motion=alignment.motions @ motion)
+    displaced = Displaced(-coefficients[:, 1:] @ displacements, responses, alignment.motions @ displacements)
+    return FormError(
+        face, polynomial, random_field, spread, noise=noise, motion=alignment.motions @ motion, displaced=displaced
+    )
 
 
 def frequencies(net: BSplineSurface) -> np.ndarray:
@@ -121,12 +150,15 @@ def _legendre(back: BSplineSurface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _field(
-    net: BSplineSurface, rows: scipy.sparse.csr_array, off: np.ndarray, motions: np.ndarray, *, reach: float
-) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+    net: BSplineSurface, rows: scipy.sparse.csr_array, off: np.ndarray, motions: np.ndarray, *,
+    aligned: np.ndarray, reach: float,
+) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, tuple[np.ndarray, np.ndarray]]:  # fmt: skip
     """Return the field's heights (m, m), standard deviations (m, m) of its amplitudes, the noise (mm) and motion (k,).
 
+    Last are k independent displacements (k, k) of one standard deviation, mm, and the heights (m², k) that they change.
     rows: basis functions (n, m²).  off: deviations (n,), mm; motions: their changes (n, k), mm/mm; polynomials removed.
     Generalised least squares give the motion: a fit of the field has the residual σ² V⁻¹ off, V: covariance of `off`.
+    aligned: precision (k, k) of the motions by the alignment, 1/mm².
     """
     (m, _), n = net.shape, len(off)  # the net is square
     gram = (rows.T @ rows).tocsr()
@@ -141,10 +173,23 @@ def _field(
     def posterior(values: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
         return _posterior_mean(gram, rows.T @ values, variance, noise2=noise2, per_mode=per_mode, start=start)
 
+    def explained(columns: np.ndarray) -> np.ndarray:
+        """Return the heights (m², k) by which the field explains changes (n, k) of the deviations."""
+        return np.stack([_heights(posterior(column)) for column in columns.T], axis=1)
+
+    def fit_motion() -> tuple[np.ndarray, np.ndarray]:
+        """Return the motion (k,) by fine relief, and its precision (k, k) with that of the alignment, 1/mm²."""
+        whitened = (motions - rows @ explained(motions)) / noise2
+        size, directions = np.linalg.eigh((whitened.T @ motions + motions.T @ whitened) / 2)
+        detected = directions[:, size > 1 / (MAX_RELIEF_UNCERTAINTY * reach) ** 2]
+        information = detected.T @ (whitened.T @ motions) @ detected
+        motion = detected @ np.linalg.solve(information, detected.T @ (whitened.T @ off))
+        total = detected @ information @ detected.T + aligned
+        return motion, (total + total.T) / 2
+
     for turn in range(SPECTRUM_ROUNDS):
         if turn == FIRST_MOTION_ROUND:
-            whitened = motions - np.stack([rows @ _heights(posterior(column)) for column in motions.T], axis=1)
-            motion = _motion_by_relief(motions, off, whitened, noise2=noise2, reach=reach)
+            motion, total = fit_motion()
         aligned_off = off - motions @ motion
         amplitude = posterior(aligned_off, amplitude)
         residual = aligned_off - rows @ _heights(amplitude)
@@ -156,17 +201,10 @@ def _field(
         variance = _variances(energies, modes, level * noise2)[band]
     amplitude = posterior(off - motions @ motion, amplitude)
     spread = 1 / (per_mode / noise2 + 1 / variance)
-    return _heights(amplitude).reshape(m, m), np.sqrt(spread), float(np.sqrt(noise2)), motion
-
-
-def _motion_by_relief(
-    motions: np.ndarray, off: np.ndarray, whitened: np.ndarray, *, noise2: float, reach: float
-) -> np.ndarray:
-    """Return the motion (k,) by generalised least squares; whitened: σ² V⁻¹ motions (n, k); noise2: σ²."""
-    normal = whitened.T @ motions / noise2
-    size, directions = np.linalg.eigh((normal + normal.T) / 2)
-    detected = size > 1 / (MAX_RELIEF_UNCERTAINTY * reach) ** 2  # determined by fine relief
-    return directions[:, detected] @ (directions[:, detected].T @ (whitened.T @ off) / noise2 / size[detected])
+    size, directions = np.linalg.eigh(total)
+    displacements = MOTION_SAFETY * directions / np.sqrt(size)
+    changes = displacements, -explained(motions @ displacements)
+    return _heights(amplitude).reshape(m, m), np.sqrt(spread), float(np.sqrt(noise2)), motion, changes
 
 
 def _variances(energy: np.ndarray, modes: np.ndarray, noise: np.ndarray) -> np.ndarray:

@@ -188,13 +188,13 @@ def _coverage(lens: Lens, points: np.ndarray) -> float:
 
 def _light(lens: Lens, form: FormError, nominal: Nominal, goal: Goal, *, effort: Effort) -> tuple[Light, float]:
     """Return the light of the lens with the form error, and the RRMSD with the uncertainty of the form added."""
-    draw = np.random.default_rng(nominal.scene.tailoring.seed).normal(size=form.spread.shape)
 
     def light_with(form: FormError) -> Light:
         return nominal.light(replace(lens, back=form.add_to(lens.back_net)), goal, effort)
 
     light = light_with(form)
-    samples = (light_with(form.posterior_sample(draw, sign)).rrmsd for sign in (1.0, -1.0))
+    seed = nominal.scene.tailoring.seed
+    samples = (light_with(form.posterior_sample(np.random.default_rng(seed), sign)).rrmsd for sign in (1.0, -1.0))
     return light, max(light.rrmsd, math.hypot(*samples) / math.sqrt(2))  # quadratic mean of two opposite samples
 
 
