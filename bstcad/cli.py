@@ -453,7 +453,7 @@ def tolerance(
     epilog=examples(
         "export outputs/thu --as zemax,dxf",
         "export outputs/thu --as points --points 1001",
-        "export outputs/thu --as raster --tool-radius 1.5 --cusp 0.01 --zero bottom -o shop",
+        "export outputs/thu --as raster --cusp 0.01 --zero bottom -o shop",
         "export outputs/sun_caustic --as raster,tiles --tiles 2x3",
     )
 )

@@ -61,6 +61,10 @@ def test_the_command_and_python_state_the_tool(small_design, tmp_path, capsys):
     design = bstcad.open(folder)
     [*_, words] = design.export("raster", cusp=0.05, folder=tmp_path / "python")
     assert words.parent == tmp_path / "python" and "Z0 on the top" in words.read_text()
+    scene = folder / "scene.toml"
+    scene.write_text(scene.read_text().replace('zero = "top"', 'zero = "bottom"'))
+    [*_, words] = bstcad.open(folder).export("raster", cusp=0.05)
+    assert "Z0 on the bottom" in words.read_text()
     names = {path.name for path in design.export("spiral", tool_radius=2.0, cusp=1e-3)}
     assert names == {"toolpath-spiral.csv", "toolpath-spiral.txt"}
     assert "radius 2 mm" in (folder / "toolpath-spiral.txt").read_text()
