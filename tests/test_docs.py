@@ -41,7 +41,7 @@ PAGES = [
     ROOT / "docs" / "reference" / "files.md",
 ]
 RUN = [page for page in PAGES if any(block.kind != "toml" for block in blocks(page))]
-LONG = {  # make bench runs the blocks of these pages, and make docs those of tutorials; other tests do what they do
+LONG = {  # make bench runs the blocks of these pages, and tutorials at full size, as make docs does (test_tutorials.py)
     "measured-part", "time-and-accuracy", "tolerances", "two-faces", "part-with-flange", "led", "your-photo", "effects",
     "first-lens", "reading-the-report", "machinable", "mirror", "failed-picture", "white-light", "cadquery",
     "street-light", "from-python",

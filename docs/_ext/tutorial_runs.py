@@ -38,15 +38,23 @@ class Runs:
         self.pool.shutdown()
 
 
+PAGES = sorted(set((DOCS / "tutorials").glob("*.md")) - {DOCS / "tutorials" / "index.md"})  # the tutorials
+
+
+def follow(page: Path, folder: Path) -> None:
+    """Run the blocks of a tutorial in a new folder, beside the templates and a photograph; an error is raised."""
+    shutil.copytree(DOCS.parent / "templates", folder / "templates")
+    skimage.io.imsave(folder / "photo.jpg", skimage.data.astronaut()[:512, 32:480])
+    code_blocks.run(page, folder)
+
+
 def make() -> None:
-    """Run each tutorial in a folder of its own, docs/_made/NAME, beside the templates and a photograph."""
-    for page in sorted(set((DOCS / "tutorials").glob("*.md")) - {DOCS / "tutorials" / "index.md"}):
+    """Run each tutorial in a folder of its own, docs/_made/NAME."""
+    for page in PAGES:
         folder = MADE / page.stem
-        shutil.rmtree(folder, ignore_errors=True)  # of the build before: `bstcad new` overwrites no scene
-        shutil.copytree(DOCS.parent / "templates", folder / "templates")
-        skimage.io.imsave(folder / "photo.jpg", skimage.data.astronaut()[:512, 32:480])
+        shutil.rmtree(folder, ignore_errors=True)  # files of the build before: `bstcad new` overwrites no scene
         logging.getLogger(__name__).info("running %s", page.name)
-        code_blocks.run(page, folder)
+        follow(page, folder)
         for path in folder.glob("*.png"):
             if path.stat().st_size > HEAVY:
                 fitting(Image.open(path)).save(path, optimize=True)
