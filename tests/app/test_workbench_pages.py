@@ -115,7 +115,7 @@ def test_the_picture_as_made_stands_beside_the_picture_as_designed(open_page, sh
     shown = [image.get_attribute("src") for image in page.locator("#made-targets img").all()]
     assert len(set(shown)) == 2 and "printed in resin" in page.inner_text("#made-says")
     page.select_option("#lit", "phone")
-    page.wait_for_selector("#made-targets img:nth-match(img, 4)", timeout=PATIENCE)
+    page.wait_for_selector(":nth-match(#made-targets img, 4)", timeout=PATIENCE)
     assert "in the light of the flashlight of a phone" in page.inner_text("#made-says")
     page.select_option("#grade", "")
     page.select_option("#lit", "")
