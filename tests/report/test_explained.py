@@ -86,6 +86,6 @@ def test_keys_of_the_scene_are_known():
     known = {row.key.replace("[]", "") for row in rows()} | {"mount.flange", "lens.front", "lens.outline"}
     tables = {key.partition(".")[0] for key in known}
     quoted = re.findall(r"`(\w+(?:\.\w+)+)(?: = [^`]*)?`", "".join(map(_page, PAGES)))
-    files = ("step", "npz", "toml", "json", "html", "txt", "pdf", "csv", "stl", "xml")
+    files = ("step", "npz", "toml", "json", "html", "txt", "pdf", "csv", "stl", "xml", "3mf")
     keys = [key for key in quoted if key.partition(".")[0] in tables and not key.endswith(files)]
     assert len(keys) > 50 and [key for key in keys if key not in known] == []
