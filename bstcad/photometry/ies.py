@@ -132,7 +132,7 @@ def _whole(kind: str, around: np.ndarray, along: np.ndarray, candela: np.ndarray
 
 def _numbers(text: str) -> np.ndarray:
     text = text.rstrip("\x1a\0 \n")  # end of a file under DOS
-    most = 2 * MAX_NUMBERS  # those of TILT=INCLUDE, too
+    most = 2 * MAX_NUMBERS  # largest count of numbers, with those of TILT=INCLUDE
     try:
         return np.array(text.replace(",", " ").split(maxsplit=most)[:most], dtype=np.float64)
     except ValueError:

@@ -398,7 +398,7 @@ def light_density(values: np.ndarray, side: float, lens: Lens | None = None) -> 
 def narrow_elements(lens: Lens, width: float) -> Iterator[tuple[str, float]]:
     """Yield key and width (mm) of each window and mirror of a scene that is narrower than `width` (mm)."""
     for name, interfaces in (("before", lens.before), ("behind", lens.behind)):
-        number = 0.0  # of the element: a window has two interfaces, a mirror one
+        number = 0.0  # number of the element: a window has two interfaces, a mirror one
         for interface in interfaces:
             across = 2 * min(interface.outline.half_extent)
             if across < width:
