@@ -175,8 +175,10 @@ class Cluster:
             yield answered.value
 
     def _answer(self, key: Any, future: Any) -> Answer:
-        if future.status == "cancelled":  # the scheduler was restarted
-            raise MachineError(f"--scheduler {self.address}: the scheduler has lost its jobs; run the command again")
+        if future.status == "cancelled":  # the client cancels every job when it loses its scheduler
+            with self._connection():
+                lost = f"--scheduler {self.address}: the scheduler has lost its jobs; run the command again"
+                raise MachineError(lost)
         if future.status == "error":
             error = future.exception()
             return Answer(key, self.address, reason=f"{type(error).__name__}: {first_line(error)}")

@@ -84,7 +84,11 @@ def test_what_cannot_be_had_is_a_sentence(monkeypatch):
 
 @pytest.mark.parametrize(
     ("future", "client", "sentence"),
-    [("pending", "closed", "has ended"), ("cancelled", "running", "has lost its jobs")],
+    [
+        ("pending", "closed", "has ended"),
+        ("cancelled", "connecting", "has ended"),
+        ("cancelled", "running", "has lost its jobs"),
+    ],
 )
 def test_a_scheduler_that_goes_away_is_a_sentence(future, client, sentence):
     waiting, submitted = object.__new__(Cluster), mock.Mock(status=future)
