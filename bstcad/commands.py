@@ -176,7 +176,7 @@ def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), prog
         made, proof = _write_and_prove(made, building, drawn, options, progress=progress)
         proven = time.perf_counter()
         irradiances = tuple(light.picture for light in proof.lights)
-        folders.write_design(made, irradiances, building)
+        folders.write_design(made, proof.lights, building)
         exported = _export_of_scene(made, building)
         order = _order(made, proof.shape, building)
         drawn.sheet(_sheet(made, proof, figures_of(made.goals, proof.lights), irradiances[0], order=order))
@@ -206,7 +206,7 @@ def _write_and_prove(
     made: Made, folder: Path, drawn: Pictures, options: ProofOptions, progress: Progress
 ) -> tuple[Made, Proof]:
     """Write the geometry to `folder` and verify it; return (design with the times of both stages, its proof)."""
-    made = replace(made.with_report_data(), stored=None)  # design.npz is written again
+    made = replace(made.with_report_data(), stored=None, lit=())  # design.npz is written again
     processes.return_freed()  # the second process needs the memory for the solid
     began = time.perf_counter()
     progress("write", 0, 1, "STEP, STL, 3MF")
@@ -407,7 +407,7 @@ def read(folder: Path) -> Made:
     """Read the design in a folder, with the stages and history of its making from report.json."""
     scene, nominal = folders.read_nominal(folder)
     making, sent = record.making(folder / "report.json"), folders.read_transport(folder, scene)
-    return Made(scene, nominal.lens, nominal.goals, making, transport=sent, stored=nominal.stored)
+    return Made(scene, nominal.lens, nominal.goals, making, transport=sent, stored=nominal.stored, lit=nominal.lit)
 
 
 def _name_of(cloud: Cloud, folder: Path) -> str:

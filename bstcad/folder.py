@@ -30,6 +30,7 @@ from bstcad.cad.mesh import MIRROR_RGBA, Label
 from bstcad.optics import quadrature
 from bstcad.optics.bspline import DEGREE, BSplineSurface, is_net, knots
 from bstcad.optics.lens import Lens
+from bstcad.optics.measure import Light
 from bstcad.optics.radial import RadialSurface
 from bstcad.optics.sides import Sides, as_pair, scaled
 from bstcad.optics.surfaces import Surface
@@ -48,6 +49,7 @@ from bstcad.verify.checks import Nominal
 SCENE, DESIGN, PART = "scene.toml", "design.npz", "part.step"  # names of files in a design's folder
 FRONT_KNOTS = ("front_knots_x", "front_knots_y")  # names in design.npz of the knots of a tailored front
 PROVEN = (SCENE, DESIGN, "lens.step", "lens.stl", PART, NET_FILE)  # files that a verification reads
+ERROR = "irradiance_error"  # name in design.npz of the error of the irradiance
 DISTANCES = "relative_distances"  # name in design.npz of a dome's distances
 REMEDY = "generate the design again"
 
@@ -273,17 +275,20 @@ def _write_scene(design: Made, folder: Path) -> None:
         (folder / name).write_bytes(data)
 
 
-def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) -> None:
+def write_design(design: Made, lights: Sequence[Light], folder: Path) -> None:
     """Write design.npz: the optimised surfaces, the pictures, and the scene's text.
 
-    irradiances: traced irradiance (rows, columns) per target; () if not traced.  The arrays of the second target are
-    target_2, irradiance_2, reachable_2, and so on.  reachable (rows, columns) is 1 in the pixels that light can reach;
-    it is absent if light can reach all bright pixels.  Transport map, if known (TransportMap): transport_x (c,) and
-    transport_y (r,), the positions of c columns and r rows of points on the target (unit of the receiver), and
-    transport_back or transport_entrance (c, r, 2), x and y (mm) of the light for each point: transport_back on the last
-    tailored face (the back; the front if only the front is tailored, or for a mirror behind glass), transport_entrance
-    in the plane z = const of the first face's vertex.  A dome also has relative_distances (m, n): the distances of its
-    control points from the centre minus lens.back.radius (mm), since those of the points themselves would be rounded.
+    lights: traced light on each target; () if not traced.  irradiance (rows, columns) and irradiance_error are its
+    picture and the RRMSD between this and the noiseless one.  The arrays of the second target are target_2,
+    irradiance_2, irradiance_error_2, reachable_2, and so on.  reachable (rows, columns) is 1 in the pixels that light
+    can reach; it is absent if light can reach all bright pixels.
+
+    Transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), the positions of c columns and r
+    rows of points on the target (unit of the receiver), and transport_back or transport_entrance (c, r, 2), x and y
+    (mm) of the light for each point: transport_back on the last tailored face (the back; the front if only the front
+    is tailored, or for a mirror behind glass), transport_entrance in the plane z = const of the first face's vertex.
+    A dome also has relative_distances (m, n): the distances of its control points from the centre minus
+    lens.back.radius (mm), since those of the points themselves would be rounded.
     """
     lens, sent = design.lens, design.transport
     (m, n), front = lens.back_net.shape, lens.front
@@ -300,7 +305,8 @@ def write_design(design: Made, irradiances: Sequence[np.ndarray], folder: Path) 
         **(dict(zip(FRONT_KNOTS, map(knots, lens.front_net.shape), strict=True)) if lens.shapes("front") else {}),
         **{numbered("target", k): goal.picture for k, goal in enumerate(design.goals)},
         **{numbered("reachable", k): part.astype(np.uint8) for k, part in parts if part is not None},
-        **{numbered("irradiance", k): picture for k, picture in enumerate(irradiances)},
+        **{numbered("irradiance", k): light.picture for k, light in enumerate(lights)},
+        **{numbered(ERROR, k): light.picture_error for k, light in enumerate(lights)},
         "scene": scene_text(design.scene, lens),
         **({f"transport_{sent.plane}": sent.source, "transport_x": sent.x, "transport_y": sent.y} if sent else {}),
     }
@@ -372,15 +378,19 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
         shapes[numbered("target", k)] = target.columns_rows[::-1]
         if (name := numbered("reachable", k)) in names:
             shapes[name] = target.columns_rows[::-1]
+        for name, shape in {"irradiance": target.columns_rows[::-1], ERROR: ()}.items():
+            if numbered(name, k) in names:  # an earlier version stored no error, and an unwritten design has no light
+                shapes[numbered(name, k)] = shape
     found = _arrays(folder, shapes | dict.fromkeys(_numbers(scene.lens.front_surface), ()), scene)
-    goals, stored = [], []
+    goals, stored, lit = [], [], []
     for k, goal in enumerate(scene.goals):
         part = found.get(numbered("reachable", k))
         goals.append(goal.restricted(None if part is None else part > 0))
         stored.append(found[numbered("target", k)])
+        lit.append((found.get(numbered("irradiance", k)), float(found.get(numbered(ERROR, k), math.nan))))
         if not stored[k].sum() > 0 or not goals[k].picture.sum() > 0:
             raise SceneError(f"{folder / DESIGN}: the picture of {goal.key} is all black; {REMEDY}")
-    return scene, Nominal(scene, _lens(scene, found), tuple(goals), stored=tuple(stored))
+    return scene, Nominal(scene, _lens(scene, found), tuple(goals), stored=tuple(stored), lit=tuple(lit))
 
 
 def read_irradiances(folder: Path, scene: scenes.Scene) -> tuple[np.ndarray, ...]:

@@ -294,7 +294,11 @@ CHOICES = {
     "accuracy": {"none": {}, "asked": {"tailoring.accuracy": 0.3}, "half pixels": {"accept.rrmsd_half": 3.0}},
     "time": {"none": {}, "limited": {"tailoring.max_time": 100.0}},
     "reach": {"whole": {}, "part": part},
-    "export": {"none": {}, "tiles": {"output.export": ["tiles"]}},
+    "export": {
+        "none": {},
+        "tiles": {"output.export": ["tiles"]},
+        "raster from below": {"output.export": ["raster"], "output.zero": "bottom"},
+    },
     "targets": {"one": {}, "two": two},
     "grade": {
         "none": {},
@@ -321,7 +325,7 @@ WITHOUT_DOME = {  # values that do not go with a dome
     "mount": ("cut",),
     "elements": ("dome before", "window behind", "fold mirror behind"),
     "wavefront": ("plane", "sphere"),
-    "export": ("tiles",),
+    "export": ("tiles", "raster from below"),
 }
 REFUSED = (  # the least sets of values that no scene has together
     *(
@@ -575,6 +579,9 @@ def _faults(chosen, folder, *, previewed, planned, retailored):
         made = again.as_made()
         assert all(np.isfinite(goal.made).all() and 0 < goal.light <= 1 + 1e-9 for goal in made.goals)
         assert made.finish.is_marked and all(len(goal.changes) == 3 for goal in made.goals)
+    if chosen["export"] == "raster from below":
+        comments = (folder / "toolpath-raster.nc").read_text("ascii").replace(")\n(", " ")
+        assert "Z0 on the bottom of the blank" in comments
     if found := _failed(report, chosen):
         found = _failed(again.verify(effort=MORE_RAYS, progress=False), chosen)
     found += [*_ripples(report), *_differences(report, again)]
@@ -717,7 +724,9 @@ def test_a_design_remains_the_design_of_its_folder(body, tmp_path):
     again = bstcad.open(folder)
     assert np.array_equal(design.lens.back_net.control_points(), again.lens.back_net.control_points())
     for each in (design, again):
-        assert each.verify(progress=False).rrmsd == pytest.approx(report.rrmsd, rel=1e-3)
+        verified = each.verify(progress=False)
+        assert verified.rrmsd == pytest.approx(report.rrmsd, rel=1e-3)
+        assert [check.passed for check in verified.checks if check.id == "irradiance"] == [True] * len(report.goals)
         assert each.solid().Volume() > 0 and each.picture().any() and each.write_part(tmp_path / "p.step").exists()
         if body != "dome":
             assert each.with_lens(each.lens).with_heights(each.lens.back.heights).lens is not None

@@ -345,6 +345,27 @@ class TestVerify:
         assert failed["value"] == pytest.approx(off.max() / arrays["target"].max())
         assert failed["where"] == f"pixel ({column}, {row}), counted from the upper left"
 
+    CHANGED_LIGHT = {
+        "5 % brighter": lambda light: 1.05 * light,
+        "two pixels beside": lambda light: np.roll(light, 2, axis=1),
+        "10 % brighter at the right edge": lambda light: light * np.linspace(0.9, 1.1, light.shape[1]),
+    }
+
+    @pytest.mark.parametrize("change", CHANGED_LIGHT)
+    def test_an_irradiance_of_another_lens_is_found(self, folder, change):
+        with np.load(folder / "design.npz") as data:
+            arrays = dict(data)
+        light = self.CHANGED_LIGHT[change](arrays["irradiance"])
+        np.savez(folder / "design.npz", **(arrays | {"irradiance": light}))
+        [failed] = [check for check in commands.verify(folder).facts["checks"] if not check["passed"]]
+        assert failed["id"] == "irradiance"
+        of_error = arrays.pop("irradiance_error")  # an earlier version did not store it
+        np.savez(folder / "design.npz", **arrays)
+        again = commands.verify(folder)
+        assert 0 <= of_error < 0.05 and again.passed
+        [found] = [check for check in again.checks if check.id == "irradiance"]
+        assert found.limit < 0.05 and found.value < 0.2 * failed["value"]
+
     SWAPS = ("the whole folder", "one file", "the folder, by one that is no design")
 
     @pytest.mark.parametrize("swap", SWAPS)

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from bstcad import folder as folders
+from bstcad.optics.measure import Light
 from bstcad.optics.surfaces import Sphere
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
@@ -186,7 +187,8 @@ def test_what_is_written_is_what_is_read(small_design, small_scene, tmp_path):
     lens = replace(nominal.lens, back=back, front=Sphere(15.0, -0.0123456789))
     design = folders.Made(scene, lens, nominal.goals)
     (tmp_path / "scene.toml").write_text(scene.toml())
-    folders.write_design(design, (nominal.goals[0].picture * 2,), tmp_path)
+    light = Light(nominal.goals[0].picture * 2, rrmsd=0.1, standard_error=0.01, rays=64, flux={}, picture_error=0.02)
+    folders.write_design(design, [light], tmp_path)
     again = folders.read_nominal(tmp_path)[1].lens
     assert np.array_equal(again.back.control_points(), lens.back.control_points())
     assert again.front == lens.front

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+import torch
 
 from bstcad.analysis.light import Blur, blur, margins, mount_losses, rrmsd_of_ripple
 from bstcad.analysis.shape import AT_BOUND, Extreme, describe, survey, survey_front
@@ -24,7 +25,17 @@ from bstcad.optics import domes, quadrature
 from bstcad.optics.channels import Channel
 from bstcad.optics.goal import Goal, worst
 from bstcad.optics.lens import Lens
-from bstcad.optics.measure import FULL, RESOLVED, Effort, Light, SpectralLine, measure_goals, spectral_lines, tubes_of
+from bstcad.optics.measure import (
+    FULL,
+    RESOLVED,
+    Effort,
+    Light,
+    SpectralLine,
+    measure_goals,
+    spectral_lines,
+    squared_distance,
+    tubes_of,
+)
 from bstcad.optics.outlines import Outline
 from bstcad.optics.passes import Face
 from bstcad.optics.wavefront_error import WavefrontError, wavefront_error
@@ -46,6 +57,9 @@ if TYPE_CHECKING:
 
 VERTEX_ROUNDING = 2e-7  # largest distance of a float32 vertex from a sloped face, relative to the largest coordinate
 VERIFY_SEED = 1_000_003  # offset of the seed, for rays that tailoring has not used
+# Tolerance of the irradiance in design.npz, of which smoothing hides noise: a multiple of its estimated error, and an
+# RMS difference relative to its RMS, for the rounding of another processor.
+STORED_NOISE, STORED_TOLERANCE = 3.0, 2e-3
 TARGET_TOLERANCE = 1e-3  # largest change of the target since design.npz / brightest pixel: picture libraries change
 DEFAULT_RRMSD_LIMIT = 0.25  # limit of the RRMSD in remarks, plans and tolerance studies if accept.rrmsd is not set
 LINE_TUBES = 1031  # smallest number of tubes per side for the picture of one line of a spectrum
@@ -72,6 +86,9 @@ class Nominal:
     goals: tuple[Goal, ...]  # goals with the pictures of the scene
     # pictures of the goals in design.npz, (rows, columns); None: those of `goals`
     stored: tuple[np.ndarray, ...] | None = field(default=None, kw_only=True)
+    # for each goal, the irradiance (rows, columns) in design.npz, None if it has none, and its error, NaN if not
+    # stated; (): no design.npz was read
+    lit: tuple[tuple[np.ndarray | None, float], ...] = field(default=(), kw_only=True)
 
     @cached_property
     def channels(self) -> tuple[Channel, ...]:
@@ -178,6 +195,10 @@ def verify(
     on_lens(made_lens)
     lights, lines = zip(*_measure_targets(made_lens, nominal, effort, on_light), strict=True)
     values = light_values(nominal.scene, nominal.goals, lights, lens=made_lens, channels=nominal.channels)
+    stored: Sequence[tuple[np.ndarray | None, float]] = nominal.lit or [(None, math.nan)] * len(lights)
+    of_stored = [
+        _stored_light_check(goal, light, *of) for goal, light, of in zip(nominal.goals, lights, stored, strict=True)
+    ]
     lights = tuple(replace(light, sets=()) for light in lights)  # frees their memory
     wavefront, of_wavefront = _wavefront_checks(made_lens, nominal)
     cut = as_cut(lens, mount)
@@ -197,6 +218,7 @@ def verify(
         closed,
         *_mesh_checks(mesh, lens, whole.volume, nominal),
         *map(_target_check, nominal.goals, nominal.stored or [goal.picture for goal in nominal.goals]),
+        *of_stored,
         *(c for goal, light in lit_goals for c in _light_checks(light, accept, optic, of=goal.suffix, why=why)),
         *(check for value in values for check in value.checks()),
         *of_wavefront,
@@ -405,6 +427,21 @@ def _target_check(goal: Goal, stored: np.ndarray) -> Check:
     name = f"target in design.npz: deviation from the target of the scene, relative to its brightest pixel{goal.suffix}"
     where = f"pixel ({column}, {row}), counted from the upper left"
     return Check.at_most(name, float(off.max() / goal.picture.max()), TARGET_TOLERANCE, where=where, id="target")
+
+
+def _stored_light_check(goal: Goal, light: Light, stored: np.ndarray | None, error: float) -> Check:
+    """Check the irradiance in design.npz against the rays of this verification, without their noise.
+
+    stored: None if design.npz is not written yet, with the picture of `light`.  error: RRMSD between the stored
+    irradiance and the noiseless one; NaN: not stated, by an earlier version; the error with as many rays then counts.
+    """
+    picture = torch.from_numpy(light.picture if stored is None else stored)
+    squared, uncertainty = squared_distance([each.to(picture.dtype) for each in light.sets], picture)
+    error = light.picture_error if math.isnan(error) else error
+    limit = math.sqrt((STORED_NOISE * error) ** 2 + RESOLVED * uncertainty + STORED_TOLERANCE**2)
+    name = f"irradiance in design.npz: RMS difference from the light traced through the STEP file{goal.suffix}"
+    where = "the file was changed, or is that of another lens; generate the design again"
+    return Check.at_most(name, math.sqrt(max(squared, 0.0)), limit, where=where, id="irradiance")
 
 
 def _mesh_checks(mesh: meshes.Mesh, lens: Lens, volume: float, nominal: Nominal) -> list[Check]:
