@@ -14,7 +14,7 @@ from bstcad.measured import alignment as aligning
 from bstcad.measured.alignment import Alignment, BackFace, Pose
 from bstcad.measured.cloud import Cloud
 from bstcad.measured.form_error import Deviation, FormError, deviation, fit_form_error, minimum_zone
-from bstcad.measured.shrinkage import AxisScales, axis_scales, low_orders, scale
+from bstcad.measured.shrinkage import AxisScales, axis_scales, orders, scale
 from bstcad.optics.goal import Goal, worst
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, Light
@@ -168,7 +168,7 @@ def _identity_checks(face: BackFace, alignment: Alignment) -> tuple[Check, Check
 def _relief(face: BackFace, points: np.ndarray) -> float | None:
     """Return the ratio of fine relief, made face to design, by regression; None if the design has none."""
     points = points[np.random.default_rng(0).permutation(len(points))[:RELIEF_POINTS]]
-    columns = low_orders(points)  # removed, as lenses of equal power have similar polynomials
+    columns = orders(points)  # removed, as lenses of equal power have similar polynomials
     off = face.height(points)
     sag = points[:, 2] - off
     fine, change = (part - columns @ shape.least_squares(columns, part) for part in (sag - sag.mean(), off))

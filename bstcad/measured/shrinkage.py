@@ -1,15 +1,17 @@
 """Fit the scale of a made part to its cloud, one for all axes or one along each: the shrinkage that a moulding had.
 
 A part that is larger than the design by ε = (ε_x, ε_y, ε_z) about the pivot c has the distances Σ_k ε_k (q_k - c_k) n_k
-from the face, q a point and n its normal.  A smooth form error resembles a scale, and moves the alignment.  Scales and
-motions are therefore fitted together by generalised least squares, d = B β + form error.  Polynomials of LOW_DEGREE
-split distances and columns B into low orders L and fine relief F, which have the mean squares v_L and v_F of residuals:
+from the face, q a point of the face and n its normal.  A smooth form error resembles a scale, and moves the
+alignment.  Scales and motions are therefore fitted together by generalised least squares, d = B β + form error.
+Polynomials of LOW_DEGREE and MIDDLE_DEGREE split distances and columns B into low orders, middle orders and fine
+relief.  In each part k, the residual has the mean square v_k, and n_k independent form errors are assumed (PART_FORMS):
 
-    (L_Bᵀ L_B PATCHES_L / v_L + F_Bᵀ F_B PATCHES_F / v_F) β = L_Bᵀ L_d PATCHES_L / v_L + F_Bᵀ F_d PATCHES_F / v_F.
+    Σ_k B_kᵀ B_k n_k / v_k β = Σ_k B_kᵀ d_k n_k / v_k.
 
-v_L and v_F follow from β, so that low orders that contradict the fine relief lose their weight.  The distances are
-measured again at the new pose.  A face without fine relief does not determine the scales: a bowl that is wider is also
-flatter.
+v_k follows from β, so that low orders that contradict the fine relief lose their weight.  The distances are measured
+again at the new pose.  A face without fine relief does not determine the scales: a bowl that is wider is also flatter,
+and a form error may resemble a scale exactly.  A scale is therefore stated only if it would also be determined by low
+orders of the form error as large as those of the aligned distances.
 """
 
 from __future__ import annotations
@@ -29,13 +31,16 @@ from bstcad.measured.alignment import (
 )  # fmt: skip
 
 LOW_DEGREE = 4  # degree of the polynomials in x and y that describe form errors of low order
+MIDDLE_DEGREE = 8  # degree of the polynomials that describe form errors of middle order: few waves, as from a chuck
+# Assumed numbers of independent form errors of low orders, of middle orders and of the rest.
+PART_FORMS = np.array([LOW_ORDER_FORMS, LOW_ORDER_FORMS, INDEPENDENT_PATCHES])
 SCALE_POINTS = 20_000  # maximum number of points to which scales are fitted
 MAX_UNCERTAINTY = 3e-3  # standard uncertainty of a scale, above which the face does not determine it
 MAX_MOTION = 0.05  # largest motion beside the alignment / BackFace.reach; a larger one shows that nothing is determined
-MAX_LOW_ENERGY = 4.0  # largest mean square of the low orders of a form error, relative to that after the alignment
-POSE_ROUNDS, WEIGHT_ROUNDS = 4, 30  # maximum numbers of poses, and of estimates of v_L and v_F at each pose
+MAX_ENERGY = 4.0  # largest mean square of a part of the form error, relative to that after the alignment
+POSE_ROUNDS, WEIGHT_ROUNDS = 4, 30  # maximum numbers of poses, and of estimates of v_k at each pose
 WEIGHT_TOLERANCE = 1e-7  # change of scales and motions (mm at the rim) that ends the rounds
-MIN_VARIANCE = 1e-18  # lower bound of v_L and v_F, mm²: rounding
+MIN_VARIANCE = 1e-18  # lower bound of v_k, mm²: rounding
 STRETCH_SIGMAS = 3.0  # difference of a scale from another axis, in standard uncertainties, that shows a stretched part
 
 
@@ -74,12 +79,12 @@ def scale(face: BackFace, alignment: Alignment) -> tuple[float, float]:
     """Return (scale of the cloud relative to the design, its standard uncertainty), one scale for all axes.
 
     If fine relief does not determine the scale, it is that of ordinary least squares.  Its uncertainty then assumes
-    LOW_ORDER_FORMS form errors that resemble a scale, of which motions and scale take up most (MAX_LOW_ENERGY).
+    LOW_ORDER_FORMS form errors that resemble a scale, of which motions and scale take up most (MAX_ENERGY).
     """
     (value,), (uncertainty,) = (part.tolist() for part in _fit(face, alignment, np.ones((3, 1))))
     if np.isfinite(uncertainty):
         return value, uncertainty
-    growth = np.einsum("ij,ij->i", alignment.points - face.pivot, alignment.normals)
+    growth = _growth(face, alignment.points, alignment.distances, alignment.normals).sum(axis=1)
     columns = face.columns(alignment.points, alignment.normals) @ alignment.motions
     both = np.stack([growth, alignment.distances], axis=1)
     growth, distances = (both - columns @ np.linalg.solve(columns.T @ columns, columns.T @ both)).T
@@ -87,64 +92,81 @@ def scale(face: BackFace, alignment: Alignment) -> tuple[float, float]:
     if energy <= (MIN_SENSITIVITY * face.reach) ** 2 * len(growth):  # a plane has no scale
         return 1.0, np.inf
     excess = growth @ distances / energy
-    residual = np.sqrt(MAX_LOW_ENERGY) * root_mean_square(distances - excess * growth)
+    residual = np.sqrt(MAX_ENERGY) * root_mean_square(distances - excess * growth)
     return 1 + float(excess), float(residual / np.sqrt(energy / len(growth) * LOW_ORDER_FORMS))
 
 
-def low_orders(points: np.ndarray) -> np.ndarray:
-    """Return the products (n, k) of Legendre polynomials up to LOW_DEGREE, of x and y scaled to ±1."""
+def orders(points: np.ndarray, degree: int = LOW_DEGREE) -> np.ndarray:
+    """Return the products (n, k) of Legendre polynomials up to `degree`, of x and y scaled to ±1; lower ones first."""
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     u, v = (2 * (points[:, :2] - low) / (high - low) - 1).T
-    i, j = np.indices((LOW_DEGREE + 1, LOW_DEGREE + 1))
-    return np.polynomial.legendre.legvander2d(u, v, (LOW_DEGREE, LOW_DEGREE))[:, (i + j <= LOW_DEGREE).ravel()]
+    degrees = np.add(*np.indices((degree + 1, degree + 1))).ravel()
+    first = np.argsort(degrees, kind="stable")[: (degrees <= degree).sum()]
+    return np.polynomial.legendre.legvander2d(u, v, (degree, degree))[:, first]
 
 
 def _fit(face: BackFace, alignment: Alignment, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return scales (p,) and standard uncertainties (p,) of growths along `axes` (3, p)."""
     cloud = alignment.points[np.random.default_rng(0).permutation(len(alignment.points))[:SCALE_POINTS]]
-    pose, most, undetermined = identity_pose(face), np.inf, (np.ones(axes.shape[1]), np.full(axes.shape[1], np.inf))
+    pose, aligned = identity_pose(face), np.full(len(PART_FORMS), np.inf)
+    undetermined = np.ones(axes.shape[1]), np.full(axes.shape[1], np.inf)
     for turn in range(POSE_ROUNDS):
         points = pose.to_design(cloud)
         distances, normals = face.distance(points)
-        growth = ((points - face.pivot) * normals) @ axes
+        growth = _growth(face, points, distances, normals) @ axes
         motions = face.columns(points, normals) @ alignment.motions
         if turn == 0:
             free = growth - motions @ np.linalg.lstsq(motions, growth, rcond=None)[0]
             energy, directions = np.linalg.eigh(free.T @ free / len(free))
             determined = energy > (MIN_SENSITIVITY * face.reach) ** 2
         basis = directions[:, determined]
-        low, fine = _energies(points, np.column_stack([growth @ basis, motions, distances]))
-        most = min(most, MAX_LOW_ENERGY * low[-1, -1])
-        found, covariance = _weighted(low, fine, most)
+        energies = _energies(points, np.column_stack([growth @ basis, motions, distances]))
+        aligned = np.minimum(aligned, energies[:, -1, -1])
+        found, covariance = _weighted(energies, aligned, np.zeros(len(aligned)))
         excess, motion = np.split(found, [basis.shape[1]])
         pose = pose.compose(-alignment.motions @ motion, face.reach)
         if np.abs(motion).max(initial=0.0) > MAX_MOTION * face.reach:
             return undetermined
         if np.abs(motion).max(initial=0.0) < WEIGHT_TOLERANCE:
             break
-    uncertainty = np.sqrt(np.einsum("ij,jk,ik->i", basis, covariance[: len(excess), : len(excess)], basis))
-    unknown = (np.abs(directions[:, ~determined]) > 1e-3).any(axis=1) | (uncertainty > MAX_UNCERTAINTY)
+    _, cautious = _weighted(energies, aligned, aligned * [1, 0, 0])  # low orders as large as after the alignment
+    uncertainty, most = (
+        np.sqrt(np.einsum("ij,jk,ik->i", basis, each[: len(excess), : len(excess)], basis))
+        for each in (covariance, cautious)
+    )
+    unknown = (np.abs(directions[:, ~determined]) > 1e-3).any(axis=1) | (most > MAX_UNCERTAINTY)
     return 1 + basis @ excess, np.where(unknown, np.inf, uncertainty)
 
 
-def _energies(points: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean products (k, k) of the columns' low orders, and those of the rest."""
-    orders, _ = np.linalg.qr(low_orders(points))
-    inside = orders.T @ columns
-    rest = columns - orders @ inside
-    return inside.T @ inside / len(points), rest.T @ rest / len(points)
+def _growth(face: BackFace, points: np.ndarray, distances: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return changes (n, 3) of the distances per growth along x, y and z.
+
+    They are those at the nearest points of the face: at the points themselves, noise and form error would count as
+    growth, and all of them on a nearly flat face.
+    """
+    return (points - distances[:, None] * normals - face.pivot) * normals
 
 
-def _weighted(low: np.ndarray, fine: np.ndarray, most: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return β (k,) and its covariance (k, k); low, fine: mean products of the columns B and d; most: largest v_L."""
-    count, found = len(low) - 1, np.zeros(len(low) - 1)
+def _energies(points: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return the mean products (3, k, k) of the columns' low orders, of their middle orders and of the rest."""
+    basis, _ = np.linalg.qr(orders(points, MIDDLE_DEGREE))
+    inside = basis.T @ columns
+    low, middle = np.split(inside, [(LOW_DEGREE + 1) * (LOW_DEGREE + 2) // 2])
+    parts = (low, middle, columns - basis @ inside)
+    return np.stack([part.T @ part for part in parts]) / len(points)
+
+
+def _weighted(energies: np.ndarray, aligned: np.ndarray, least: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return β (k,) and its covariance (k, k).
+
+    energies: mean products of columns B and d.  aligned: v_k of the aligned distances.  least: lower bounds of v_k.
+    """
+    count = energies.shape[1] - 1
+    found, least = np.zeros(count), np.maximum(least, MIN_VARIANCE)
     for _ in range(WEIGHT_ROUNDS):
         left = np.append(-found, 1.0)
-        weights = (
-            LOW_ORDER_FORMS / max(min(left @ low @ left, most), MIN_VARIANCE),
-            INDEPENDENT_PATCHES / max(left @ fine @ left, MIN_VARIANCE),
-        )
-        normal = weights[0] * low + weights[1] * fine
+        weights = PART_FORMS / np.clip(left @ energies @ left, least, np.maximum(MAX_ENERGY * aligned, least))
+        normal = np.tensordot(weights, energies, axes=1)
         before, covariance = found, np.linalg.pinv(normal[:count, :count], hermitian=True)
         found = covariance @ normal[:count, count]
         if np.abs(found - before).max(initial=0.0) < WEIGHT_TOLERANCE:

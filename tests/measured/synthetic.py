@@ -72,5 +72,14 @@ def low_order(places, kind, size, random):
     """A form error of low order at points, along z: its amplitude is `size` (mm) at the rim, its direction random."""
     turn, (x, y) = random.uniform(0, 2 * np.pi), places[:, :2].T / np.abs(places[:, :2]).max()
     u, v = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
-    shapes = {"astigmatism": u * u - v * v, "coma": (3 * (u * u + v * v) - 2) * u, "cylinder": 2 * u * u - 1}
+    square = u * u + v * v
+    if kind == "random":  # Legendre polynomials of degrees 2 to 5, twice their RMS is `size`
+        degrees = np.add(*np.indices((6, 6)))
+        factors = random.normal(size=(6, 6)) * ((degrees >= 2) & (degrees <= 5)) / (1 + degrees)
+        shape = np.polynomial.legendre.legval2d(x, y, factors)
+        return size / 2 * shape / shape.std()
+    shapes = {
+        "astigmatism": u * u - v * v, "coma": (3 * square - 2) * u, "cylinder": 2 * u * u - 1,
+        "spherical": 6 * square**2 - 6 * square + 1, "trefoil": u**3 - 3 * u * v * v,
+    }  # fmt: skip
     return size * shapes[kind]
