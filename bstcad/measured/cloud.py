@@ -31,6 +31,7 @@ class Cloud:
     sha256: str = ""  # hash of the file
     without_data: int = 0  # number of points of the file that lack a coordinate and are left out
     columns: str = ""  # names of the columns read, for a Zygo file or if other columns state x, y or z too; else ""
+    duplicates: int = 0  # number of points of the file that repeat an earlier one exactly and are left out
 
 
 def load(path: Path, outline: Outline) -> Cloud:
@@ -41,7 +42,8 @@ def load(path: Path, outline: Outline) -> Cloud:
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     digest = hashlib.sha256(data).hexdigest()
-    return Cloud(points, unit, path, digest, without_data=measured.without_data, columns=measured.columns)
+    left_out = {"without_data": measured.without_data, "duplicates": measured.duplicates}
+    return Cloud(points, unit, path, digest, columns=measured.columns, **left_out)
 
 
 def _read(path: Path) -> tuple[MeasuredPoints, bytes]:
@@ -63,9 +65,10 @@ def _read(path: Path) -> tuple[MeasuredPoints, bytes]:
     else:
         measured = read_mesh(data, ending) if ending in MESH_SUFFIXES else read_text(data)
     if len(measured.positions) < MIN_CLOUD_POINTS:
-        without = f" and {measured.without_data} without data" if measured.without_data else ""
+        counts = {"without data": measured.without_data, "duplicated": measured.duplicates}
+        more = "".join(f" and {count} {where}" for where, count in counts.items() if count)
         raise ValueError(
-            f"contains {len(measured.positions)} points{without}, which are too few; measure at least "
+            f"contains {len(measured.positions)} points{more}, which are too few; measure at least "
             f"{MIN_CLOUD_POINTS}, preferably 10 000"
         )
     return measured, data

@@ -222,6 +222,7 @@ def _facts(face: BackFace, alignment: Alignment, error: Deviation, cloud: Cloud)
         "points": len(alignment.points),
         "left_out": {
             "without data": cloud.without_data,
+            "duplicated": cloud.duplicates,
             "outside the outline": alignment.outside,
             "off the face": alignment.off_face,
         },

@@ -34,7 +34,7 @@ def read_mesh(data: bytes, ending: str) -> MeasuredPoints:
     points = make_points(positions)
     if not len(points.positions):
         raise ValueError("contains no points; export the vertices of the measured face")
-    return MeasuredPoints(np.unique(points.positions, axis=0), points.without_data)
+    return MeasuredPoints(points.positions, points.without_data)  # vertices of neighbouring triangles are no duplicates
 
 
 class _Damaged(Exception):

@@ -52,10 +52,11 @@ class MeasuredPoints:
     positions: np.ndarray  # positions of the points (n, 3), mm, or in an unknown unit if the file states none
     without_data: int = 0  # number of points that lack a coordinate and were left out
     columns: str = ""  # names of the columns read, for a Zygo file or if other columns state x, y or z too; else ""
+    duplicates: int = 0  # number of points that repeat an earlier one exactly and were left out
 
 
 def make_points(positions: np.ndarray, where: Sequence[int] | None = None, columns: str = "") -> MeasuredPoints:
-    """Return the points without NaN; ValueError for a coordinate above MAX_POSITION; where: their line numbers."""
+    """Return distinct points without NaN; ValueError for a coordinate above MAX_POSITION; where: line numbers."""
     missing = np.isnan(positions).any(axis=1)
     excessive = ~(np.abs(positions) <= MAX_POSITION) & ~np.isnan(positions)
     if excessive.any():
@@ -65,7 +66,16 @@ def make_points(positions: np.ndarray, where: Sequence[int] | None = None, colum
             f"{place}: {'xyz'[axis]} = {positions[row, axis]:.4g} mm exceeds {MAX_POSITION:.0f} mm; state another "
             "unit in the heading, or leave out points that were not measured"
         )
-    return MeasuredPoints(positions[~missing], int(missing.sum()), columns)
+    kept, count = distinct(positions[~missing]), int(missing.sum())
+    return MeasuredPoints(kept, count, columns, duplicates=len(positions) - count - len(kept))
+
+
+def distinct(positions: np.ndarray) -> np.ndarray:
+    """Return the points (n, 3) without those that repeat an earlier one exactly: they are no independent data."""
+    order = np.lexsort(positions.T)  # stable, so that the first of equal points comes first
+    repeated = np.zeros(len(positions), dtype=bool)
+    repeated[order[1:]] = (positions[order[1:]] == positions[order[:-1]]).all(axis=1)
+    return positions[~repeated]
 
 
 def read_text(data: bytes) -> MeasuredPoints:

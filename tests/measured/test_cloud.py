@@ -114,6 +114,21 @@ def test_lines_without_data_are_counted_and_left_out(tmp_path, separator, headin
     assert found.without_data == len(words) and found.points == pytest.approx(kept, abs=1e-6)
 
 
+@pytest.mark.parametrize("name", ["a.csv", "a.ply"])
+def test_duplicated_points_are_used_once(tmp_path, name):
+    """The whole cloud twice, and one point 40 times more, which would have hidden that it is an outlier."""
+    given = np.vstack([GOOD, GOOD, np.repeat(GOOD[:1], 40, axis=0)])
+    head = HEADER.format("ascii", "", len(given), XYZ.replace("property float quality\n", ""), "")
+    (tmp_path / name).write_text((head if name == "a.ply" else "") + lines(given, " "))
+    found = clouds.load(tmp_path / name, ROUND)
+    assert found.points == pytest.approx(GOOD, abs=1e-6)
+    assert found.duplicates == (0 if name == "a.ply" else 240)  # triangles of a mesh share vertices
+    (tmp_path / name).write_text(lines(given[:60].repeat(4, axis=0), " "))
+    if name == "a.csv":
+        with pytest.raises(ValueError, match="contains 60 points and 180 duplicated, which are too few"):
+            clouds.load(tmp_path / name, ROUND)
+
+
 def test_the_actual_columns_are_taken_and_that_is_known(tmp_path):
     heading = "ID;X nom;Y nom;Z nom;X act;Y act;Z act;Dev"
     rows = [f"{k};0;0;0;{x};{y};{z};0" for k, (x, y, z) in enumerate(GOOD)]
@@ -177,7 +192,7 @@ def test_a_ply_file_is_held_to_what_its_header_promises(tmp_path, order):
     path = tmp_path / "a.ply"
     path.write_bytes(ply(order))
     found = clouds.load(path, ROUND)
-    assert found.points == pytest.approx(np.unique(GOOD, axis=0), abs=1e-8)
+    assert found.points == pytest.approx(GOOD, abs=1e-8)
     wrong = {
         "declares 1000000000 points, but": ply(order, 10**9),  # 28 GB
         "declares 999999999999999999 rows of element 'face', but 2 follow": ply(order, faces=10**18 - 1),
