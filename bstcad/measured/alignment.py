@@ -300,7 +300,8 @@ def _neighbour_planes(
 
 START_TOLERANCE = 1e-4  # distance of `first_pose` / BackFace.reach, up to which the best start is accepted at once
 START_SAMPLE, AXES_SAMPLE = 3000, 1000  # number of points for the starts, and for exchanges of axes
-START_STEPS, AXES_STEPS = 40, 15  # Gauss-Newton steps from each start, and for exchanges of axes
+START_STEPS, AXES_STEPS = 40, 15  # Gauss-Newton steps from each start, and for turns and exchanges of axes
+TURNS = 72  # number of turns about the axis that are tried; 5° apart, fine relief still leads to the right one
 START_FRACTION = 0.25  # fraction of the points, the nearest ones inside the outline, by which a start is judged
 IMPROVEMENT_RATIO = 0.5  # ratio of a later start's distance to the best so far, below which the later one replaces it
 DECENTRE_RING = 0.15  # ratio of the decentre of further starts to BackFace.reach, used if the first ones do not fit
@@ -317,6 +318,15 @@ def first_pose(face: BackFace, cloud: np.ndarray) -> tuple[Pose, float]:
     ring = DECENTRE_RING * face.reach * np.stack([np.cos(turns), np.sin(turns)], axis=1)
     further = _best_start(face, sample, [*ring, *(middle + ring)], START_STEPS)
     return further if further[1] < IMPROVEMENT_RATIO * best[1] else best
+
+
+def find_turned_pose(face: BackFace, cloud: np.ndarray, pose: Pose, original: float) -> Pose | None:
+    """Return `pose` turned about the axis so that it more than halves `first_pose`'s distance `original`, or None."""
+    sample = _sample(cloud)[:: START_SAMPLE // AXES_SAMPLE]
+    angles = 2 * np.pi * np.arange(1, TURNS) / TURNS
+    starts = (pose.compose(np.array([0.0, 0.0, 0.0, 0.0, 0.0, a * face.reach]), face.reach) for a in angles)
+    turned, distance = min((_refine_start(face, sample, start, AXES_STEPS) for start in starts), key=lambda fit: fit[1])
+    return turned if distance < IMPROVEMENT_RATIO * original else None
 
 
 def find_axis_exchange(face: BackFace, cloud: np.ndarray, original: float) -> tuple[np.ndarray, str] | None:
@@ -339,7 +349,7 @@ def _axis_exchanges() -> Iterator[tuple[np.ndarray, str]]:
     for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
         matrix = np.diag(signs)[:, np.argsort(order)].astype(float)
         changed = [k for k in range(3) if order[k] != k or signs[k] < 0]
-        if changed:
+        if matrix[2, 2] < 1 or np.linalg.det(matrix) < 0:  # not a turn about the axis; see find_turned_pose
             yield matrix, ", ".join(f"{'xyz'[k]} is {'-' * (signs[k] < 0)}{'xyz'[order[k]]}" for k in changed)
 
 

@@ -145,14 +145,25 @@ def _wavefront(lens: Lens, nominal: Nominal) -> Iterator[Check]:
 def _align(face: BackFace, points: np.ndarray) -> tuple[Alignment, str]:
     """Return the alignment and the exchange of axes that the cloud needs, in words; "" if it fits as given."""
     pose, distance = aligning.first_pose(face, points)
-    poor = distance > aligning.START_TOLERANCE * face.reach
-    if poor and (exchange := aligning.find_axis_exchange(face, points, distance)):
+    if distance <= aligning.START_TOLERANCE * face.reach:
+        alignment = aligning.align(face, points, pose)
+        if _is_of_face(face, alignment):
+            return alignment, ""
+    if turned := aligning.find_turned_pose(face, points, pose, distance):
+        alignment = aligning.align(face, points, turned)
+        if _is_of_face(face, alignment):
+            return alignment, ""
+    if exchange := aligning.find_axis_exchange(face, points, distance):
         matrix, words = exchange
         exchanged = points @ matrix.T
         alignment = aligning.align(face, exchanged, aligning.first_pose(face, exchanged)[0])
-        if all(check.passed for check in _identity_checks(face, alignment)):
+        if _is_of_face(face, alignment):
             return alignment, f"{words}{': the face is flipped' if matrix[2, 2] < 0 else ''}"
     return aligning.align(face, points, pose), ""
+
+
+def _is_of_face(face: BackFace, alignment: Alignment) -> bool:
+    return all(check.passed for check in _identity_checks(face, alignment))
 
 
 def _identity_checks(face: BackFace, alignment: Alignment) -> tuple[Check, Check]:

@@ -17,10 +17,14 @@ from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.measured.alignment import BackFace, align, first_pose
 from bstcad.measured.shrinkage import axis_scales
+from bstcad.optics.lens import Lens
 from bstcad.optics.measure import measure
+from bstcad.optics.outlines import Circle
+from bstcad.optics.surfaces import Plane
 from bstcad.report.figure_jobs import NoPictures
 from bstcad.verify import checks
 from tests.conftest import pictures, quick_effort
+from tests.lenses import net
 from tests.measured.synthetic import SHIFT, TURN, cloud, dirty, points, with_form_error
 
 EFFORT = quick_effort()
@@ -240,3 +244,14 @@ def test_many_parts_of_one_design_are_judged_beside_it(small_design, nominal, tm
     ):
         assert cli.run(["verify", str(folder), *wrong]) == 2 and sentence in capsys.readouterr().err
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("degrees", [90.0, 137.0, 180.0])
+def test_a_turned_part_is_aligned_by_its_relief(degrees):
+    """Relief of 1 µm on a bowl: a part upside down was said to be of another lens, or to have reversed axes."""
+    bowl = Lens(Plane(0.0), net(lambda x, y: 0.02 * x**2 + 0.01 * y**2, 5.0, 65, 6.0), Circle(5.0), 1.5)
+    lens = with_form_error(bowl, 1e-3, 0.7)
+    face, given = BackFace.of(lens), clouds.Cloud(cloud(lens, 3000, 2e-5, SHIFT, (0.0, 0.0, degrees)), "mm", Path())
+    found, checks_of_cloud = made_part.aligned(given, face, None)
+    assert all(check.passed for check in checks_of_cloud) and found.rms < 3e-5
+    assert abs(found.pose.angles[2]) == pytest.approx(degrees, abs=0.05)
