@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,7 +26,7 @@ from bstcad.runs import environment, files, processes
 from bstcad.runs.checkpoint import Keeper
 from bstcad.runs.cluster import Answer, Cluster, Machines
 from bstcad.runs.processes import ExitStatus, Tick
-from bstcad.scene.errors import SceneError
+from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import Scene, load
 from bstcad.sweep import cold_run
 from bstcad.sweep.cold_run import LocalPool, SceneFiles, StoredRecord, unpack_scene
@@ -234,7 +233,10 @@ def _finished_entry(row: BatchEntry, answer: Answer, folder: Path, local: bool) 
             _store_design(answer.value[1], folder / row.name)
         except SceneError as error:
             return row.changed(status=REFUSED, reason=str(error))
-    report = _report(row, folder)
+    try:
+        report = cold_run.read_report(folder / row.name)
+    except MachineError as error:
+        return row.changed(status=BROKEN, reason=str(error))
     return row.changed(
         status=report["verdict"],
         checks_failed=tuple(check["name"] for check in report["checks"] if not check["passed"]),
@@ -280,10 +282,6 @@ def write(rows: Sequence[BatchEntry], folder: Path) -> None:
     cold_run.write_csv(folder / "batch.csv", BATCH_COLUMNS, lines)
 
 
-def _report(row: BatchEntry, folder: Path) -> dict[str, Any]:
-    return json.loads((folder / row.name / "report.json").read_text(encoding="utf-8"))
-
-
 def exit_code(rows: Sequence[BatchEntry]) -> int:
     """Return 2 if a scene was refused, 1 if a check failed or an error ended a design, else 0."""
     if any(row.status == REFUSED for row in rows):
@@ -304,6 +302,6 @@ def summary(rows: Sequence[BatchEntry], folder: Path, verbose: bool = False) -> 
         status = f"{row.status.upper():{wide}}", STATUS_STYLES.get(row.status, "bold red")
         lines.append(Text.assemble(status, f"  {figures}{row.scene}{reason}"))
         if row.checks_failed or (verbose and row.finished):
-            checks = [Check(**check) for check in _report(row, folder)["checks"]]
+            checks = [Check(**check) for check in cold_run.read_report(folder / row.name)["checks"]]
             checked += check_lines(checks, verbose, f"{row.scene}: ")
     return Group(*lines, *checked)

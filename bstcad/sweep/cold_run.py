@@ -10,7 +10,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-import json
 import math
 import tempfile
 import threading
@@ -36,6 +35,7 @@ from bstcad.optics.lens import Lens
 from bstcad.optics.measure import Effort, measure_goals
 from bstcad.optics.outlines import Rectangle
 from bstcad.optics.surfaces import Plane
+from bstcad.report.record import read as read_contents
 from bstcad.runs import environment, files, processes
 from bstcad.runs.cluster import THIS_MACHINE, Answer
 from bstcad.runs.processes import Tick
@@ -66,6 +66,14 @@ def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
         return kind.model_validate_json(files.contents(path, MAX_RECORD_SIZE))
     except ValueError:  # pydantic's errors are ValueErrors
         raise MachineError(f"{path}: is damaged, or was written by another program; {remedy}") from None
+
+
+def read_report(folder: Path) -> dict[str, Any]:
+    """Return the entries of a design's report.json; raise MachineError if the file is missing or damaged."""
+    try:
+        return read_contents(folder / "report.json").facts()
+    except ValueError as error:
+        raise MachineError(str(error)) from None
 
 
 def write_record(path: Path, record: StoredRecord) -> None:
@@ -299,7 +307,10 @@ def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick:
         return ColdRun(status=FAILED, reason=reason, allowed_seconds=limit, **times)
     if process.code not in (0, 1) or not (folder / "report.json").is_file():
         return ColdRun(status=FAILED, reason=process.reason, **times)
-    report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    try:
+        report = read_report(folder)
+    except MachineError as error:
+        return ColdRun(status=FAILED, reason=str(error), **times)
     return ColdRun(
         status=DONE,
         peak_memory_gb=report["machine"].pop("peak_memory_gb", None),

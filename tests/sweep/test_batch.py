@@ -95,6 +95,21 @@ def test_one_bad_scene_stops_nothing(scenes, designs, capsys):
     assert sorted(path.name for path in (scenes / "out").iterdir()) == ["a", "b", "batch.csv", "batch.json"]
 
 
+def test_a_damaged_report_is_a_sentence(scenes, designs, tmp_path):
+    """A design whose report.json is damaged is broken; a later summary that needs the report is refused."""
+    (scenes / "wrong.toml").unlink()
+    designs.small = shutil.copytree(designs.small, tmp_path / "damaged")  # the other tests need it whole
+    report = designs.small / "report.json"
+    report.write_text(report.read_text()[:500])
+    assert run(scenes) == 1
+    rows = told(scenes)
+    assert {row["status"] for row in rows.values()} == {batch.BROKEN}
+    assert all("run bstcad verify to write it again" in row["reason"] for row in rows.values())
+    failed = batch.BatchEntry(scene="a.toml", name="a", checks_failed=("a check",))
+    with pytest.raises(MachineError, match="cannot be read .*; run bstcad verify"):
+        batch.summary([failed], scenes / "out")
+
+
 @pytest.mark.parametrize(("end", "code"), [(None, 0), (FAULT, 1)])
 def test_the_exit_code_is_of_the_worst(scenes, designs, end, code):
     (scenes / "wrong.toml").unlink()

@@ -11,6 +11,7 @@ from bstcad.folder import scene_files
 from bstcad.optics.measure import Effort
 from bstcad.runs import environment
 from bstcad.runs.cluster import Cluster
+from bstcad.runs.processes import ExitStatus
 from bstcad.sweep import cold_run, tradeoff
 from bstcad.sweep.cold_run import DONE, FAILED, ColdRun, LocalPool, calibration_kernel, judge_run, run_and_judge
 from bstcad.sweep.tradeoff import Knob
@@ -45,6 +46,18 @@ def test_a_sweep_of_cold_runs_measures_each_and_tells_why_one_failed(tiny, tmp_p
 def test_a_run_without_time_is_ended_and_says_so(tiny):
     found = run_and_judge(scene_files(tiny), (), limit=0.3, effort=EFFORT)
     assert found.status == FAILED and "ended after" in found.reason and found.rrmsd is None
+
+
+def test_a_run_with_a_damaged_report_fails_and_says_so(tiny, monkeypatch):
+    def cut_off(arguments, *_):
+        folder = Path(arguments[arguments.index("-o") + 1])
+        folder.mkdir(parents=True)
+        (folder / "report.json").write_text('{"passed": tr')
+        return ExitStatus(0, 1.0, 1.0, "")
+
+    monkeypatch.setattr(cold_run.processes, "run", cut_off)
+    found = run_and_judge(scene_files(tiny), (), limit=10.0, effort=EFFORT)
+    assert found.status == FAILED and "report.json: cannot be read" in found.reason
 
 
 def test_a_lens_tailored_to_other_pixels_is_judged_on_those_of_the_base(small_design):
