@@ -128,8 +128,16 @@ def _read_zygo(every: list[tuple[int, str]]) -> MeasuredPoints:
     if not lines:
         raise ValueError(f"contains no points; {INPUT_HINT}")
     width = 1e3 * pixel
-    positions = _table(lines, _Layout(None, False), (0, 1, 2)) * [width, -width, 1e-3]
-    positions[:, :2] -= (np.nanmin(positions[:, :2], axis=0) + np.nanmax(positions[:, :2], axis=0)) / 2
+    stated_points = _table(lines, _Layout(None, False), (0, 1, 2))
+    misplaced = ~(np.abs(stated_points[:, :2]) <= MAX_POSITION / width).all(axis=1)
+    if misplaced.any():
+        number, line = lines[int(misplaced.argmax())]
+        raise ValueError(
+            f"line {number}: {line[:40]!r} has a pixel that is not finite, or over {MAX_POSITION:.0f} mm from the "
+            "first one; export the file again"
+        )
+    positions = stated_points * [width, -width, 1e-3]
+    positions[:, :2] -= (positions[:, :2].min(axis=0) + positions[:, :2].max(axis=0)) / 2
     columns = f"x (pixels of {width:.4g} mm), y (rows of pixels from the top) and z (\u00b5m)"
     return make_points(positions, [number for number, _ in lines], columns)
 

@@ -472,7 +472,8 @@ def of_json(data: bytes | str, kind: type[Record] = Contents) -> Record:
         found = _adapter(kind).validate_json(_upgraded(data))
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        raise ValueError(": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))) from None
+        entry = ".".join(map(str, first["loc"]))  # keys of a damaged file may have characters that steer a terminal
+        raise ValueError(files.one_line(": ".join(filter(None, (entry, first["msg"]))))) from None
     if not _is_printable(plain(found)):
         raise ValueError(f"a text in it has more than {MAX_STRING_LENGTH} characters, or characters that do not print")
     return found
