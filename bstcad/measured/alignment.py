@@ -321,10 +321,13 @@ def first_pose(face: BackFace, cloud: np.ndarray) -> tuple[Pose, float]:
 
 
 def find_turned_pose(face: BackFace, cloud: np.ndarray, pose: Pose, original: float) -> Pose | None:
-    """Return `pose` turned about the axis so that it more than halves `first_pose`'s distance `original`, or None."""
+    """Return a pose turned about the axis that more than halves `first_pose`'s distance `original`, or None.
+
+    Both `pose` and the cloud as given are turned, since a cloud at a wrong angle can lead `pose` far astray.
+    """
     sample = _sample(cloud)[:: START_SAMPLE // AXES_SAMPLE]
-    angles = 2 * np.pi * np.arange(1, TURNS) / TURNS
-    starts = (pose.compose(np.array([0.0, 0.0, 0.0, 0.0, 0.0, a * face.reach]), face.reach) for a in angles)
+    turns = np.outer(2 * np.pi * np.arange(1, TURNS) / TURNS, [0.0, 0.0, 0.0, 0.0, 0.0, face.reach])
+    starts = (start.compose(turn, face.reach) for start in (identity_pose(face, np.zeros(3)), pose) for turn in turns)
     turned, distance = min((_refine_start(face, sample, start, AXES_STEPS) for start in starts), key=lambda fit: fit[1])
     return turned if distance < IMPROVEMENT_RATIO * original else None
 

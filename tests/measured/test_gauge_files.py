@@ -47,7 +47,7 @@ FAULTS = {
     "none": (lambda heights: heights, 1, [], ""),
     "30 % missing": (with_gaps, 1, [], ""),
     "mirrored": (lambda heights: heights[::-1], 1, ["made-axes"], "y is -y"),
-    "turned by 90 degrees": (lambda heights: np.rot90(heights), 1, ["made-axes"], "x is -y, y is x"),
+    "turned by 90 degrees": (lambda heights: np.rot90(heights), 1, [], ""),
     "mm as metres": (lambda heights: 1e3 * heights, 1e3, None, "its points seem to be in micrometres"),
     "mm as inches": (lambda heights: heights / 25.4, 1 / 25.4, ["made-unit"], "inches"),
 }
