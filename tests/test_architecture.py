@@ -119,7 +119,7 @@ ONLY = {
 # A library, and the declared one that has it among its own requirements and in its interface.
 COMES_WITH = {
     "pydantic_core": "pydantic", "markupsafe": "jinja2", "h11": "uvicorn", "dask": "distributed", "drjit": "mitsuba",
-    "IPython": "ipywidgets",
+    "IPython": "ipywidgets", "h5py": "SurfaceTopography",
 }  # fmt: skip
 HEAVY = (
     "torch", "numpy", "scipy", "numba", "OCP", "cadquery", "matplotlib", "pyvista", "PIL",

@@ -21,7 +21,8 @@ import numpy as np
 import sdfio
 import x3pio
 
-from bstcad.measured.point_text import UNITS_IN_MM, MeasuredPoints, make_points
+from bstcad.measured.hdf5_structure import check_structure
+from bstcad.measured.point_text import UNITS_IN_MM, MeasuredPoints, NotAMap, make_points
 
 MAX_MAP_POINTS = 20_000_000  # largest number of points of a height map, for which 1 GB of memory is enough
 MAX_UNPACKED_SIZE = 1_000_000_000  # largest size (bytes) of the unpacked contents of a zip archive
@@ -61,34 +62,30 @@ def read_grid(data: bytes, name: str) -> MeasuredPoints:
         read = {"X3P": _read_x3p, "SDF": _read_sdf}[name]
     try:
         return read(data)
-    except _NotAMap as error:
+    except NotAMap as error:
         raise ValueError(str(error)) from None
     except Exception as error:  # readers of damaged files raise errors of any kind
         reason = " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__
         raise ValueError(f"is not a readable {name} file ({reason}); {EXPORT_HINT}") from None
 
 
-class _NotAMap(ValueError):
-    """Error, in a sentence, of a readable file that is not a usable height map."""
-
-
 def _check_count(shape: tuple[int, ...], size: int | None = None) -> None:
-    """Raise _NotAMap for a shape with too many points, or with more points than an uncompressed file has bytes."""
+    """Raise NotAMap for a shape with too many points, or with more points than an uncompressed file has bytes."""
     count = math.prod(shape)
     if size is not None and count > size:
-        raise _NotAMap(f"its header declares {count} points, but the file has {size} bytes; {EXPORT_HINT}")
+        raise NotAMap(f"its header declares {count} points, but the file has {size} bytes; {EXPORT_HINT}")
     if count > MAX_MAP_POINTS:
         most = f"{MAX_MAP_POINTS} are possible"
-        raise _NotAMap(f"its header declares {count} points, and {most}; export every second point")
+        raise NotAMap(f"its header declares {count} points, and {most}; export every second point")
 
 
 def _map_points(heights: np.ndarray, x_pitch: float, y_pitch: float) -> MeasuredPoints:
     """Return the points of heights (rows y, columns x), all in mm, with x = y = 0 in the middle."""
     rows, columns = heights.shape
     if min(rows, columns) < 2:
-        raise _NotAMap(f"has a profile of {heights.size} points; measure the area of the back face")
+        raise NotAMap(f"has a profile of {heights.size} points; measure the area of the back face")
     if not (0 < x_pitch < math.inf and 0 < y_pitch < math.inf):
-        raise _NotAMap(f"states the pitches {x_pitch:g} mm in x and {y_pitch:g} mm in y; calibrate, and export again")
+        raise NotAMap(f"states the pitches {x_pitch:g} mm in x and {y_pitch:g} mm in y; calibrate, and export again")
     x = (np.arange(columns) - (columns - 1) / 2) * x_pitch
     y = (np.arange(rows) - (rows - 1) / 2) * y_pitch
     positions = np.empty((rows, columns, 3))
@@ -114,7 +111,7 @@ def _read_x3p(data: bytes) -> MeasuredPoints:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         unpacked = sum(part.file_size for part in archive.infolist())
         if unpacked > MAX_UNPACKED_SIZE:
-            raise _NotAMap(f"has {unpacked} bytes after decompression, and {MAX_UNPACKED_SIZE} are possible")
+            raise NotAMap(f"has {unpacked} bytes after decompression, and {MAX_UNPACKED_SIZE} are possible")
         for part in archive.infolist():
             if part.filename.endswith("main.xml"):
                 with archive.open(part) as main:
@@ -122,9 +119,9 @@ def _read_x3p(data: bytes) -> MeasuredPoints:
     info = x3pio.info(io.BytesIO(data), verify=False)
     _check_count(info.shape)
     if info.layer_count != 1:
-        raise _NotAMap(f"has {info.layer_count} layers; export only the layer of the back face")
+        raise NotAMap(f"has {info.layer_count} layers; export only the layer of the back face")
     if info.feature_type is x3pio.FeatureType.PROFILE:
-        raise _NotAMap(f"has a profile of {math.prod(info.shape)} points; measure the area of the back face")
+        raise NotAMap(f"has a profile of {math.prod(info.shape)} points; measure the area of the back face")
     file = x3pio.X3pFile.loads(data, verify=False)
     layer: Any = file.layers[0]  # layer of a surface or a point cloud
     states_origin = not file.placement.is_identity or layer.x is not None or layer.y is not None
@@ -136,7 +133,7 @@ def _read_x3p(data: bytes) -> MeasuredPoints:
 
 
 def _check_xml(file: IO[bytes]) -> None:
-    """Raise _NotAMap if main.xml, which x3pio reads into memory as a whole, is too large or declares entities.
+    """Raise NotAMap if main.xml, which x3pio reads into memory as a whole, is too large or declares entities.
 
     It is parsed in blocks, without a tree, up to the first excess.
     """
@@ -159,16 +156,16 @@ def _check_xml(file: IO[bytes]) -> None:
             within, listed = False, listed + parser.CurrentByteIndex
 
     def refuse(*declaration: object) -> None:
-        raise _NotAMap(f"declares entities in its main.xml; {EXPORT_HINT}")
+        raise NotAMap(f"declares entities in its main.xml; {EXPORT_HINT}")
 
     parser.StartElementHandler, parser.EndElementHandler, parser.EntityDeclHandler = begin, end, refuse
     while block := file.read(XML_BLOCK):
         parser.Parse(block)
         outside = -listed if within else parser.CurrentByteIndex - listed
         if outside > MAX_XML_SIZE:
-            raise _NotAMap(f"has more than {MAX_XML_SIZE} bytes of XML besides its points; {EXPORT_HINT}")
+            raise NotAMap(f"has more than {MAX_XML_SIZE} bytes of XML besides its points; {EXPORT_HINT}")
         if elements > MAX_XML_POINTS or parser.CurrentByteIndex > MAX_XML_SIZE + BYTES_PER_XML_POINT * MAX_XML_POINTS:
-            raise _NotAMap(f"lists more than {MAX_XML_POINTS} values as XML; export them in binary form")
+            raise NotAMap(f"lists more than {MAX_XML_POINTS} values as XML; export them in binary form")
 
 
 def _read_sdf(data: bytes) -> MeasuredPoints:
@@ -196,16 +193,17 @@ def _surface_topography(name: str) -> Callable[..., Any]:
 
 def _read_topography(data: bytes, name: str, open_topography: Callable[..., Any]) -> MeasuredPoints:
     """Read the first channel of heights; SurfaceTopography gives heights (columns x, rows y)."""
-    stream = io.BytesIO(data)
-    with open_topography(stream, format=BY_SURFACE_TOPOGRAPHY[name]) as file:
+    if name == "DATX":
+        check_structure(data)
+    with open_topography(io.BytesIO(data), format=BY_SURFACE_TOPOGRAPHY[name]) as file:
         channel = file.default_channel
         if channel.dim != 2:
-            raise _NotAMap(f"has a profile of {math.prod(channel.nb_grid_pts)} points; measure the area of the face")
+            raise NotAMap(f"has a profile of {math.prod(channel.nb_grid_pts)} points; measure the area of the face")
         _check_count(tuple(channel.nb_grid_pts), None if name == "DATX" else len(data))
         if channel.physical_sizes is None:
-            raise _NotAMap("states no pitch of its points in x and y; calibrate the lateral scale, and export again")
+            raise NotAMap("states no pitch of its points in x and y; calibrate the lateral scale, and export again")
         if channel.unit not in UNITS_IN_MM:
-            raise _NotAMap(f"states its lengths in {channel.unit}; export it with lengths in mm or \u00b5m")
+            raise NotAMap(f"states its lengths in {channel.unit}; export it with lengths in mm or \u00b5m")
         topography = channel.topography()
     size = UNITS_IN_MM[channel.unit]
     heights = np.ma.filled(np.ma.asarray(topography.heights()).astype(np.float64), np.nan).T

@@ -55,6 +55,10 @@ class MeasuredPoints:
     duplicates: int = 0  # number of points that repeat an earlier one exactly and were left out
 
 
+class NotAMap(ValueError):
+    """Error, in a sentence, of a readable file that is not a usable height map."""
+
+
 def make_points(positions: np.ndarray, where: Sequence[int] | None = None, columns: str = "") -> MeasuredPoints:
     """Return distinct points without NaN; ValueError for a coordinate above MAX_POSITION; where: line numbers."""
     missing = np.isnan(positions).any(axis=1)

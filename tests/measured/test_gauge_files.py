@@ -1,6 +1,8 @@
 """Files of gauges: each format is read back with the truth it was written from, and each fault is one sentence."""
 
 import io
+import os
+import re
 import time
 import tracemalloc
 import zipfile
@@ -12,8 +14,9 @@ from scipy.spatial import cKDTree
 
 from bstcad import folder as folders
 from bstcad.measured import cloud as clouds
-from bstcad.measured import made_part, point_grid
+from bstcad.measured import hdf5_structure, made_part, point_grid
 from bstcad.measured.alignment import BackFace
+from bstcad.measured.point_text import NotAMap
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import sag
 from tests.measured import gauge_files
@@ -257,6 +260,123 @@ def test_a_list_of_data_may_be_longer_than_other_xml(tmp_path, monkeypatch):
     assert found.points[:, 2] == pytest.approx(heights.ravel())
     monkeypatch.setattr(point_grid, "MAX_XML_SIZE", 800)
     assert "has more than 800 bytes of XML" in one_sentence(tmp_path, "x3p", stream.getvalue())
+
+
+# ---- structures of HDF5 that a height map does not need -------------------------------------------------------------
+
+SURFACE = "/Measurement/Surface"
+ROW = [("Source", "S64"), ("Link", "S64"), ("Destination", "S64")]
+
+
+def replaced(make):
+    """A change of an HDF5 file that makes its surface anew, by `make`."""
+
+    def change(file, folder):
+        del file[SURFACE]
+        make(file, folder)
+
+    return change
+
+
+def external(file, folder):
+    (folder / "secret").write_bytes(bytes(8 * 400))
+    file.create_dataset(SURFACE, (20, 20), "f8", external=[(str(folder / "secret"), 0, 8 * 400)])
+
+
+def pipe(file, folder):
+    os.mkfifo(folder / "pipe")
+    file.create_dataset(SURFACE, (20, 20), "f8", external=[(str(folder / "pipe"), 0, 8 * 400)])
+
+
+def virtual(file, folder):
+    import h5py
+
+    layout = h5py.VirtualLayout((20, 20), "f8")
+    layout[:] = h5py.VirtualSource(str(folder / "other.h5"), "heights", (20, 20))
+    file.create_virtual_dataset(SURFACE, layout)
+
+
+def huge_chunks(file, folder):
+    file.create_dataset(SURFACE, (20_000, 20_000), "f8", chunks=(20_000, 20_000))
+
+
+def plugin(file, folder):
+    import h5py
+
+    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    properties.set_chunk((20, 20))
+    properties.set_filter(32_015, h5py.h5z.FLAG_OPTIONAL)  # Zstandard, which HDF5 loads from a folder of plugins
+    space = h5py.h5s.create_simple((20, 20))
+    h5py.h5d.create(file.id, SURFACE.encode(), h5py.h5t.NATIVE_DOUBLE, space, properties)
+
+
+def linked(make):
+    def link(file, folder):
+        import h5py
+
+        file[SURFACE] = make(h5py, folder)
+
+    return link
+
+
+def described(*rows, shape=None):
+    """A change of the table of metadata."""
+
+    def change(file, folder):
+        del file["MetaData"]
+        if shape:
+            file.create_dataset("MetaData", shape, ROW, chunks=(64,))
+        else:
+            file["MetaData"] = np.array([*rows], dtype=ROW)
+
+    return change
+
+
+def attribute(file, folder):
+    file.create_group("notes").attrs.create("note", np.zeros(2_000_000), dtype="f8")
+
+
+def many_links(file, folder):
+    group = file.create_group("many")
+    for index in range(10_001):
+        group[f"{index}"] = file[SURFACE]
+
+
+DOUBLING = [(b"Root", b"a", b"{0}"), *(
+    (b"{%d}" % index, key, b"{%d}" % (index + 1)) for index in range(40) for key in (b"a", b"b")
+)]  # fmt: skip
+CIRCLE = [(b"Root", b"a", b"{0}"), (b"{0}", b"a", b"{0}")]
+HOSTILE = {  # change of a readable file, and words of the sentence
+    "external storage": (replaced(external), "whose data are in another place or file"),
+    "a pipe": (replaced(pipe), "whose data are in another place or file"),
+    "a virtual dataset": (replaced(virtual), "whose data are in another place or file"),
+    "a soft link": (replaced(linked(lambda h5py, _: h5py.SoftLink("/elsewhere"))), "contains the link 'Surface'"),
+    "an external link": (
+        replaced(linked(lambda h5py, folder: h5py.ExternalLink(str(folder / "other.h5"), "/heights"))),
+        "contains the link 'Surface' to another place or file",
+    ),
+    "huge chunks": (replaced(huge_chunks), "in chunks of 3200000000 bytes, and 160000000 are possible"),
+    "a plugin": (replaced(plugin), "which needs the plugin 32015 of HDF5"),
+    "many rows": (described(shape=(10**12,)), "declares 1000000000000 rows of metadata"),
+    "doubling references": (described(*DOUBLING), "has metadata of more than 10000 entries"),
+    "references in a circle": (described(*CIRCLE), "has metadata of more than 10000 entries"),
+    "a huge attribute": (attribute, "declares 16000000 bytes in its attribute 'note', and 10000000 are possible"),
+    "many links": (many_links, "contains more than 10000 links"),
+}
+
+
+@pytest.mark.parametrize("change", HOSTILE)
+def test_an_hdf5_file_with_more_than_a_height_map_is_refused_before_it_is_read(tmp_path, change):
+    """The structure is checked by h5py alone; HDF5 would open the other file, wait for the pipe, or fill the memory."""
+    h5py = pytest.importorskip("h5py")
+    stream = io.BytesIO(gauge_files.datx(map_of(), 0.3))
+    hdf5_structure.check_structure(stream.getvalue())
+    make, words = HOSTILE[change]
+    with h5py.File(stream, "r+", libver="latest") as file:
+        make(file, tmp_path)
+    with pytest.raises(NotAMap, match=re.escape(words)) as error:
+        hdf5_structure.check_structure(stream.getvalue())
+    assert "; export the file again" in str(error.value) and "\n" not in str(error.value)
 
 
 def test_other_files_are_no_height_maps():
