@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bstcad.measured import point_grid
+from bstcad.measured import grid_process, point_grid
 from bstcad.measured.point_mesh import read_mesh
 from bstcad.measured.point_text import INCH, INPUT_HINT, MeasuredPoints, read_text
 from bstcad.optics.outlines import Outline
@@ -56,7 +56,7 @@ def _read(path: Path) -> tuple[MeasuredPoints, bytes]:
         raise ValueError(f"is empty; {INPUT_HINT}")
     ending = path.suffix.lower()
     if name := point_grid.grid_format(data):
-        measured = point_grid.read_grid(data, name)
+        measured = grid_process.read_limited(data, name)
     elif ending in point_grid.ENDINGS:
         known = ", ".join(dict.fromkeys(name for _, _, name in point_grid.FORMATS))
         raise ValueError(

@@ -317,16 +317,17 @@ class ExitStatus:
 
 
 def run(
-    arguments: Sequence[str], limit: float = math.inf, tick: Tick = lambda: None, environment: Mapping[str, str] = {}
-) -> ExitStatus:
-    """Run `bstcad` with these arguments in a child process, which is killed after `limit` seconds.
+    arguments: Sequence[str], limit: float = math.inf, tick: Tick = lambda: None, environment: Mapping[str, str] = {},
+    module: str = "bstcad.cli",
+) -> ExitStatus:  # fmt: skip
+    """Run a module, by default `bstcad`, with these arguments in a child process; kill it after `limit` seconds.
 
     tick: called regularly; an exception of tick ends the child.  environment: additional environment variables.
     """
     source = str(Path(__file__).parents[2])  # the child runs these sources
     paths = os.pathsep.join(filter(None, (source, os.environ.get("PYTHONPATH"))))
     variables = {**os.environ, **environment, "PYTHONPATH": paths, PARENT: str(os.getpid())}
-    command, null = [sys.executable, "-m", "bstcad.cli", *arguments], subprocess.DEVNULL
+    command, null = [sys.executable, "-m", module, *arguments], subprocess.DEVNULL
     with tempfile.TemporaryFile() as stderr:
         began, others = time.perf_counter(), _cpu_seconds_of_children()
         child = subprocess.Popen(command, stdin=null, stdout=null, stderr=stderr, start_new_session=True, env=variables)
@@ -357,6 +358,16 @@ def _end(child: subprocess.Popen) -> None:
         with contextlib.suppress(subprocess.TimeoutExpired):
             child.wait(TERMINATION_TIMEOUT)
             return
+
+
+def limit_memory(largest: int) -> None:
+    """Limit the address space of this process to `largest` bytes, where the system can do so."""
+    with contextlib.suppress(ImportError, ValueError, OSError):
+        import resource
+
+        soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+        given = [limit for limit in (soft, hard) if limit != resource.RLIM_INFINITY]
+        resource.setrlimit(resource.RLIMIT_AS, (min(largest, *given) if given else largest, hard))
 
 
 def end_with_parent() -> None:

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from bstcad import folder as folders
 from bstcad.measured import cloud as clouds
-from bstcad.measured import hdf5_structure, made_part, point_grid
+from bstcad.measured import grid_process, hdf5_structure, made_part, point_grid
 from bstcad.measured.alignment import BackFace
 from bstcad.measured.point_text import NotAMap
 from bstcad.optics.outlines import Circle
@@ -54,6 +54,14 @@ FAULTS = {
     "mm as metres": (lambda heights: 1e3 * heights, 1e3, None, "its points seem to be in micrometres"),
     "mm as inches": (lambda heights: heights / 25.4, 1 / 25.4, ["made-unit"], "inches"),
 }
+
+
+@pytest.fixture(autouse=True)
+def reader(monkeypatch):
+    """The reader of height maps, which this process calls itself: a child for each damaged file would take minutes."""
+    limited = grid_process.read_limited
+    monkeypatch.setattr(grid_process, "read_limited", point_grid.read_grid)
+    return limited
 
 
 def written(form, *given):
@@ -260,6 +268,45 @@ def test_a_list_of_data_may_be_longer_than_other_xml(tmp_path, monkeypatch):
     assert found.points[:, 2] == pytest.approx(heights.ravel())
     monkeypatch.setattr(point_grid, "MAX_XML_SIZE", 800)
     assert "has more than 800 bytes of XML" in one_sentence(tmp_path, "x3p", stream.getvalue())
+
+
+# ---- limits of the child process -------------------------------------------------------------------------------------
+
+READERS = {  # reader of a child, and words of the sentence
+    "sleep(60)": "was not read within 3 s",
+    "abort()": "ended the process that reads X3P files (ended by SIGABRT)",
+    "_exit(3)": "ended the process that reads X3P files (exit code 3)",
+    "bytes(grid_process.MAX_READER_MEMORY)": "needs more than 8 GB of memory",
+    "1 / 0": "ended the process that reads X3P files (exit code 1)",
+}
+
+
+@pytest.mark.parametrize("statement", READERS)
+def test_a_reader_without_bounds_ends_in_a_sentence(tmp_path, monkeypatch, reader, statement):
+    """The child runs a module that puts another function in the place of the reader."""
+    (tmp_path / "hostile_reader.py").write_text(
+        "from os import _exit, abort\nfrom time import sleep\nfrom bstcad.measured import grid_process, point_grid\n"
+        f"point_grid.read_grid = lambda data, name: {statement}\ngrid_process.main()\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(grid_process, "MODULE", "hostile_reader")
+    if "sleep" in statement:
+        monkeypatch.setattr(grid_process, "MAX_READER_TIME", 3.0)
+    with pytest.raises(ValueError, match=re.escape(READERS[statement])) as error:
+        reader(WRITERS["x3p"](map_of(), 0.3), "X3P")
+    assert "; export the file again" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_the_child_gives_the_points_and_the_sentence_of_the_reader(tmp_path, reader):
+    heights = with_gaps(map_of())
+    data = WRITERS["x3p"](heights, 0.3)
+    found, known = reader(data, "X3P"), point_grid.read_grid(data, "X3P")
+    assert np.array_equal(found.positions, known.positions)
+    assert (found.without_data, found.columns) == (np.isnan(heights).sum(), known.columns)
+    with pytest.raises(ValueError) as error:
+        reader(data[:300], "X3P")
+    with pytest.raises(ValueError, match=re.escape(str(error.value))):
+        point_grid.read_grid(data[:300], "X3P")
 
 
 # ---- structures of HDF5 that a height map does not need -------------------------------------------------------------
