@@ -294,11 +294,7 @@ CHOICES = {
     "accuracy": {"none": {}, "asked": {"tailoring.accuracy": 0.3}, "half pixels": {"accept.rrmsd_half": 3.0}},
     "time": {"none": {}, "limited": {"tailoring.max_time": 100.0}},
     "reach": {"whole": {}, "part": part},
-    "export": {
-        "none": {},
-        "tiles": {"output.export": ["tiles"]},
-        "raster from below": {"output.export": ["raster"], "output.zero": "bottom"},
-    },
+    "export": {"none": {}, "tiles": {"output.export": ["tiles"]}},
     "targets": {"one": {}, "two": two},
     "grade": {
         "none": {},
@@ -325,7 +321,7 @@ WITHOUT_DOME = {  # values that do not go with a dome
     "mount": ("cut",),
     "elements": ("dome before", "window behind", "fold mirror behind"),
     "wavefront": ("plane", "sphere"),
-    "export": ("tiles", "raster from below"),
+    "export": ("tiles",),
 }
 REFUSED = (  # the least sets of values that no scene has together
     *(
@@ -579,9 +575,6 @@ def _faults(chosen, folder, *, previewed, planned, retailored):
         made = again.as_made()
         assert all(np.isfinite(goal.made).all() and 0 < goal.light <= 1 + 1e-9 for goal in made.goals)
         assert made.finish.is_marked and all(len(goal.changes) == 3 for goal in made.goals)
-    if chosen["export"] == "raster from below":
-        comments = (folder / "toolpath-raster.nc").read_text("ascii").replace(")\n(", " ")
-        assert "Z0 on the bottom of the blank" in comments
     if found := _failed(report, chosen):
         found = _failed(again.verify(effort=MORE_RAYS, progress=False), chosen)
     found += [*_ripples(report), *_differences(report, again)]

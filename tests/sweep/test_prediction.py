@@ -50,7 +50,7 @@ def test_a_pilot_has_a_quarter_of_the_net_the_pixels_and_the_tubes():
 
 
 def test_both_nets_of_two_faces_shrink_alike():
-    beam = load("templates/beam_shaper.toml", {"lens.front.control_points": 193})
+    beam = load("templates/beam_shaper.toml", {"lens.back.control_points": 385, "lens.front.control_points": 193})
     assert pilot_scene(beam)[0].lens.nets() == (193, 97)
 
 

@@ -61,7 +61,7 @@ def nominal(small_design, few):
 def with_picture(nominal, picture, **changes):
     """Return the nominal with another picture, which is stored as well, and interpolated on cells."""
     goals = tuple(replace(goal, picture=picture, draw=None, **changes) for goal in nominal.goals)
-    return replace(nominal, goals=goals, stored=(picture,))
+    return replace(nominal, goals=goals, stored=(picture,), lit=())
 
 
 def changed(nominal, name, **changes):
@@ -359,6 +359,7 @@ def narrower_screen(nominal, right=10.0):
 
 DESIGNS = {
     "the target by 1 %": (lambda n: replace(n, stored=(1.01 * n.goals[0].picture,)), {"target"}),
+    "another irradiance": (lambda n: replace(n, lit=((1.5 * n.goals[0].picture, 1e-3),)), {"irradiance"}),
     "the front's curvature by 1e-9": (other_front, {"front-curvature"}),
     "RRMSD asked for: 1e-6": (lambda n: other_limits(n, rrmsd=1e-6), {"rrmsd"}),
     "thickness asked for: 9.9 mm": (lambda n: changed(n, "lens", min_thickness=9.9), {"thickness"}),
