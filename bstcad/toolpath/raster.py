@@ -25,6 +25,7 @@ ROUGH_TOLERANCE = 0.1  # tolerance of roughing, as a fraction of the stock
 SAFE_HEIGHT = 5.0  # Z of rapid moves, above the top of the blank (mm)
 RAPID_FEED = 3000.0  # feed that the estimate of the time assumes for rapid moves (mm/min)
 STRAIGHT_PLAN = 1e-9  # difference from 1 of the cosine between two moves that are one line in the plan
+MAX_OVERRUN = 0.98  # largest distance of a line from the face / radius of the ball, which touches nothing beyond
 PLUNGE = 1 / 3  # feed of moves straight down, as a fraction of the feed
 
 
@@ -100,7 +101,7 @@ def raster(face: MachinedFace, levels: tuple[float, float], wanted: Cutting) -> 
     passes: list[Pass] = list(_roughing(face, cutting, top)) if stock else []
     lines = 2 * max(face.outline.half_extent) / spacing.pitch
     chords.refuse_many(lines * 2 * min(face.outline.half_extent) / tool.spacing(tolerance))
-    zigzag = np.concatenate(list(_lines(face, spacing.pitch, tool.reach + spacing.pitch, cutting.along)))
+    zigzag = np.concatenate(list(_lines(tool, spacing.pitch, cutting.along)))
     passes.append(
         Pass(_straightened(_followed(zigzag, tip, tool.spacing(tolerance), tolerance), tolerance), rough=False)
     )
@@ -109,16 +110,19 @@ def raster(face: MachinedFace, levels: tuple[float, float], wanted: Cutting) -> 
     return Raster(written, tool, cutting, spacing=spacing, top=top, bottom=bottom)
 
 
-def _lines(face: MachinedFace, pitch: float, overrun: float, along: str) -> Iterator[np.ndarray]:
-    """Yield the ends (2, 2) of lines over the outline, grown by `overrun` mm, in turn in both directions."""
-    a, b, r2 = face.outline.limits
+def _lines(tool: RoundTool, pitch: float, along: str) -> Iterator[np.ndarray]:
+    """Yield the ends (2, 2) of lines over the places within the tool's reach of the face, in turn in both directions.
+
+    The lines go on by a pitch (mm), so that none is missing, as long as a tool there still meets the face.
+    """
+    a, b, r2 = tool.face.outline.limits
     a, b = (a, b) if along == "x" else (b, a)
-    r = math.sqrt(r2) + overrun
+    r = math.sqrt(r2) + min(tool.reach + pitch, MAX_OVERRUN * tool.radius)
     reach = b + r
     count = math.ceil(2 * reach / pitch) + 1
     for k, level in enumerate(np.linspace(-reach, reach, count)):
         beyond = max(abs(level) - b, 0.0)
-        half = a + (r if r2 == 0 else math.sqrt(max(r * r - beyond * beyond, 0.0)))
+        half = a + math.sqrt(max(r * r - beyond * beyond, 0.0))
         ends = np.array([[-half, level], [half, level]])[:: -1 if k % 2 else 1]
         yield ends if along == "x" else ends[:, ::-1]
 
@@ -156,10 +160,7 @@ def _roughing(face: MachinedFace, cutting: Cutting, top: float) -> Iterator[Pass
     def tip(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return larger.ball(x, y) - cutting.radius - top
 
-    lines = [
-        _followed(ends, tip, spacing, ROUGH_TOLERANCE * stock)
-        for ends in _lines(face, pitch, larger.reach + pitch, cutting.along)
-    ]
+    lines = [_followed(ends, tip, spacing, ROUGH_TOLERANCE * stock) for ends in _lines(larger, pitch, cutting.along)]
     lowest = min(float(line[:, 2].min()) for line in lines)
     for level in range(1, math.ceil(-lowest / depth) + 1):
         above, floor = -(level - 1) * depth, -level * depth

@@ -105,6 +105,15 @@ def test_chords_keep_their_tolerance_everywhere():
     assert off.max() < 1e-4 and (np.diff(t) > 0).all() and len(t) < 1200
 
 
+@pytest.mark.parametrize("along", ["x", "y"])
+def test_a_steep_plate_is_milled_to_its_corners(along):
+    """Lines that go on by a pitch beyond a square corner are farther from the face than the ball is wide."""
+    face = face_of(lambda x, y: 0.12 * (x**2 + y**2), m=129, half=4.1)
+    path = milled(face, along=along)
+    found = check_raster(path)
+    assert face.shape.slope > 0.8 and found.gouge < 5e-4 and found.unreached == 0.0
+
+
 def test_the_check_finds_a_path_that_cuts_into_the_face():
     path = milled(face_of(smooth), stock=0.0)
     assert check_raster(path).gouge < 5e-4
