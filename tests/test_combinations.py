@@ -294,7 +294,7 @@ CHOICES = {
     "accuracy": {"none": {}, "asked": {"tailoring.accuracy": 0.3}, "half pixels": {"accept.rrmsd_half": 3.0}},
     "time": {"none": {}, "limited": {"tailoring.max_time": 100.0}},
     "reach": {"whole": {}, "part": part},
-    "export": {"none": {}, "tiles": {"output.export": ["tiles"]}},
+    "export": {"none": {}, "tiles from below": {"output.export": ["raster", "tiles"], "output.zero": "bottom"}},
     "targets": {"one": {}, "two": two},
     "grade": {
         "none": {},
@@ -321,7 +321,7 @@ WITHOUT_DOME = {  # values that do not go with a dome
     "mount": ("cut",),
     "elements": ("dome before", "window behind", "fold mirror behind"),
     "wavefront": ("plane", "sphere"),
-    "export": ("tiles",),
+    "export": ("tiles from below",),
 }
 REFUSED = (  # the least sets of values that no scene has together
     *(
@@ -575,6 +575,9 @@ def _faults(chosen, folder, *, previewed, planned, retailored):
         made = again.as_made()
         assert all(np.isfinite(goal.made).all() and 0 < goal.light <= 1 + 1e-9 for goal in made.goals)
         assert made.finish.is_marked and all(len(goal.changes) == 3 for goal in made.goals)
+    if chosen["export"] == "tiles from below":
+        comments = (folder / "toolpath-raster-tile-1-1.nc").read_text("ascii").replace(")\n(", " ")
+        assert "Z0 on the bottom of the blank" in comments
     if found := _failed(report, chosen):
         found = _failed(again.verify(effort=MORE_RAYS, progress=False), chosen)
     found += [*_ripples(report), *_differences(report, again)]
