@@ -105,7 +105,8 @@ def _cloud_checks(
     name, where = "made part: fraction of outliers among the points of the face", "clean the part and measure it again"
     yield Check.at_most(name, alignment.outlier_fraction, MAX_OUTLIER_FRACTION, where=where, id="made-outliers")
     (factor, uncertainty), name = scale(face, alignment), "made part: error of the scale of the cloud"
-    limit, stretch = max(SCALE_TOLERANCE, SCALE_SIGMAS * uncertainty), axis_scales(face, alignment).stretch
+    limit = max(SCALE_TOLERANCE, SCALE_SIGMAS * uncertainty) if np.isfinite(uncertainty) else None  # a plane has none
+    stretch = axis_scales(face, alignment).stretch
     where = "; ".join(filter(None, (f"size of cloud / design: {factor:.5f}", stretch)))
     yield Check.at_most(name, abs(factor - 1), limit, where=where, id="made-scale")
     x, y, _ = alignment.pose.shift

@@ -62,7 +62,7 @@ def test_it_comes_through(name, tmp_path, monkeypatch):
     failed = {check["id"] for check in report["checks"] if not check["passed"]}
     if "rrmsd" in failed:  # few evaluations leave ripple in an unsharp lens
         failed -= {"ripple"}
-    assert failed <= {"rrmsd"}
+    assert failed <= {"rrmsd", "rrmsd-half"}
     assert report["passed"] is not bool(failed)
     assert report["rrmsd"] <= hard.rrmsd
     assert report["efficiency"] >= hard.efficiency
