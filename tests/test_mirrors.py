@@ -16,7 +16,7 @@ from tests.test_seen import letter
 
 SMALL = {
     "lens.back.control_points": 33, "target.pixels": 48, "target.sample": None, "tailoring.quality": "draft",
-    "tailoring.rays": 256, "tailoring.transport_grid": 64, "accept.rrmsd": 0.25,
+    "tailoring.rays": 256, "tailoring.transport_grid": 64, "accept": {"rrmsd": 0.25},
 }  # fmt: skip
 PARALLEL = {"source": {"kind": "collimated", "aperture": {"shape": "circle", "radius": 27.0}, "z": 100.0}}
 EFFORT = quick_effort()

@@ -20,7 +20,7 @@ BEHIND_GLASS = {
     "lens.material": "PMMA", "lens.front": {"kind": "bspline", "z": 0.0, "optimise": True, "reflect": True},
     "lens.back": {"kind": "bspline", "z": 12.0, "control_points": 33}, "lens.front.control_points": 41,
     "target.sample": None, "target.pixels": 48, "tailoring.quality": "draft", "tailoring.rays": 256,
-    "tailoring.transport_grid": 64, "tailoring.stage2_iterations": 16, "accept.rrmsd": 0.25,
+    "tailoring.transport_grid": 64, "tailoring.stage2_iterations": 16, "accept": {"rrmsd": 0.25},
 }  # fmt: skip
 
 
