@@ -64,7 +64,7 @@ def read_grid(data: bytes, name: str) -> MeasuredPoints:
         return read(data)
     except NotAMap as error:
         raise ValueError(str(error)) from None
-    except MemoryError:  # of a limit that grid_process.py sets and explains
+    except MemoryError:  # the limit of memory is set and explained by grid_process.py
         raise
     except Exception as error:  # readers of damaged files raise errors of any kind
         reason = " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__
