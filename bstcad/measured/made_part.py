@@ -105,9 +105,10 @@ def _cloud_checks(
     name, where = "made part: fraction of outliers among the points of the face", "clean the part and measure it again"
     yield Check.at_most(name, alignment.outlier_fraction, MAX_OUTLIER_FRACTION, where=where, id="made-outliers")
     (factor, uncertainty), name = scale(face, alignment), "made part: error of the scale of the cloud"
-    limit = max(SCALE_TOLERANCE, SCALE_SIGMAS * uncertainty) if np.isfinite(uncertainty) else None  # a plane has none
-    stretch = axis_scales(face, alignment).stretch
-    where = "; ".join(filter(None, (f"size of cloud / design: {factor:.5f}", stretch)))
+    known, stretch = np.isfinite(uncertainty), axis_scales(face, alignment).stretch
+    limit = max(SCALE_TOLERANCE, SCALE_SIGMAS * uncertainty) if known else None
+    size = f"size of cloud / design: {factor:.5f}" if known else "this form of face does not tell the scale of its part"
+    where = "; ".join(filter(None, (size, stretch)))
     yield Check.at_most(name, abs(factor - 1), limit, where=where, id="made-scale")
     x, y, _ = alignment.pose.shift
     name, where = "made part: decentre in the frame of the cloud", f"x {x:+.4g} mm, y {y:+.4g} mm"

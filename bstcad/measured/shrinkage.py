@@ -40,6 +40,8 @@ MAX_MOTION = 0.05  # largest motion beside the alignment / BackFace.reach; a lar
 MAX_ENERGY = 4.0  # largest mean square of a part of the form error, relative to that after the alignment
 POSE_ROUNDS, WEIGHT_ROUNDS = 4, 30  # maximum numbers of poses, and of estimates of v_k at each pose
 WEIGHT_TOLERANCE = 1e-7  # change of scales and motions (mm at the rim) that ends the rounds
+MAX_HIDDEN = 4.0  # largest form error of a smooth face that motions and scale hide, relative to the RMS that they leave
+MAX_EXCESS = 0.05  # largest difference of one scale from 1, and its uncertainty, that a part has; form errors exceed it
 MIN_VARIANCE = 1e-18  # lower bound of v_k, mm²: rounding
 STRETCH_SIGMAS = 3.0  # difference of a scale from another axis, in standard uncertainties, that shows a stretched part
 
@@ -79,7 +81,8 @@ def scale(face: BackFace, alignment: Alignment) -> tuple[float, float]:
     """Return (scale of the cloud relative to the design, its standard uncertainty), one scale for all axes.
 
     If fine relief does not determine the scale, it is that of ordinary least squares.  Its uncertainty then assumes
-    LOW_ORDER_FORMS form errors that resemble a scale, of which motions and scale take up most (MAX_ENERGY).
+    LOW_ORDER_FORMS form errors that resemble a scale, of which motions and scale take up most (MAX_HIDDEN).  A face of
+    which no part can have this scale (MAX_EXCESS) has none: (1, infinity).
     """
     (value,), (uncertainty,) = (part.tolist() for part in _fit(face, alignment, np.ones((3, 1))))
     if np.isfinite(uncertainty):
@@ -92,8 +95,9 @@ def scale(face: BackFace, alignment: Alignment) -> tuple[float, float]:
     if energy <= (MIN_SENSITIVITY * face.reach) ** 2 * len(growth):  # a plane has no scale
         return 1.0, np.inf
     excess = growth @ distances / energy
-    residual = np.sqrt(MAX_ENERGY) * root_mean_square(distances - excess * growth)
-    return 1 + float(excess), float(residual / np.sqrt(energy / len(growth) * LOW_ORDER_FORMS))
+    residual = MAX_HIDDEN * root_mean_square(distances - excess * growth)
+    uncertainty = residual / np.sqrt(energy / len(growth) * LOW_ORDER_FORMS)
+    return (1 + float(excess), float(uncertainty)) if max(abs(excess), uncertainty) <= MAX_EXCESS else (1.0, np.inf)
 
 
 def orders(points: np.ndarray, degree: int = LOW_DEGREE) -> np.ndarray:

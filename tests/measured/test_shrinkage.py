@@ -62,11 +62,15 @@ def test_true_scales_lie_within_two_uncertainties_in_19_of_20_parts(lens, kinds)
     assert (np.sum(np.array(off) < 2, axis=0) >= 19).all()
 
 
-@pytest.mark.parametrize("smooth_lens", [BOWL, DOME, NEARLY_FLAT], ids=["bowl", "dome", "nearly flat"])
-def test_a_smooth_face_states_no_scale_that_form_errors_resemble(smooth_lens):
+def test_a_smooth_face_states_no_scale_that_form_errors_resemble(lens):
     """A nearly flat part had the scales 2 ± 0.000002 along x, y and z, as its form error itself counted as growth."""
-    off = [errors(*made(smooth_lens, seed, 1.0, KINDS[seed % len(KINDS)])) for seed in SEEDS]
+    off = [errors(*made(lens, seed, 1.0, KINDS[seed % len(KINDS)])) for seed in SEEDS]
     assert (np.sum(np.array(off) < 2, axis=0) >= 19).all()
+
+
+def test_a_cylinder_gives_a_nearly_flat_face_no_scale():
+    """A cylinder of 5 µm on a sag of 25 µm had scales up to 14 stated uncertainties off, in 6 of 20 parts."""
+    assert all(scale(*made(NEARLY_FLAT, seed, 1.0, "cylinder"))[1] == np.inf for seed in range(6))
 
 
 def test_a_part_that_is_stretched_along_z_is_named(lens):
