@@ -381,6 +381,11 @@ def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
     return _with_remarks(contents, *written("remarks.txt.j2", "outliers", share=part.facts["outliers"]["share"]))
 
 
+def with_failures(contents: Contents, failures: Mapping[str, str]) -> Contents:
+    """Return the contents with a remark on each kind of output.export that is not possible, for the stated reason."""
+    return _with_remarks(contents, *written("remarks.txt.j2", "failures", failures=failures))
+
+
 def _with_remarks(contents: Contents, *more: Remark) -> Contents:
     """Return the contents with more remarks, and the verdict that follows from them."""
     every, limited = (*contents.all_remarks, *more), contents.verdict != NO_LIMIT
