@@ -51,12 +51,12 @@ from bstcad.report.prescription import SHEET, Order
 from bstcad.report.record import Contents, Examined, LeftOut, Report, StageRecord, contents_of, with_part
 from bstcad.report.rendering import LightPath
 from bstcad.report.tolerances import Tolerances
+from bstcad.report.toolpath_files import refuse_hopeless
 from bstcad.report.units import prepare
 from bstcad.runs import cluster, files, processes, signals
 from bstcad.runs.checkpoint import Keeper
 from bstcad.runs.environment import circumstances
 from bstcad.runs.files import MachineError, SceneError
-from bstcad.scene.moulding import CAVITY
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import numbered
@@ -115,6 +115,7 @@ def generate(
     this checkpoint.  After a Ctrl-C the best lens so far is written to the folder that `output_folder` returns.
     """
     scene = with_default_net(scene, lambda line: hooks.progress("control points", 1, 1, line))
+    _refuse_exports(scene)
     path, say = files.beside(folder, "checkpoint"), lambda text: hooks.progress("checkpoint", 0, 0, text)
     keeper = Keeper(path, purpose(scene, device), say, kind=DesignState)
     processes.begin()
@@ -184,7 +185,7 @@ def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), prog
         estimates = _left_out(made, proof)  # while the second process draws the pictures
         drawn.result()
         made = replace(made, making=made.making.with_stages(StageRecord("report", time.perf_counter() - proven)))
-        contents = replace(_contents(made, proof, estimates), order=order)
+        contents = replace(record.with_failures(_contents(made, proof, estimates), exported.failures), order=order)
         drawn.begin(draw_convergence, contents)
         _write_report(made, proof.lens, contents, building, drawn=drawn, options=options)
         _write_sheet(drawn, building)
@@ -589,32 +590,39 @@ def _cutting(settings: Mapping[str, Any]) -> Cutting:
 
 
 def _export_of_scene(made: Made, folder: Path) -> Exported:
-    """Write the files of output.export; a note states why a cavity cannot be built, as a check does for part.step."""
-    kinds = made.scene.output.export
-    written = _export(made, [kind for kind in kinds if kind != CAVITY], folder)
-    if CAVITY in kinds:
-        try:
-            cavity = _export(made, [CAVITY], folder)
-        except ValueError as error:
-            cavity = Exported([], [f"cavity.step is not written: {error}"])
-        written = Exported(written.paths + cavity.paths, written.notes + cavity.notes)
-    return written
+    """Write the files of output.export that are possible for this lens; a remark of the report states the others."""
+    return _export(made, made.scene.output.export, folder, strict=False)
+
+
+def _refuse_exports(scene: Scene) -> None:
+    """Raise SceneError if output.export asks for a tool path that can only fail after the design."""
+    kinds, lens = scene.output.export, scene.lens
+    for kind in (kind for kind in kinds if kind in files.PATHS):
+        with scene_errors(f'output.export: "{kind}" is not possible'):
+            flat = scene.flat_lens(lens.back.net)
+            cells = exports.DEFAULT_TILING.cells(flat.plan) if "tiles" in kinds else ()
+            refuse_hopeless(kind, flat, _cutting_of(scene, [kind]), lens.tailored_faces, cells=cells)
+
+
+def _cutting_of(scene: Scene, kinds: Sequence[str], cutting: Cutting = DEFAULTS) -> Cutting:
+    """Return the settings of tool paths, with the scene's tool and zero; ValueError if no tool has its radius."""
+    if cutting.zero is None:
+        cutting = replace(cutting, zero=scene.output.zero)
+    if cutting.tool_radius is not None or scene.lens.mould or not set(kinds) & set(files.PATHS):
+        return cutting
+    return replace(cutting, tool_radius=scene.lens.tool_radius)  # the tool for which the faces were designed
 
 
 def _export(
     made: Made, kinds: Sequence[str], folder: Path, *, points: int | None = None, cutting: Cutting = DEFAULTS,
-    tiling: Tiling = exports.DEFAULT_TILING,
+    tiling: Tiling = exports.DEFAULT_TILING, strict: bool = True,
 ) -> Exported:  # fmt: skip
-    scene, lens = made.scene, made.lens
+    scene, lens, cutting = made.scene, made.lens, _cutting_of(made.scene, kinds, cutting)
     light = GridLight(scene.light.central, tuple(target.screen for target in scene.targets))
     far = far_field_of(scene)
-    if cutting.tool_radius is None and not scene.lens.mould:  # the tool for which the faces were designed
-        cutting = replace(cutting, tool_radius=scene.lens.tool_radius)
-    if cutting.zero is None:
-        cutting = replace(cutting, zero=scene.output.zero)
     return exports.export(
         lens, kinds, folder, points=points, label=folders.label(scene), mount=scene.mount, light=light, far=far,
-        cutting=cutting, moulding=scene.moulding, part=scene.part.of(scene.lens), tiling=tiling,
+        cutting=cutting, moulding=scene.moulding, part=scene.part.of(scene.lens), tiling=tiling, strict=strict,
     )  # fmt: skip
 
 

@@ -372,7 +372,7 @@ class Workbench:
         text = self.workspace.opened(name).text
         page, number = str(_required(body, "page"))[:40], _integer(_required(body, "number"))
         grade = str(body["made"]) if body.get("made") in GRADE_NAMES else None
-        light = str(body["lit"]) if body.get("lit") in LIGHTS else None
+        light = str(body["lit"]) if isinstance(body.get("lit"), str) and body["lit"] in LIGHTS else None
         asking = PreviewRequest(page, number, self.workspace.scene(name, text), text=text, grade=grade, light=light)
         self.desk.ask(asking)
         return self._answered(name, asking, 0)
@@ -506,7 +506,7 @@ class Workbench:
     def export(self, name: str, body: Body) -> dict[str, Any]:
         """Start to write files for a shop; body: {"kind": name, "tool_radius": mm, "tiles": "2x3"}, kind required."""
         kind, radius, tiles = (body.get(key) for key in ("kind", "tool_radius", "tiles"))
-        if kind not in SHOP_FILES:
+        if not isinstance(kind, str) or kind not in SHOP_FILES:
             raise SceneError(f"kind: {kind!r} is no file for a shop; give {', '.join(SHOP_FILES)}")
         size = None if radius in (None, "") else _number(radius, "tool_radius")
         return self._begin(name, "export", {"kind": kind, "tool_radius": size, "tiles": str(tiles or "")[:20]})
@@ -577,10 +577,11 @@ def _json_handler(work: Callable[[str, Body], dict[str, Any]]) -> Callable[[Requ
     async def answer(request: Request) -> Response:
         try:
             body = json.loads(await request.body() or b"{}")
+            json.dumps(body, ensure_ascii=False).encode()  # UnicodeEncodeError: half of a character, such as \ud800
         except (ValueError, RecursionError):
             body = None
         if not isinstance(body, dict):
-            raise SceneError("the request is not a JSON object; reload the page")
+            raise SceneError("the request is not a JSON object of valid text; reload the page")
         return JSONResponse(await run_in_threadpool(work, request.path_params.get("name", ""), body))
 
     return answer

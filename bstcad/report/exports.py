@@ -11,8 +11,9 @@ from __future__ import annotations
 import io
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from bstcad.report.toolpath_files import toolpath_files
 from bstcad.report.units import environment, paragraphs
 from bstcad.runs import files
 from bstcad.scene.blank import export_complaints
-from bstcad.scene.moulding import CAVITY, MISSING, Moulding
+from bstcad.scene.moulding import MISSING, Moulding
 from bstcad.scene.mount import Mount, Part
 from bstcad.toolpath.cutting import DEFAULTS, Cutting
 
@@ -83,13 +84,14 @@ class Exported:
 
     paths: list[Path]
     notes: list[str]  # sentences on how far interpolation of a grid or table moves the light
+    failures: dict[str, str]  # reasons why kinds are not possible, by kind
 
 
 def export(
     lens: Lens, kinds: Sequence[str], folder: Path, points: int | None = None, label: Label = DEFAULT_LABEL,
     mount: Mount | None = None, light: GridLight | None = None, far: FarField | None = None,
     cutting: Cutting = DEFAULTS, moulding: Moulding | None = None, part: Part | None = None,
-    tiling: Tiling = DEFAULT_TILING,
+    tiling: Tiling = DEFAULT_TILING, strict: bool = True,
 ) -> Exported:  # fmt: skip
     """Write the files of `kinds` (files.EXPORTS; nothing for SHEET) to the folder, each completely or not at all.
 
@@ -100,42 +102,39 @@ def export(
     moulding: shrinkage for the cavity; None: it cannot be exported.  part: data of the part that STEP files state.
     tiling: numbers of tiles along x and along y; with the kind "tiles", each tile has a raster and a height map.
     ValueError: a kind is unknown, points is out of range, or a tool path or a tile is not possible.
+    strict: False: a kind that is not possible is in `Exported.failures`, and the files of the other kinds are written.
     """
     for kind in kinds:
         if kind not in files.EXPORTS:
             raise ValueError(f"'{kind}' cannot be exported; give one of {', '.join(files.EXPORTS)}")
     if points is not None and not MIN_POINTS <= points <= MAX_POINTS:
         raise ValueError(f"points = {points} is not possible; give a number from {MIN_POINTS} to {MAX_POINTS}")
-    lens, paths, notes, intensity = lens.plain(), [], [], None
+    lens, found = lens.plain(), Exported([], [], {})
     for complaint in export_complaints(
         kinds, domes.is_dome(lens), lens.passes.index_before, front_ends=lens.front.outline is not None
     ):  # fmt: skip
         raise ValueError(complaint)
     cells = tiling.cells(lens.plan) if "tiles" in kinds else ()
+    intensity = None if far is None else cache(lambda: Stated(far.table(lens), far.lumens))  # traced once for all files
     for kind in dict.fromkeys(kinds):
-        if kind == CAVITY:
-            if moulding is None:
-                raise ValueError(MISSING)
-            paths += _write_cavity(lens, moulding, mount, folder, label=label, part=part or Part())
-            notes.append(paths[-1].read_text(encoding="utf-8").strip())
-            continue
-        if kind in (*INTENSITIES, RAYS) and far is None:
-            raise ValueError(f"'{kind}' needs the light of a scene; export it from the folder of a design")
-        if kind == RAYS and far is not None:
-            files.put(folder / "rays.tm25ray", tm25.write(far.rays(lens, RAY_COUNT), _luminaire(lens, label)))
-            paths.append(folder / "rays.tm25ray")
-            continue
-        if kind in INTENSITIES and far is not None and intensity is None:  # traced once for all files
-            intensity = Stated(far.table(lens), far.lumens)
-        for name, data in _files(
-            kind, lens, points, label=label, mount=mount, light=light, intensity=intensity, cutting=cutting,
-            tiling=tiling, cells=cells, part=part or Part(),
-        ):  # fmt: skip
-            files.put(folder / name, data.encode("utf-8") if isinstance(data, str) else data)
-            paths.append(folder / name)
-            if name.endswith(SIDECAR):
-                notes.append(str(data).strip())
-    return Exported(paths, notes)
+        written: dict[Path, str | bytes] = {}
+        try:
+            for name, data in _files(
+                kind, lens, points, label=label, mount=mount, light=light, far=far, intensity=intensity,
+                cutting=cutting, moulding=moulding, tiling=tiling, cells=cells, part=part or Part(),
+            ):  # fmt: skip
+                files.put(folder / name, data.encode("utf-8") if isinstance(data, str) else data)
+                written[folder / name] = str(data).strip() if name.endswith(SIDECAR) else ""
+        except ValueError as error:
+            if strict:
+                raise
+            found.failures[kind] = str(error)
+            for path in written:
+                path.unlink()
+        else:
+            found.paths.extend(written)
+            found.notes.extend(filter(None, written.values()))
+    return found
 
 
 def _files(
@@ -146,12 +145,16 @@ def _files(
     label: Label,
     mount: Mount | None,
     light: GridLight | None,
-    intensity: Stated | None,
+    far: FarField | None,
+    intensity: Callable[[], Stated] | None,
     cutting: Cutting,
+    moulding: Moulding | None,
     tiling: Tiling,
     cells: Sequence[Cell],
     part: Part,
 ) -> Iterator[tuple[str, str | bytes]]:
+    if kind in (*INTENSITIES, RAYS) and far is None:
+        raise ValueError(f"'{kind}' needs the light of a scene; export it from the folder of a design")
     count = min(max(lens.back_net.shape), MAX_POINTS) if points is None else points
     match kind:
         case "sag" if domes.is_dome(lens):
@@ -195,22 +198,26 @@ def _files(
         case "preview":
             yield from preview_files(lens, label)
         case "ies" | "ldt" | "csv" if intensity is not None:
-            yield f"intensity.{kind}", photometric_file(kind, lens, intensity, label)
+            yield f"intensity.{kind}", photometric_file(kind, lens, intensity(), label)
+        case "tm25" if far is not None:
+            yield "rays.tm25ray", tm25.write(far.rays(lens, RAY_COUNT), _luminaire(lens, label))
+        case "cavity":
+            yield from _cavity_files(lens, moulding, mount, label=label, part=part)
 
 
-def _write_cavity(
-    lens: Lens, moulding: Moulding, mount: Mount | None, folder: Path, *, label: Label, part: Part
-) -> list[Path]:
-    """Write the solid of the cavity and its sidecar; return their paths."""
+def _cavity_files(
+    lens: Lens, moulding: Moulding | None, mount: Mount | None, *, label: Label, part: Part
+) -> Iterator[tuple[str, str | bytes]]:
+    """Yield (name, content) of the solid of the cavity and of its sidecar."""
     from bstcad.cad import cavity
 
+    if moulding is None:
+        raise ValueError(MISSING)
     solid, about = cavity.cavity(lens, moulding, mount)
     what = "lens" if mount is None else "part"
-    step, sidecar = folder / "cavity.step", folder / f"cavity{SIDECAR}"
-    files.put(step, cavity.step_file(solid, label.name, part))
+    yield "cavity.step", cavity.step_file(solid, label.name, part)
     words = f"cavity.step: the {what}, enlarged about x = y = 0, z = {about:.6g} mm; {moulding.words()}\n"
-    files.put(sidecar, words.encode("utf-8"))
-    return [step, sidecar]
+    yield f"cavity{SIDECAR}", words
 
 
 # --- photometric files ---------------------------------------------------------------------------------------------

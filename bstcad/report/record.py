@@ -381,6 +381,11 @@ def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
     return _with_remarks(contents, *written("remarks.txt.j2", "outliers", share=part.facts["outliers"]["share"]))
 
 
+def with_failures(contents: Contents, failures: Mapping[str, str]) -> Contents:
+    """Return the contents with a remark on each kind of output.export that is not possible, for the stated reason."""
+    return _with_remarks(contents, *written("remarks.txt.j2", "failures", failures=failures))
+
+
 def _with_remarks(contents: Contents, *more: Remark) -> Contents:
     """Return the contents with more remarks, and the verdict that follows from them."""
     every, limited = (*contents.all_remarks, *more), contents.verdict != NO_LIMIT
@@ -474,8 +479,9 @@ def of_json(data: bytes | str, kind: type[Record] = Contents) -> Record:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
         entry = ".".join(map(str, first["loc"]))  # keys of a damaged file may have characters that steer a terminal
         raise ValueError(files.one_line(": ".join(filter(None, (entry, first["msg"]))))) from None
-    if not _is_printable(plain(found)):
-        raise ValueError(f"a text in it has more than {MAX_STRING_LENGTH} characters, or characters that do not print")
+    if not _is_valid(plain(found)):
+        long = f"a text in it has more than {MAX_STRING_LENGTH} characters, or characters that do not print"
+        raise ValueError(f"{long}, or a number is not finite")
     return found
 
 
@@ -506,7 +512,13 @@ def _upgraded(data: bytes | str) -> bytes | str:
             predicted = {key: measured.get(key) for key in ("rrmsd_predicted", "rrmsd_high")}
             measured["goals"] = measured.pop("targets", [{"key": "target"} | predicted])
         return to_json(facts)
-    except (AttributeError, KeyError, TypeError, ValueError):  # not a report: the caller reports the error
+    except (
+        AttributeError,
+        KeyError,
+        OverflowError,
+        TypeError,
+        ValueError,
+    ):  # not a report: the caller reports the error
         return data
 
 
@@ -515,13 +527,19 @@ def _adapter(kind: type[Record]) -> TypeAdapter[Record]:
     return TypeAdapter(kind)
 
 
-def _is_printable(value: Any) -> bool:
-    """Return True if all strings, except those of the prescription, are short and cannot control a terminal."""
+def _is_valid(value: Any, any_text: bool = False) -> bool:
+    """Return True if numbers are finite, and strings outside the prescription short and unable to control a terminal.
+
+    any_text: True inside the prescription.
+    """
     if isinstance(value, str):
-        return len(value) <= MAX_STRING_LENGTH and value.isprintable()
+        return any_text or (len(value) <= MAX_STRING_LENGTH and value.isprintable())
     if isinstance(value, dict):
-        return all(_is_printable(key) and (key == "prescription" or _is_printable(part)) for key, part in value.items())
-    return not isinstance(value, list) or all(map(_is_printable, value))
+        parts = ((key, _is_valid(part, any_text or key == "prescription")) for key, part in value.items())
+        return all(valid and _is_valid(key, any_text) for key, valid in parts)
+    if isinstance(value, list):
+        return all(_is_valid(part, any_text) for part in value)
+    return not isinstance(value, float) or math.isfinite(value)
 
 
 def plain(value: Any) -> Any:

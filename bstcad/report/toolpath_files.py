@@ -19,13 +19,21 @@ from bstcad.optics.lens import Lens
 from bstcad.report.shop_figures import left_figure
 from bstcad.report.units import quantity
 from bstcad.toolpath import gcode
-from bstcad.toolpath.chords import digits
+from bstcad.toolpath import raster as rasters
+from bstcad.toolpath import spiral as spirals
+from bstcad.toolpath.chords import digits, refuse_many
 from bstcad.toolpath.cutting import Cutting
 from bstcad.toolpath.machined_face import MachinedFace, RoundTool
 from bstcad.toolpath.raster import RAPID_FEED, SAFE_HEIGHT, Raster, raster
 from bstcad.toolpath.spiral import ANGLE_DIGITS, Spiral, spiral
 from bstcad.toolpath.swept_volume import LEFT, Swept, check_raster, check_spiral
 
+# Steepest face (degrees) that a tool reaches, its name, and number of places of a path over a plane, by kind of path.
+PLANES = {
+    "spiral": (spirals.MAX_NOSE_SLOPE, "nose", spirals.flat_places),
+    "raster": (rasters.MAX_BALL_SLOPE, "ball", rasters.flat_places),
+}
+MIN_EXCESS = 2.0  # points of a path over a plane / most points, from which a design cannot shorten the path enough
 ROWS_AT_A_TIME = 100_000  # rows of a table that are formatted at a time
 
 
@@ -56,6 +64,21 @@ def toolpath_files(
             yield f"{own}.nc", gcode.gcode(milled, [*sentences, *_of_check(found, milled.tool)])
             yield f"{own}.csv", raster_table(milled)
             yield from _check_files(own, found, milled.tool, sentences, cusp=milled.spacing.cusp)
+
+
+def refuse_hopeless(
+    kind: str, lens: Lens, cutting: Cutting, tailored: Sequence[str], cells: Sequence[Cell] = ()
+) -> None:
+    """Raise ValueError if a path over a lens before tailoring can only fail, whatever shape the tailored faces get.
+
+    A face that is not tailored is too steep, or a path over planes is more than MIN_EXCESS times too long.
+    """
+    steepest, tool, places = PLANES[kind]
+    for side, face in machined_faces(lens):
+        if side not in tailored:
+            face.refuse_steep(steepest, tool)
+        for cell in (cells if kind == "raster" else ()) or (None,):
+            refuse_many(places(face if cell is None else face.part(*_extent(cell, side)), cutting) / MIN_EXCESS)
 
 
 def _check_files(

@@ -33,6 +33,8 @@ HEIGHT_EXPORTS = {  # kinds that need a back of heights z(x, y), which a dome is
     "zemax": "a table of", "turning": "a table of", "spiral": "a path over", "raster": "a path over",
     "heightmap": "a picture of",
 }  # fmt: skip
+PATHS = ("spiral", "raster")  # kinds that are paths of a round tool
+TOOL_RADII = (1e-3, 1e3)  # smallest and largest radius of such a tool (mm)
 MAX_ARCHIVE_SIZE = 600_000_000  # largest .npz (bytes), enough for a net of 2049 x 2049 and pictures of 4096 x 4096
 MAX_ARRAY_HEADER = 4096  # largest header of an array in an .npz archive (bytes), with a margin
 MAX_FOLDER_NAME = 230  # largest name of a folder of a design (bytes); names beside it are longer, up to 255

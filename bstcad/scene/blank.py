@@ -16,7 +16,7 @@ from bstcad.optics.outlines import Circle, Rectangle
 from bstcad.optics.passes import LENS, MIRROR, SECOND_SURFACE, Face, Passes
 from bstcad.optics.sides import Sides, as_pair, coarser, in_proportion, simplified
 from bstcad.optics.surfaces import Surface
-from bstcad.runs.files import HEIGHT_EXPORTS
+from bstcad.runs.files import HEIGHT_EXPORTS, PATHS, TOOL_RADII
 from bstcad.scene.dome_back import RadialBack
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import (
@@ -76,10 +76,13 @@ class Back(Record):
         return simplified(self.control_points)
 
 
-def export_complaints(kinds: Iterable[str], dome: bool, index_before: float, front_ends: bool = False) -> Iterator[str]:
+def export_complaints(
+    kinds: Iterable[str], dome: bool, index_before: float, front_ends: bool = False, tool_radius: float | None = None
+) -> Iterator[str]:
     """Yield a sentence for each kind of export that cannot hold a lens; index_before: of the medium at its front.
 
-    front_ends: True if the front has an outline of its own, with a plane around it.
+    front_ends: True if the front has an outline of its own, with a plane around it.  tool_radius: radius (mm) of the
+    tool that the scene states; None: no radius.
     """
     for kind in kinds:
         if dome and kind in HEIGHT_EXPORTS:
@@ -91,6 +94,11 @@ def export_complaints(kinds: Iterable[str], dome: bool, index_before: float, fro
             yield '"tiles" cuts whole faces, and the front ends in lens.front.outline; remove it, or use lens.step'
         elif index_before != 1 and kind == "zemax":
             yield '"zemax" starts its light in air, and lens.encapsulant is not air; use lens.step in its place'
+        elif kind in PATHS and tool_radius is not None and not TOOL_RADII[0] <= tool_radius <= TOOL_RADII[1]:
+            radius = (
+                f"lens.tool_radius, and {tool_radius:g} mm is not between {TOOL_RADII[0]:g} and {TOOL_RADII[1]:g} mm"
+            )
+            yield f'"{kind}" cuts with {radius}; use bstcad export --as {kind} --tool-radius in its place'
 
 
 AnyBack = Annotated[Back | RadialBack, Field(discriminator="kind")]

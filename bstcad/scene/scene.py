@@ -117,8 +117,9 @@ class Scene(Record):
         yield from lighting.encapsulant_complaints(source, lens, self._of_dome)
         ends = getattr(lens.front, "outline", None) is not None
         of_export = export_complaints(
-            self.output.export, lens.dome is not None, lens.passes.index_before, front_ends=ends
-        )
+            self.output.export, lens.dome is not None, lens.passes.index_before, front_ends=ends,
+            tool_radius=None if lens.mould else lens.tool_radius,
+        )  # fmt: skip
         yield from (f"output.export: {complaint}" for complaint in of_export)
         if CAVITY in self.output.export and self.moulding is None:
             yield f"output.export: {MISSING}"

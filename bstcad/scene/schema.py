@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
+from weakref import WeakValueDictionary
 
 from pydantic import (
     BaseModel,
@@ -108,7 +109,7 @@ def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], exam
 
     def content(given: Any, checked: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
         found = found_in(given, info)
-        return found if isinstance(found, kind) else checked(found)  # a copy would compute its cached values again
+        return shared(found) if isinstance(found, kind) else checked(found)  # a copy would compute cached values again
 
     def found_in(given: Any, info: ValidationInfo) -> Any:
         if isinstance(given, kind):
@@ -128,6 +129,15 @@ def from_file(kind: type[FileContent], read: Callable[[Path], FileContent], exam
 
     written = PlainSerializer(lambda found: found.name, return_type=str)
     return WrapValidator(content), written, WithJsonSchema({"type": "string"})
+
+
+_SHARED: WeakValueDictionary[int, FileContent] = WeakValueDictionary()  # contents in use, by their hash
+
+
+def shared(content: FileContent) -> FileContent:
+    """Return the equal content that is in use, else `content`, so that the caches of many scenes keep a file once."""
+    known = _SHARED.setdefault(hash(content), content)
+    return known if known == content else content
 
 
 def _check_links(path: Path, bounds: Sequence[Path]) -> None:

@@ -71,7 +71,11 @@ def minimise(problem: Objective, method: Method, evaluations: int, best: Best = 
     """
     if best.evaluations >= evaluations:
         return
-    query, reason = next(method), ""
+    try:
+        query, reason = next(method), ""
+    except StopIteration as end:  # a resumed method whose state leads nowhere, such as one that is damaged
+        yield Iterate(best, None, reason=end.value)
+        return
     while not reason:
         merit, gradients, figure = problem(query.parameters)
         skipped = best.skipped

@@ -46,6 +46,11 @@ def for_passes(cusp: float, tolerance: float) -> float:
     return max(cusp - tolerance / 2, cusp / 2)
 
 
+def flat_pitch(radius: float, cusp: float, pitch: float | None, fractions: tuple[float, float]) -> float:
+    """Return the pitch (mm) of passes over a plane; fractions: smallest and largest pitch / radius from a cusp."""
+    return _passes(1 / radius, cusp, pitch, limits=(fractions[0] * radius, fractions[1] * radius)).pitch
+
+
 def spiral_passes(tool: RoundTool, cusp: float, pitch: float | None) -> Passes:
     """Return the passes of a spiral whose cusps in the plane of the nose are at most `cusp` (mm), or of this pitch."""
 

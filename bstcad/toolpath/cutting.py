@@ -9,13 +9,14 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
-RADII = (1e-3, 1e3)  # smallest and largest radius of a tool, mm
+from bstcad.runs.files import TOOL_RADII
+
 HEIGHTS = (1e-7, 10.0)  # smallest and largest cusp height and tolerance, mm
 STEPS = (1e-5, 1e3)  # smallest and largest pitch, stock and depth of cut, mm
 FEEDS = (1e-2, 1e6)  # smallest and largest feed, mm/min
 LIMITS = {
-    "tool_radius": (*RADII, "mm"), "cusp": (*HEIGHTS, "mm"), "pitch": (*STEPS, "mm"), "tolerance": (*HEIGHTS, "mm"),
-    "stock": (*STEPS, "mm"), "depth": (*STEPS, "mm"), "feed": (*FEEDS, "mm/min"),
+    "tool_radius": (*TOOL_RADII, "mm"), "cusp": (*HEIGHTS, "mm"), "pitch": (*STEPS, "mm"),
+    "tolerance": (*HEIGHTS, "mm"), "stock": (*STEPS, "mm"), "depth": (*STEPS, "mm"), "feed": (*FEEDS, "mm/min"),
 }  # fmt: skip
 CHOICES = {"along": ("x", "y"), "zero": ("top", "bottom"), "units": ("mm", "inch"), "rapid": ("G0", "G1")}
 

@@ -91,6 +91,13 @@ class MachinedFace:
             valley, ridge = max(valley, float(concave.max())), max(ridge, -float(convex.min()))
         return Shape(slope, valley, bend=max(abs(valley), abs(ridge)))
 
+    def refuse_steep(self, steepest: float, tool: str) -> None:
+        """Raise ValueError if a part of the face is steeper than this tool reaches (degrees)."""
+        slope = math.degrees(math.atan(self.shape.slope))
+        if slope > steepest:
+            steep = f"the face is {slope:.3g} degrees steep, and a {tool} reaches {steepest:g} degrees"
+            raise ValueError(f"{steep}; limit lens.max_slope, or cut the face on a machine with more axes")
+
     def heights(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return z (mm) of the face at points (mm)."""
         return self.net.sag_and_slope(torch.from_numpy(x), torch.from_numpy(y))[0].numpy()

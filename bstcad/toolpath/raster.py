@@ -88,10 +88,7 @@ def raster(face: MachinedFace, levels: tuple[float, float], wanted: Cutting) -> 
     """
     cutting = wanted.completed(ROUTER)
     tool, (cusp, tolerance), stock = RoundTool(face, cutting.radius), cutting.finish, cutting.roughing[0]
-    steepest = math.degrees(math.atan(face.shape.slope))
-    if steepest > MAX_BALL_SLOPE:
-        steep = f"the face is {steepest:.3g} degrees steep, and a ball reaches {MAX_BALL_SLOPE:g} degrees"
-        raise ValueError(f"{steep}; limit lens.max_slope, or cut the face on a machine with more axes")
+    face.refuse_steep(MAX_BALL_SLOPE, "ball")
     spacing = cusps.raster_passes(tool, cusps.for_passes(cusp, tolerance), pitch=cutting.pitch, along=cutting.along)
     bottom, top = levels[0], levels[1] + stock
 
@@ -99,8 +96,7 @@ def raster(face: MachinedFace, levels: tuple[float, float], wanted: Cutting) -> 
         return tool.ball(x, y) - tool.radius - top
 
     passes: list[Pass] = list(_roughing(face, cutting, top)) if stock else []
-    lines = 2 * max(face.outline.half_extent) / spacing.pitch
-    chords.refuse_many(lines * 2 * min(face.outline.half_extent) / tool.spacing(tolerance))
+    chords.refuse_many(_places(face, spacing.pitch, tool.spacing(tolerance)))
     zigzag = np.concatenate(list(_lines(tool, spacing.pitch, cutting.along)))
     passes.append(
         Pass(_straightened(_followed(zigzag, tip, tool.spacing(tolerance), tolerance), tolerance), rough=False)
@@ -108,6 +104,20 @@ def raster(face: MachinedFace, levels: tuple[float, float], wanted: Cutting) -> 
     places = chords.digits(tolerance)
     written = tuple(replace(each, points=np.round(each.points, places)) for each in passes)
     return Raster(written, tool, cutting, spacing=spacing, top=top, bottom=bottom)
+
+
+def flat_places(face: MachinedFace, wanted: Cutting) -> float:
+    """Return the number of places at which the raster of a plane with the outline and net of a face begins."""
+    cutting = wanted.completed(ROUTER)
+    cusp = cusps.for_passes(*cutting.finish)
+    return _places(
+        face, cusps.flat_pitch(cutting.radius, cusp, cutting.pitch, cusps.RASTER_PITCHES), face.net.detail / 2
+    )
+
+
+def _places(face: MachinedFace, pitch: float, spacing: float) -> float:
+    a, b = face.outline.half_extent
+    return (2 * a / pitch) * (2 * b / spacing)
 
 
 def _lines(tool: RoundTool, pitch: float, along: str) -> Iterator[np.ndarray]:

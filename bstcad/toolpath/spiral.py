@@ -56,10 +56,7 @@ def spiral(face: MachinedFace, wanted: Cutting) -> Spiral:
     """Return the spiral that cuts a face; ValueError if the face is too steep for a nose or the path too long."""
     cutting = wanted.completed(LATHE)
     tool, (cusp, tolerance) = RoundTool(face, cutting.radius), cutting.finish
-    steepest = math.degrees(math.atan(face.shape.slope))
-    if steepest > MAX_NOSE_SLOPE:
-        steep = f"the face is {steepest:.3g} degrees steep, and a nose reaches {MAX_NOSE_SLOPE:g} degrees"
-        raise ValueError(f"{steep}; limit lens.max_slope, or cut the face on a machine with more axes")
+    face.refuse_steep(MAX_NOSE_SLOPE, "nose")
     passes = cusps.spiral_passes(tool, cusps.for_passes(cusp, tolerance), cutting.pitch)
     pitch = passes.pitch
     inwards = math.ceil(
@@ -82,6 +79,18 @@ def spiral(face: MachinedFace, wanted: Cutting) -> Spiral:
         angle, x, z, tool=tool, cutting=cutting, passes=passes,
         slope_along_cut=_slope_along_cut(face), slope_at_axis=math.hypot(z_x, z_y),
     )  # fmt: skip
+
+
+def flat_places(face: MachinedFace, wanted: Cutting) -> float:
+    """Return the number of places at which the spiral of a plane with the outline and net of a face begins."""
+    cutting, r = wanted.completed(LATHE), math.hypot(*face.outline.farthest)
+    cusp = cusps.for_passes(*cutting.finish)
+    return (
+        math.pi
+        * r
+        * r
+        / (cusps.flat_pitch(cutting.radius, cusp, cutting.pitch, cusps.SPIRAL_PITCHES) * face.net.detail / 2)
+    )
 
 
 def nose_height(tool: RoundTool, turn: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -1,8 +1,6 @@
 """The cavity of a mould: its nets and its volume are the part's, multiplied by the factors of the shrinkage."""
 
 import math
-from pathlib import Path
-from types import SimpleNamespace
 
 import cadquery as cq
 import numpy as np
@@ -11,14 +9,12 @@ import torch
 from OCP.BRep import BRep_Tool
 from OCP.Geom import Geom_BSplineSurface
 
-from bstcad import commands
 from bstcad.cad import cavity, mounting
 from bstcad.cad.solid import named_solid
 from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.lens import Lens
 from bstcad.optics.outlines import Circle
 from bstcad.optics.surfaces import Sphere
-from bstcad.report.exports import Exported
 from bstcad.scene.moulding import Moulding
 from bstcad.scene.mount import Mount, Part
 from tests.cad.test_dome import dome
@@ -89,18 +85,3 @@ def test_a_length_of_the_cavity_is_the_stated_one():
     for moulding, width in ((UNIFORM, 8 / 0.995), (Moulding(shrinkage=0.005, relative_to="part"), 8 * 1.005)):
         box = cavity.cavity(lens(), moulding)[0].solid.BoundingBox(1e-4)
         assert box.xlen == pytest.approx(width, abs=1e-5) and box.ylen == pytest.approx(width, abs=1e-5)
-
-
-def test_a_design_whose_cavity_cannot_be_built_says_so_in_a_note(monkeypatch):
-    """The other files of output.export are written."""
-
-    def export(made, kinds, folder):
-        if "cavity" in kinds:
-            raise ValueError("mount: the flange does not fit")
-        return Exported([folder / kind for kind in kinds], [])
-
-    monkeypatch.setattr(commands, "_export", export)
-    made = SimpleNamespace(scene=SimpleNamespace(output=SimpleNamespace(export=("sag", "cavity"))))
-    written = commands._export_of_scene(made, Path("out"))
-    assert written.paths == [Path("out/sag")]
-    assert written.notes == ["cavity.step is not written: mount: the flange does not fit"]

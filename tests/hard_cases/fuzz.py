@@ -62,7 +62,7 @@ def changed(random: Random, good: Good, changes: tuple[str, ...] = CHANGES, most
     tokens = list(good.tokens)
     for _ in range(random.randint(1, most)):
         change = random.choice(changes)
-        groups = good.numbers if change in ("number", "digit") else good.groups
+        groups = (good.numbers if change in ("number", "digit") else ()) or good.groups
         group = random.choices(groups, [len(g) for g in groups])[0] if change == "digit" else random.choice(groups)
         place = random.choice(group)
         if change == "exchange":  # a flag is turned, a reference leads elsewhere

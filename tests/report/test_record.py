@@ -81,6 +81,66 @@ def test_a_report_with_an_entry_that_does_not_fit_is_refused_in_one_sentence(tmp
     assert record.making(path) == DesignCourse()
 
 
+def _with(key, text):
+    """A report as JSON with this text as the value of a key."""
+    return json.dumps(TOLD["report"] | {key: "@"}).replace('"@"', text)
+
+
+DIGITS = "9" * 1_000_000
+FOREIGN = {  # texts of JSON that are no report
+    "nesting of lists": "[" * 100_000 + "]" * 100_000,
+    "nesting of dicts": '{"a":' * 100_000 + "1" + "}" * 100_000,
+    "nesting below a key": _with("prescription", "[" * 3000 + "]" * 3000),
+    **{
+        f"{number} of {key}": _with(key, number)
+        for number in ("NaN", "-Infinity", "1e999")
+        for key in ("rrmsd", "seed")
+    },
+    **{
+        f"{number} of any value": _with("prescription", f'{{"a": [{number}]}}')
+        for number in ("NaN", "Infinity", "1e999")
+    },
+    "digits of an integer": _with("seed", DIGITS),
+    "digits of a float": _with("rrmsd", DIGITS),
+    "digits of any value": _with("prescription", f'{{"a": {DIGITS}}}'),
+    "digits of a place of an earlier version": _with("goals", f'[{{"z": {"9" * 400}}}]'),
+    "a key of a million characters": _with("rrmsd", f'0, "{"x" * 1_000_000}": 1'),
+    "a key that steers a terminal": _with("rrmsd", '0, "\\u001b[2J\\u202e": 1'),
+    "half of a character": _with("name", '"\\ud800"'),
+    "a byte-order mark": b"\xef\xbb\xbf{}",
+    "no UTF-8": b'{"name": "\xff"}',
+    "nothing": "",
+    **{
+        kind: text
+        for kind, text in {"list": "[1]", "number": "3", "null": "null", "text": '"x"', "flag": "true"}.items()
+    },
+}
+
+
+@pytest.mark.parametrize("kind", [Contents, tolerances.Tolerances], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("what", FOREIGN)
+def test_foreign_json_is_refused_in_one_sentence(what, kind):
+    with pytest.raises(ValueError) as refused:
+        of_json(FOREIGN[what], kind)
+    assert type(refused.value) is ValueError and str(refused.value).isprintable() and len(str(refused.value)) <= 600
+
+
+@pytest.mark.parametrize("value", [None, 1, -1e308, "x", True, [], {}, [[]], {"a": [1]}], ids=str)
+@pytest.mark.parametrize("key", TOLD["report"])
+def test_a_value_of_another_type_is_read_and_written_again_or_refused_in_one_sentence(tmp_path, key, value):
+    try:
+        found = of_json(json.dumps(TOLD["report"] | {key: value}))
+    except ValueError as error:
+        assert type(error) is ValueError and str(error).isprintable() and len(str(error)) <= 600
+    else:
+        record.write_json(found, tmp_path / "report.json")
+        assert record.read(tmp_path / "report.json") == found
+
+
+def test_the_last_of_several_equal_keys_counts():
+    assert of_json(_with("rrmsd", '0.5, "rrmsd": 0.25')).rrmsd == 0.25
+
+
 def test_a_missing_key_is_named():
     for key in KEYS:
         with pytest.raises(ValueError, match=f"^{key}: Field required"):

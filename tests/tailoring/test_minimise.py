@@ -134,6 +134,15 @@ def test_lbfgs_says_why_it_ended():
     assert by_lbfgs(flat, ORIGIN, 200).reason == "plateau"
 
 
+@pytest.mark.parametrize("gradient", [0.0, math.nan])
+def test_a_state_from_which_no_step_leads_down_ends_the_run(gradient):
+    """The best evaluation so far stays the result."""
+    state = of_lbfgs.LbfgsState(torch.ones(2).double(), 1.0, torch.full((2,), gradient).double())
+    best = Best(1.0, parameters=(torch.ones(2),), evaluations=3)
+    [end] = minimise(None, lbfgs([torch.ones(2)], 10, state), 10, best)
+    assert (end.best, end.parameters, end.reason) == (best, None, "plateau")
+
+
 def test_adam_finds_the_bottom_of_a_bowl():
     last = ended(bowl, adam([ORIGIN], [0.05], 400), 400)
     torch.testing.assert_close(last.best.parameters[0], MINIMUM, rtol=0, atol=1e-2)
