@@ -141,6 +141,11 @@ class Alignment:
         return len(self.outliers) / (len(self.outliers) + len(self.points))
 
     @property
+    def turns_freely(self) -> bool:
+        """True if the points do not determine the rotation about the axis."""
+        return MOTION_NAMES[-1] in self.undetermined
+
+    @property
     def rms(self) -> float:
         """RMS of the distances (mm)."""
         return root_mean_square(self.distances)
@@ -208,13 +213,6 @@ def gauss_newton_step(
     determined = sensitivity2 > max(MIN_SENSITIVITY, by_form) ** 2
     motions = directions[:, determined]
     return -motions @ ((motions.T @ (weighted.T @ distances)) / sensitivity2[determined]), motions
-
-
-def precision(face: BackFace, alignment: Alignment) -> np.ndarray:
-    """Return the precision (k, k), 1/mm², of the alignment's motions with the residuals as form errors of low order."""
-    columns = face.columns(alignment.points, alignment.normals) @ alignment.motions
-    variance = max(alignment.rms, MIN_POINT_NOISE) ** 2 / LOW_ORDER_FORMS
-    return columns.T @ columns / (len(columns) * variance)
 
 
 def _face_points(face: BackFace, cloud: np.ndarray, pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -294,6 +292,43 @@ def _neighbour_planes(
     off = distances[part] - plane[:, 0, 0]  # height of the plane at the point itself
     similar = np.abs(left - off[:, None]) < np.abs(off)[:, None] / 2
     return off, MAD_TO_SIGMA * np.median(np.abs(left), axis=1), similar.sum(axis=1)
+
+
+# --- poses that fit equally well --------------------------------------------------------------------------------------
+
+MAX_FOLD = 12  # largest number of equal turns about the axis that are sought
+EQUAL_SIGMAS = 3.0  # excess of a turned pose's mean square distance, in its standard deviations, that tells the poses
+MAX_TURNED_OUT = 0.02  # fraction of points outside the outline after a turn, above which the outline tells the pose
+TURN_SAMPLE = 5000  # maximum number of points by which turned poses are compared
+
+
+def turn_about_axis(face: BackFace, angle: float) -> np.ndarray:
+    """Return the motion (6,) that turns by an angle (degrees) about the axis; see Pose.compose."""
+    return np.array([0.0, 0.0, 0.0, 0.0, 0.0, face.reach * np.radians(angle)])
+
+
+def equal_turns(face: BackFace, alignment: Alignment) -> tuple[float, ...]:
+    """Return the angles (degrees, 0 excluded) about the axis at which the part fits as well: multiples of 360 / n.
+
+    A turned pose has the distances d', after the best small motion.  It fits as well if mean(d'²) - mean(d²) does not
+    exceed EQUAL_SIGMAS standard deviations 2 rms(d) rms(d' - d) / sqrt(N), N: number of independent form errors.
+    """
+    chosen = np.random.default_rng(0).permutation(len(alignment.points))[:TURN_SAMPLE]
+    points, distances, found = alignment.points[chosen], alignment.distances[chosen], []
+    rms, number = max(root_mean_square(distances), MIN_POINT_NOISE), min(len(points), INDEPENDENT_PATCHES)
+    for angle in sorted({360 * k / n for n in range(2, MAX_FOLD + 1) for k in range(1, n)}):
+        turned = identity_pose(face).compose(turn_about_axis(face, angle), face.reach).to_design(points)
+        inside = face.contains(turned)
+        if 1 - inside.mean() > MAX_TURNED_OUT:
+            continue
+        off, normals = face.distance(turned[inside])
+        columns = face.columns(turned[inside], normals) @ alignment.motions
+        off = off - columns @ np.linalg.lstsq(columns, off, rcond=None)[0]
+        change = root_mean_square(off - distances[inside])
+        excess = np.mean(off**2) - np.mean(distances[inside] ** 2)
+        if excess <= EQUAL_SIGMAS * 2 * rms * change / np.sqrt(number):
+            found.append(angle)
+    return tuple(found)
 
 
 # --- starting poses ---------------------------------------------------------------------------------------------------

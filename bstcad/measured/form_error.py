@@ -12,19 +12,30 @@ this pose therefore belongs to the posterior: it adds to the precision of a moti
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.fft
 import scipy.sparse
 import torch
+from scipy.linalg import hadamard
 from scipy.optimize import linprog
 from scipy.sparse.linalg import LinearOperator, cg
 from scipy.special import eval_jacobi
+from scipy.stats import norm
 
 from bstcad.analysis.shape import least_squares
-from bstcad.measured.alignment import Alignment, BackFace, Pose, precision, root_mean_square
+from bstcad.measured.alignment import (
+    INDEPENDENT_PATCHES,
+    LOW_ORDER_FORMS,
+    MIN_POINT_NOISE,
+    Alignment,
+    BackFace,
+    Pose,
+    root_mean_square,
+)  # fmt: skip
+from bstcad.measured.shrinkage import orders
 from bstcad.optics.bspline import BSplineSurface, basis_matrix, interpolating_net
 from bstcad.optics.lens import Lens
 from bstcad.optics.surfaces import sag, sampled
@@ -32,16 +43,20 @@ from bstcad.optics.surfaces import sag, sampled
 POLYNOMIAL_DEGREE = 2  # degree of the polynomial in x and y
 NET_MARGIN = 0.2  # margin (at each end) of the field's net / side of the lens's net; there cosines end with zero slope
 POINTS_PER_NET_CELL = 6.0  # mean number of measured points in a cell of the field's net
-FIELD_NET_LIMITS = (9, 513)  # limits of the field's control points per side, before they are rounded up for the FFT
+FIELD_NET_LIMITS = (15, 513)  # limits of the field's control points per side, before they are rounded up for the FFT
 MAX_REFINEMENT = 4  # refinement per side of a lens's net to which a finer field is added: the two nets are not nested
 BANDS_PER_OCTAVE = 4  # number of bands of the spectrum per octave of frequency
 SPECTRUM_ROUNDS = 8  # number of alternating estimates of field and spectrum
 FIRST_MOTION_ROUND = 3  # round, from 0, in which the motion is fitted; the spectrum is then good enough to weight it
-MOTION_SAFETY = 1.5  # factor on the uncertainty of the motion, as its weights are estimated from the same points
+MOTION_SAFETY = 2.0  # factor on the uncertainty of the motion, as its weights are estimated from the same points
 MAX_FIELD_STEPS, FIELD_TOLERANCE = 30, 1e-4  # maximum steps of conjugate gradients, and their relative tolerance
 DETECTION_SIGMAS = 3.0  # excess over noise, in standard deviations, at which a band of frequencies contains form
 UNDETECTED_VARIANCE = 1e-4  # variance of the form / variance of the noise, in a band without detected form
 MAX_RELIEF_UNCERTAINTY = 0.001  # uncertainty of a motion fitted to fine relief / BackFace.reach, above which it is zero
+SMOOTH_EXPONENT = (
+    3.0  # least exponent by which the variance of undetected form falls with the frequency: polished faces
+)
+SAMPLES = 8  # number of posterior_samples, a Hadamard matrix's order; more than the six motions
 EXTRAPOLATION_BANDS = 6  # number of bands from which the spectrum is extrapolated below the noise
 MIN_NOISE_RATIO = 1e-3  # lower bound of the noise relative to the RMS deviation
 SAMPLING_STRIPS = 32  # number of strips in which a net is sampled, which bounds the memory
@@ -87,13 +102,24 @@ class FormError:
         values = np.concatenate([self.at(x.ravel(), y.ravel()).reshape(x.shape) for x, y in strips])
         return replace(finer, heights=finer.heights + torch.from_numpy(interpolating_net(values)))
 
-    def posterior_sample(self, random: np.random.Generator, sign: float = 1.0) -> FormError:
+    def posterior_samples(self, random: np.random.Generator) -> Iterator[FormError]:
+        """Yield SAMPLES samples of the posterior whose displacements have orthogonal directions.
+
+        The mean square of a linear figure's changes is then the sum over the squares of those by each displacement.
+        """
+        count = self.displaced.motion.shape[1]
+        yield from (self.posterior_sample(random, signs=row[1 : count + 1]) for row in hadamard(SAMPLES))
+
+    def posterior_sample(
+        self, random: np.random.Generator, sign: float = 1.0, signs: np.ndarray | None = None
+    ) -> FormError:
         """Return a sample of the posterior; sign: ±1, factor of its difference from the mean.
 
-        Each displacement has its standard deviation and a random direction, so that a sample never hides one.
+        Each displacement has its standard deviation, so that a sample never hides one.  signs (k,): directions ±1 of
+        the displacements; None: random.
         """
         field_change = scipy.fft.idctn(random.normal(size=self.spread.shape) * self.spread, norm="ortho")
-        signs = random.choice((-1.0, 1.0), self.displaced.motion.shape[1])
+        signs = random.choice((-1.0, 1.0), self.displaced.motion.shape[1]) if signs is None else signs
         change = sign * (field_change + (self.displaced.heights @ signs).reshape(field_change.shape))
         return replace(
             self,
@@ -133,6 +159,21 @@ def fit_form_error(face: BackFace, alignment: Alignment) -> FormError:
     return FormError(
         face, polynomial, random_field, spread, noise=noise, motion=alignment.motions @ motion, displaced=displaced
     )
+
+
+def precision(face: BackFace, alignment: Alignment) -> np.ndarray:
+    """Return the precision (k, k), 1/mm², of the alignment's motions: Bᵀ B / (n v), B: their columns.
+
+    v = v_low / LOW_ORDER_FORMS + v_rest / INDEPENDENT_PATCHES.  v_low is the mean square (mm²) of the distances' low
+    orders without noise: form errors that may resemble a motion.  v_rest is that of the rest, mostly noise.
+    """
+    columns, n = face.columns(alignment.points, alignment.normals) @ alignment.motions, len(alignment.points)
+    basis, _ = np.linalg.qr(orders(alignment.points))
+    inside = basis.T @ alignment.distances
+    rest = (n * alignment.rms**2 - inside @ inside) / (n - len(inside))
+    low = max(inside @ inside - len(inside) * rest, 0.0) / n
+    variance = low / LOW_ORDER_FORMS + rest / min(n, INDEPENDENT_PATCHES)
+    return columns.T @ columns / (n * max(variance, MIN_POINT_NOISE**2))
 
 
 def frequencies(net: BSplineSurface) -> np.ndarray:
@@ -198,9 +239,9 @@ def _field(
         energies = energy if energies is None else (energies + energy) / 2
         free = max(n - float((1 / shrunk).sum()), 0.05 * n)
         noise2 = float(np.sqrt(noise2 * max(float(residual @ residual) / free, min_variance)))
-        variance = _variances(energies, modes, level * noise2)[band]
+        variance, possible = (of(energies, modes, level * noise2)[band] for of in (_variances, _possible_variances))
     amplitude = posterior(off - motions @ motion, amplitude)
-    spread = 1 / (per_mode / noise2 + 1 / variance)
+    spread = 1 / (per_mode / noise2 + 1 / possible)
     size, directions = np.linalg.eigh(total)
     displacements = MOTION_SAFETY * directions / np.sqrt(size)
     changes = displacements, -explained(motions @ displacements)
@@ -224,6 +265,24 @@ def _variances(energy: np.ndarray, modes: np.ndarray, noise: np.ndarray) -> np.n
         trend = np.exp(np.minimum(slope, 0.0) * (np.flatnonzero(higher) - last.mean()) + np.log(variance[last]).mean())
         variance[higher] = np.clip(trend, UNDETECTED_VARIANCE * noise[higher], (least * noise)[higher])
     return variance
+
+
+def _possible_variances(energy: np.ndarray, modes: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return the variance (mm²) that the form may have in each band, for samples; arguments as in _variances.
+
+    Where fewer than EXTRAPOLATION_BANDS bands are detected, an undetected one may have the mean of a normal
+    distribution of the excess energy, truncated at zero.  Beyond the last detected band the spectrum falls.
+    """
+    variance, deviation = _variances(energy, modes, noise), np.sqrt(2 / modes)
+    detected = np.flatnonzero(energy > 1 + DETECTION_SIGMAS * deviation)
+    if len(detected) >= EXTRAPOLATION_BANDS:
+        return variance
+    excess = (energy - 1) / deviation
+    possible = noise * deviation * (excess + np.exp(norm.logpdf(excess) - norm.logcdf(excess)))
+    possible[detected] = variance[detected]
+    last = detected[-1] if len(detected) else 0
+    octaves = np.maximum(np.arange(len(energy)) - last, 0) / BANDS_PER_OCTAVE
+    return np.maximum(np.minimum(possible, possible[last] * 2.0 ** (-SMOOTH_EXPONENT * octaves)), variance)
 
 
 def _heights(amplitude: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from bstcad.analysis import shape
 from bstcad.measured import alignment as aligning
-from bstcad.measured.alignment import Alignment, BackFace, Pose
+from bstcad.measured.alignment import Alignment, BackFace, Pose, equal_turns, turn_about_axis
 from bstcad.measured.cloud import Cloud
 from bstcad.measured.form_error import Deviation, FormError, deviation, fit_form_error, minimum_zone
 from bstcad.measured.shrinkage import AxisScales, axis_scales, orders, scale
@@ -30,7 +30,35 @@ SCALE_SIGMAS = 3.0  # tolerance of the scale, in standard uncertainties, if larg
 MIN_MEASURED_FRACTION = 0.8  # minimum measured fraction of the face; elsewhere the form is extrapolated
 COVERAGE_POINTS = 20  # mean number of points in a cell of the grid from which the coverage is counted
 RELIEF_POINTS = 20_000  # maximum number of points from which the fine relief is estimated
+SAMPLE_ACCURACY = 2.0  # accuracy of the light of a sample of the form, relative to that of the light of the part
+MAX_TURNED = 3  # maximum number of turned poses whose light is predicted
 MAX_OUTLIER_FRACTION = 0.1  # fraction of outliers near the face above which face and outliers are indistinguishable
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Predicted light of a made part on a target."""
+
+    light: Light  # light of the lens with the fitted form
+    high: float  # RRMSD with the uncertainty of the form: quadratic mean over samples, at least that of `light`
+    uncertainty: float  # standard uncertainty of the RRMSD: RMS difference of the samples', with pose and form
+    turned: tuple[float, ...] = ()  # RRMSDs in other poses that fit as well
+
+    def facts(self) -> dict[str, Any]:
+        """Return the entries of report.json; None if no light falls on the target."""
+        figures = {"rrmsd_predicted": self.light.rrmsd, "rrmsd_high": self.high, "rrmsd_uncertainty": self.uncertainty}
+        finite = {key: value if math.isfinite(value) else None for key, value in figures.items()}
+        return finite | {"rrmsd_turned": [value for value in self.turned if math.isfinite(value)]}
+
+    @property
+    def orientation(self) -> str:
+        """Sentence on the light in all poses that fit as well; "" if there is one pose, or no light."""
+        every = [value for value in (self.light.rrmsd, *self.turned) if math.isfinite(value)]
+        if len(every) < 2:
+            return ""
+        if max(every) - min(every) <= 2 * math.sqrt(2) * self.uncertainty:  # of a difference of two figures
+            return f"the RRMSD is the same there within its uncertainty, {min(every):.3g} to {max(every):.3g}"
+        return f"the RRMSD depends on it, {min(every):.3g} to {max(every):.3g}: mark the orientation and measure again"
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +84,10 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     form = fit_form_error(face, alignment)
     figures = deviation(lens, alignment, form)
     cheap = replace(nominal.effort(effort), witness=False)
-    lights = [_light(lens, form, nominal, goal, effort=cheap) for goal in nominal.goals]
+    angles = equal_turns(face, alignment)
+    chosen = angles[:: max(1, math.ceil(len(angles) / MAX_TURNED))]
+    turned = [_turned_form(face, alignment, angle) for angle in chosen]
+    lights = [_light(lens, form, nominal, goal, effort=cheap, turned=turned) for goal in nominal.goals]
     (size, _), axes = scale(face, alignment), axis_scales(face, alignment)
     checks = (
         *of_cloud,
@@ -70,10 +101,13 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
         "moulding_shrinkage": _moulding_shrinkage(nominal, size, axes),
         "passed": all(check.passed for check in checks),
     }
-    predicted = [_predicted(light, high) for light, high in lights]
-    facts |= predicted[worst(each["rrmsd_predicted"] for each in predicted)]
+    predicted = [each.facts() for each in lights]
+    heaviest = worst(each["rrmsd_predicted"] for each in predicted)
+    facts |= predicted[heaviest]
+    facts["alignment"]["equal_turns"] = list(angles)
+    facts["orientation"] = _orientation(alignment, angles, lights[heaviest])
     facts["goals"] = [{"key": goal.key} | of for goal, of in zip(nominal.goals, predicted, strict=True)]
-    irradiances = tuple(light.picture for light, _ in lights)
+    irradiances = tuple(each.light.picture for each in lights)
     return MadePart(checks, facts, figures, irradiances=irradiances, outliers=alignment.outliers)
 
 
@@ -115,19 +149,14 @@ def _cloud_checks(
     yield Check.at_most(name, math.hypot(x, y), decentre, "mm", where=where, id="made-decentre")
 
 
-def _light_checks(nominal: Nominal, lights: Sequence[tuple[Light, float]]) -> Iterator[Check]:
-    """Check the RRMSD on each target; lights: light on it, and RRMSD with the uncertainty of the form."""
-    for goal, (light, high) in zip(nominal.goals, lights, strict=True):
-        name = f"made part: RRMSD predicted{goal.suffix}"
-        yield Check.at_most(name, light.rrmsd, nominal.scene.accept.rrmsd, id="made-rrmsd")
+def _light_checks(nominal: Nominal, lights: Sequence[Prediction]) -> Iterator[Check]:
+    """Check the RRMSD on each target: the largest of all poses that fit equally well."""
+    for goal, each in zip(nominal.goals, lights, strict=True):
+        name, high = f"made part: RRMSD predicted{goal.suffix}", each.high
+        where, rrmsd = f"standard uncertainty {each.uncertainty:.2g}", max(each.light.rrmsd, *each.turned, -math.inf)
+        yield Check.at_most(name, rrmsd, nominal.scene.accept.rrmsd, where=where, id="made-rrmsd")
         name = f"made part: RRMSD predicted, with the uncertainty of the form{goal.suffix}"
         yield Check.at_most(name, high, None, id="made-rrmsd-high")
-
-
-def _predicted(light: Light, high: float) -> dict[str, float | None]:
-    """Return the RRMSD without and with the uncertainty of the form; None if no light falls on the target."""
-    figures = {"rrmsd_predicted": light.rrmsd, "rrmsd_high": high}
-    return {key: value if math.isfinite(value) else None for key, value in figures.items()}
 
 
 def _wavefront(lens: Lens, nominal: Nominal) -> Iterator[Check]:
@@ -199,16 +228,42 @@ def _coverage(lens: Lens, points: np.ndarray) -> float:
     return float(measured[lens.outline.depth(*middles) >= 0].mean())
 
 
-def _light(lens: Lens, form: FormError, nominal: Nominal, goal: Goal, *, effort: Effort) -> tuple[Light, float]:
-    """Return the light of the lens with the form error, and the RRMSD with the uncertainty of the form added."""
+def _light(
+    lens: Lens, form: FormError, nominal: Nominal, goal: Goal, *, effort: Effort, turned: Sequence[FormError] = ()
+) -> Prediction:
+    """Return the light of the lens with the form error, with its uncertainty.
 
-    def light_with(form: FormError) -> Light:
+    The uncertainty is the RMS difference of the RRMSDs of samples of the form: of its field, and of its pose along the
+    principal axes of the pose's covariance.  turned: form errors in other poses that fit equally well.
+    """
+
+    def light_with(form: FormError, effort: Effort) -> Light:
         return nominal.light(replace(lens, back=form.add_to(lens.back_net)), goal, effort)
 
-    light = light_with(form)
-    seed = nominal.scene.tailoring.seed
-    samples = (light_with(form.posterior_sample(np.random.default_rng(seed), sign)).rrmsd for sign in (1.0, -1.0))
-    return light, max(light.rrmsd, math.hypot(*samples) / math.sqrt(2))  # quadratic mean of two opposite samples
+    light, quick = light_with(form, effort), replace(effort, accuracy=SAMPLE_ACCURACY * effort.accuracy)
+    samples = form.posterior_samples(np.random.default_rng(nominal.scene.tailoring.seed))
+    rrmsds = np.array([light_with(sample, quick).rrmsd for sample in samples])
+    others = tuple(light_with(each, quick).rrmsd for each in turned)
+    high = max(light.rrmsd, aligning.root_mean_square(rrmsds))
+    return Prediction(light, high, aligning.root_mean_square(rrmsds - light.rrmsd), turned=others)
+
+
+def _turned_form(face: BackFace, alignment: Alignment, angle: float) -> FormError:
+    """Return the form error in the pose that is turned about the axis by an angle (degrees)."""
+    start = aligning.identity_pose(face).compose(turn_about_axis(face, angle), face.reach)
+    return fit_form_error(face, aligning.align(face, alignment.points, start))
+
+
+def _orientation(alignment: Alignment, angles: Sequence[float], predicted: Prediction) -> str:
+    """Return a sentence on poses that fit equally well, and the light in them; "" if there are none."""
+    if alignment.turns_freely or len(angles) >= aligning.MAX_FOLD:
+        found = "The form of the face does not determine the rotation about its axis: all rotations fit equally well"
+    elif angles:
+        listed = ", ".join(f"{angle:.3g}" for angle in angles)
+        found = f"{len(angles) + 1} poses fit equally well: the part may be turned about its axis by {listed} degrees"
+    else:
+        return ""
+    return f"{'; '.join(filter(None, (found, predicted.orientation)))}."
 
 
 def _moulding_shrinkage(nominal: Nominal, scale: float, axes: AxisScales) -> list[float] | None:

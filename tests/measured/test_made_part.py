@@ -16,6 +16,7 @@ from bstcad.commands import ProofOptions
 from bstcad.measured import cloud as clouds
 from bstcad.measured import made_part
 from bstcad.measured.alignment import BackFace, align, first_pose
+from bstcad.measured.made_part import Prediction
 from bstcad.measured.shrinkage import axis_scales
 from bstcad.optics.lens import Lens
 from bstcad.optics.measure import measure
@@ -44,7 +45,7 @@ def light(nominal):
 @pytest.fixture
 def same_light(monkeypatch, light):
     """Whatever is wrong with a part, its light is the design's: for tests of its form."""
-    monkeypatch.setattr(made_part, "_light", lambda *given, **more: (light, light.rrmsd))
+    monkeypatch.setattr(made_part, "_light", lambda *given, **more: Prediction(light, light.rrmsd, 0.0))
 
 
 def judged(found, nominal, unit="mm"):
@@ -255,3 +256,29 @@ def test_a_turned_part_is_aligned_by_its_relief(degrees):
     found, checks_of_cloud = made_part.aligned(given, face, None)
     assert all(check.passed for check in checks_of_cloud) and found.rms < 3e-5
     assert abs(found.pose.angles[2]) == pytest.approx(degrees, abs=0.05)
+
+
+def test_equal_poses_are_stated_in_terminal_and_report(small_design, nominal, tmp_path, quick, capsys, monkeypatch):
+    """Two poses that fit equally well are stated in one sentence, which is absent where there is one pose."""
+    folder = shutil.copytree(small_design.folder, tmp_path / "design")
+    monkeypatch.setattr(made_part, "equal_turns", lambda *given: ())
+    given = saved(tmp_path / "cloud.csv", as_designed(nominal.lens))
+    assert cli.run(["verify", str(folder), "--measured", str(given)]) == 0
+    assert "Orientation" not in capsys.readouterr().out
+    monkeypatch.setattr(made_part, "equal_turns", lambda *given: (180.0,))
+    again = saved(tmp_path / "again.csv", as_designed(nominal.lens)[:-1])
+    assert cli.run(["verify", str(folder), "--measured", str(again)]) == 0
+    words = "2 poses fit equally well: the part may be turned about its axis by 180 degrees."
+    written = json.loads((folder / "report.json").read_text())["measured"]
+    assert "Orientation" in capsys.readouterr().out and written["orientation"] == words
+    assert written["alignment"]["equal_turns"] == [180.0] and words in (folder / "report.html").read_text()
+
+
+def test_the_largest_rrmsd_of_equal_poses_is_judged(nominal, light):
+    """The lens of the disc is the same upside down, but for a tilt, and so is its light, within 15 % of noise."""
+    part = judged(as_designed(nominal.lens), nominal)
+    [turned] = part.facts["rrmsd_turned"]
+    assert part.facts["alignment"]["equal_turns"] == [180.0] and turned == pytest.approx(light.rrmsd, rel=0.15)
+    assert "the RRMSD is the same there within its uncertainty" in part.facts["orientation"]
+    [check, _] = made_part._light_checks(nominal, [Prediction(light, light.rrmsd, 0.001, turned=(0.3, 0.2))])
+    assert check.value == 0.3 and check.where == "standard uncertainty 0.001" and not check.passed
