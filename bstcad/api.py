@@ -26,12 +26,14 @@ from bstcad import commands, pipeline
 from bstcad import folder as folders
 from bstcad.commands import OwnCheck, OwnSection, ProofOptions
 from bstcad.folder import Made, same_front
-from bstcad.measured.compensation import Settings as CompensationSettings
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, tubes_picture
-from bstcad.optics.sides import as_pair, simplified, size_text
-from bstcad.optics.surfaces import Surface
+from bstcad.manufacture.measured.compensation import Settings as CompensationSettings
+from bstcad.manufacture.shop.as_built import AsBuilt
+from bstcad.manufacture.shop.rounds import Compensated
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.sides import as_pair, simplified, size_text
+from bstcad.optics.surfaces.surfaces import Surface
+from bstcad.optics.trace.measure import Effort, tubes_picture
 from bstcad.report import record
 from bstcad.report.drawing import png
 from bstcad.report.light_figures import View, irradiance_triptych
@@ -42,15 +44,13 @@ from bstcad.runs import progress as progresses
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import MIN_ROUND_POINTS
 from bstcad.scene.scene import Scene, load
-from bstcad.shop.as_built import AsBuilt
-from bstcad.shop.rounds import Compensated
 from bstcad.tailoring.merit import PictureError
 from bstcad.tailoring.run import Hooks
 from bstcad.transport.mapping import TransportMap
 
 if TYPE_CHECKING:
-    from bstcad.tolerance.as_made import AsMade
-    from bstcad.tolerance.lit_by import LitBy
+    from bstcad.manufacture.tolerance.as_made import AsMade
+    from bstcad.manufacture.tolerance.lit_by import LitBy
 
 RELATIVE_TOLERANCE = 1e-9  # largest ignored difference of indices (relative) and of the ends of nets (in net widths)
 PREVIEW_TUBES = 521  # flux tubes per side of the light, for the picture of a design that is not verified yet
@@ -288,7 +288,8 @@ class Design:
         measured: file of points of a made part (CSV, PLY or STL; mm), which is also verified, see Report.measured.
         folder: folder for report, figures and deviation map of the made part; the design's folder is not changed.
         against: independent programs that also trace the design, "batoid" and "mitsuba", or your own judge
-        (bstcad.judges.comparison.OwnJudge).  measured, folder and against need a written design.  Others: see `write`.
+        (bstcad.verify.judges.comparison.OwnJudge).  measured, folder and against need a written design.  Others: see
+        `write`.
         """
         options = ProofOptions(effort, checks=checks, sections=sections)
         cloud, place = (Path(path).expanduser() if path else None for path in (measured, folder))
@@ -316,7 +317,7 @@ class Design:
         workers: number of processes for the traces (a script then needs `if __name__ == "__main__":`); scheduler:
         address of a dask scheduler instead.
         """
-        from bstcad.tolerance.study import StudySettings  # loaded late, as in commands.tolerance
+        from bstcad.manufacture.tolerance.study import StudySettings  # loaded late, as in commands.tolerance
 
         folder = self._own_folder()
         with progresses.for_script(progress) as shown:
@@ -362,7 +363,7 @@ class Design:
         None: that of the grade.  The result has `goals` with the pictures `designed` and `made`, their `rrmsds` and
         `contrasts`, and the `changes` by each effect; `facts()` returns its figures as a dictionary.
         """
-        from bstcad.tolerance.as_made import as_made  # loaded late, as in commands.tolerance
+        from bstcad.manufacture.tolerance.as_made import as_made  # loaded late, as in commands.tolerance
 
         made = self._made
         return as_made(made.scene, made.lens, made.goals, grade=grade, layer_height=layer_height)
@@ -373,7 +374,7 @@ class Design:
         distance: from the light to the lens (mm); None: five widths of the lens for a lamp, one for an LED, 500 mm for
         a phone.  The result has `goals` with the pictures `designed` and `lit`, and their `rrmsds`.
         """
-        from bstcad.tolerance.lit_by import lit_by  # loaded late, as in commands.tolerance
+        from bstcad.manufacture.tolerance.lit_by import lit_by  # loaded late, as in commands.tolerance
 
         return lit_by(self._made.scene, self._made.lens, self._made.goals, name=light, distance=distance)
 

@@ -101,9 +101,9 @@ with signals.exit_on_signal():  # loading these libraries takes a quarter of a s
     from bstcad.step_text import beginning
 
 if TYPE_CHECKING:
+    from bstcad.planning.batch import BatchScene
     from bstcad.report.record import Contents, Examined
     from bstcad.scene.scene import Scene
-    from bstcad.sweep.batch import BatchScene
 
 START_TIME = time.perf_counter()  # start of the times in reports, which include the loading of the large libraries
 INTERRUPTED, INTERNAL_ERROR = 130, 70  # exit codes after Ctrl-C and after a fault of bstcad
@@ -287,12 +287,12 @@ def plan(
         wanted = load_scene(scene, settings)
         from bstcad import commands
         from bstcad import folder as folders
+        from bstcad.planning.net_choice import with_net
+        from bstcad.planning.plan import plan as planned
+        from bstcad.planning.plan import reach_drawn
         from bstcad.report import report as reports
         from bstcad.scene.quality import GRADE_NAMES
         from bstcad.scene.target import numbered
-        from bstcad.sweep.net_choice import with_net
-        from bstcad.sweep.plan import plan as planned
-        from bstcad.sweep.plan import reach_drawn
 
     if made is not None and made not in GRADE_NAMES:
         raise SceneError(f"--made {made}: unknown grade; give one of {', '.join(GRADE_NAMES)}")
@@ -394,7 +394,7 @@ def compensate(
     folder: Folder, measured: Clouds, gain: Gain = None, cutoff: Cutoff = None, by: By = "form"
 ) -> int:  # fmt: skip
     """Write the back to cut next, from measured points of the parts that were cut last."""
-    from bstcad.measured.compensation import Settings as CompensationSettings
+    from bstcad.manufacture.measured.compensation import Settings as CompensationSettings
 
     processes.begin()
     commands = load_commands()
@@ -412,7 +412,7 @@ def compensate(
 )
 def retailor(folder: Folder, blank: AsBuiltBlank, output: Output = None, verbose: Verbose = False) -> int:
     """Tailor the back anew to a blank as it was built."""
-    from bstcad.shop.as_built import AsBuilt
+    from bstcad.manufacture.shop.as_built import AsBuilt
 
     built = AsBuilt.parse(",".join(blank))
     processes.begin()
@@ -432,9 +432,9 @@ def tolerance(
     if wanted is not None and not 0 < wanted < 100:
         raise SceneError(f"--yield {wanted:g}: is not between 0 and 100; give the percentage of lenses that must pass")
     commands = load_commands()
+    from bstcad.manufacture.tolerance import tolerancing
+    from bstcad.manufacture.tolerance.study import StudySettings
     from bstcad.report.tolerances import summary
-    from bstcad.tolerance import tolerancing
-    from bstcad.tolerance.study import StudySettings
 
     settings = StudySettings(grade, None if wanted is None else wanted / 100, seed)
     if trial is not None:
@@ -508,9 +508,9 @@ def tradeoff(
         raise SceneError(f"--budget {budget:g}: is not between 0 and 1e7; give the seconds for all runs, such as 600")
     with loading():
         wanted = load_scene(scene, settings, quality)
+        from bstcad.planning import results
+        from bstcad.planning import tradeoff as sweeping
         from bstcad.runs import cluster
-        from bstcad.sweep import results
-        from bstcad.sweep import tradeoff as sweeping
 
     warn(wanted)
     folder = output or user_path(Path("outputs") / f"{wanted.name}-tradeoff")
@@ -530,8 +530,8 @@ def batch(
     if folder.exists() and not folder.is_dir():
         raise SceneError(f"{folder}: is a file; give another folder with -o")
     with loading():
+        from bstcad.planning import batch as batches
         from bstcad.runs import cluster
-        from bstcad.sweep import batch as batches
 
         cluster.check(scheduler, workers)
         changes = overrides(settings, quality)
@@ -557,8 +557,8 @@ def scene_paths(patterns: list[str]) -> list[Path]:
 
 
 def _load_or_refuse(path: Path, changes: dict[str, Any]) -> BatchScene:
+    from bstcad.planning.batch import BatchScene
     from bstcad.scene.scene import load
-    from bstcad.sweep.batch import BatchScene
 
     try:
         scene = load(path, changes)

@@ -27,17 +27,20 @@ import bstcad
 from bstcad import folder as folders
 from bstcad.cad.tiling import Tiling
 from bstcad.folder import Made
-from bstcad.judges import comparison
-from bstcad.judges.comparison import Comparison
-from bstcad.measured import cloud as clouds
-from bstcad.measured import made_part
-from bstcad.measured.cloud import Cloud
-from bstcad.measured.compensation import USUAL
-from bstcad.measured.compensation import Settings as CompensationSettings
-from bstcad.measured.form_error import map_files
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import FULL, Effort, Light, SpectralLine
+from bstcad.manufacture.measured import cloud as clouds
+from bstcad.manufacture.measured import made_part
+from bstcad.manufacture.measured.cloud import Cloud
+from bstcad.manufacture.measured.compensation import USUAL
+from bstcad.manufacture.measured.compensation import Settings as CompensationSettings
+from bstcad.manufacture.measured.form_error import map_files
+from bstcad.manufacture.shop import as_built, rounds
+from bstcad.manufacture.shop.as_built import AsBuilt, Retailored
+from bstcad.manufacture.shop.rounds import Compensated
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.trace.measure import FULL, Effort, Light, SpectralLine
 from bstcad.pipeline import DesignState, design, purpose
+from bstcad.planning.estimates import diagnosis, left_out
+from bstcad.planning.net_choice import with_net
 from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
 from bstcad.report.data_sheet import DataSheet
 from bstcad.report.drawing import png as rendered
@@ -60,22 +63,19 @@ from bstcad.runs.files import MachineError, SceneError
 from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import numbered
-from bstcad.shop import as_built, rounds
-from bstcad.shop.as_built import AsBuilt, Retailored
-from bstcad.shop.rounds import Compensated
 from bstcad.step_text import beginning
-from bstcad.sweep.estimates import diagnosis, left_out
-from bstcad.sweep.net_choice import with_net
 from bstcad.tailoring.run import NO_HOOKS, Hooks, Progress, no_progress
 from bstcad.toolpath.cutting import CHOICES, DEFAULTS, Cutting
 from bstcad.verify import checks
 from bstcad.verify.checks import Proof
+from bstcad.verify.judges import comparison
+from bstcad.verify.judges.comparison import Comparison
 from bstcad.verify.verdict import Check, verdict
 
 if TYPE_CHECKING:
-    from bstcad.tolerance.as_made import AsMade
-    from bstcad.tolerance.lit_by import LitBy
-    from bstcad.tolerance.study import StudySettings
+    from bstcad.manufacture.tolerance.as_made import AsMade
+    from bstcad.manufacture.tolerance.lit_by import LitBy
+    from bstcad.manufacture.tolerance.study import StudySettings
 
 # Patterns of the names of the files of tiles.
 TILE_FILES = "tile-*-*.step", "toolpath-raster*tile-*-*.*", "heightmap-tile-*-*.*"
@@ -504,7 +504,7 @@ def tolerance(
     workers: number of processes for the traces (None: only this one).  scheduler: address of a dask scheduler, whose
     workers trace instead.
     """
-    from bstcad.tolerance import tolerancing  # loaded late, since the other commands do not need it
+    from bstcad.manufacture.tolerance import tolerancing  # loaded late, since the other commands do not need it
 
     if (wanted := settings.wanted) is not None and not 0 < wanted < 1:
         raise SceneError(f"wanted: {wanted:g} is not between 0 and 1; give the fraction of lenses that must pass")
@@ -535,7 +535,7 @@ def predict_lit_by(scene: Scene, light: str, distance: float | None = None, png:
     distance: from the light to the lens (mm); None: that of the light.  png: as for `predict_as_made`.
     """
     from bstcad.app.preview import REFINED, preview  # loaded late, as in predict_as_made
-    from bstcad.tolerance.lit_by import scene_lit_by
+    from bstcad.manufacture.tolerance.lit_by import scene_lit_by
 
     scene_lit_by(scene, light, distance)  # an unknown light is refused before the preview
     found = preview(scene, REFINED)

@@ -27,13 +27,13 @@ import numpy as np
 
 from bstcad.cad import mesh as meshes
 from bstcad.cad.mesh import MIRROR_RGBA, Label
-from bstcad.optics import quadrature
-from bstcad.optics.bspline import DEGREE, BSplineSurface, is_net, knots
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Light
-from bstcad.optics.radial import RadialSurface
-from bstcad.optics.sides import Sides, as_pair, scaled
-from bstcad.optics.surfaces import Surface
+from bstcad.optics.lens import quadrature
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface, is_net, knots
+from bstcad.optics.surfaces.radial import RadialSurface
+from bstcad.optics.surfaces.sides import Sides, as_pair, scaled
+from bstcad.optics.surfaces.surfaces import Surface
+from bstcad.optics.trace.measure import Light
 from bstcad.report.prescription import scene_text
 from bstcad.report.record import DesignCourse
 from bstcad.runs import files

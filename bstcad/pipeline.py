@@ -19,18 +19,18 @@ import torch
 import bstcad
 from bstcad.analysis.shape import thickness_range
 from bstcad.analysis.steepness import Steepness, needed_steepness
-from bstcad.baselines import integration, paper
 from bstcad.folder import Made
-from bstcad.optics.goal import Goal
-from bstcad.optics.lens import Lens
-from bstcad.optics.reach import MAX_EXIT_ANGLE, grazing_of, spread_at, unreached
-from bstcad.optics.sides import as_pair
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.surfaces.sides import as_pair
+from bstcad.optics.trace.reach import MAX_EXIT_ANGLE, grazing_of, spread_at, unreached
 from bstcad.report.record import CurvePoint, DesignCourse, PrecisionTest, StageRecord
 from bstcad.runs import processes
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import ResolvedTailoring
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2, two_faces
+from bstcad.tailoring.baselines import integration, paper
 from bstcad.tailoring.carried import carry_light
 from bstcad.tailoring.feasibility import find_demand, is_infeasible
 from bstcad.tailoring.grazing import without_reflection

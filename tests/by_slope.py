@@ -1,6 +1,6 @@
 """Intersection and refraction at height fields by their slopes, as textbooks write them, instead of by normals."""
 
-from bstcad.optics import interfaces
+from bstcad.optics.lens import interfaces
 
 
 def intersect(surface, rays, outline, missed):

@@ -153,7 +153,7 @@ def pixels_of_all(path, pixels):
 
 def quick_effort():
     """Return an effort of few points, with the tubes and rays that resolve the small design."""
-    from bstcad.optics.measure import Effort
+    from bstcad.optics.trace.measure import Effort
 
     return Effort(512, places=129, points=4096)
 

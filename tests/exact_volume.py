@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from scipy.interpolate import BSpline, NdBSpline
 
-from bstcad.optics.bspline import DEGREE, BSplineSurface, knots, parameter
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline
-from bstcad.optics.quadrature import gauss_rule, rim_breaks
-from bstcad.optics.surfaces import Surface, sag
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.quadrature import gauss_rule, rim_breaks
+from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface, knots, parameter
+from bstcad.optics.surfaces.outlines import Outline
+from bstcad.optics.surfaces.surfaces import Surface, sag
 
 
 def exact_volume(lens: Lens) -> float:

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline, Rectangle
-from bstcad.optics.profiles import MeasuredProfile, Profile
-from bstcad.optics.rays import Rays
-from bstcad.optics.sides import Sides, as_pair
-from bstcad.optics.surfaces import Sphere, Surface
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.profiles import MeasuredProfile, Profile
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Outline, Rectangle
+from bstcad.optics.surfaces.rays import Rays
+from bstcad.optics.surfaces.sides import Sides, as_pair
+from bstcad.optics.surfaces.surfaces import Sphere, Surface
 
 N = 1.488
 SQUARE = Rectangle(20.0, 20.0)

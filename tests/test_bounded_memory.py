@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.source_images import ImageSamples
+from bstcad.optics.trace.source_images import ImageSamples
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.source_image import IMAGE_NODES, MAX_TRANSFORM_BYTES, VALUE_BYTES, widest
@@ -48,7 +48,7 @@ from pathlib import Path
 import bstcad.app.preview
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
-from bstcad.sweep.plan import plan
+from bstcad.planning.plan import plan
 held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 for source, scene, changes in json.load(sys.stdin):
     try:

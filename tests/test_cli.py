@@ -275,8 +275,8 @@ def test_ctrl_c_ends_at_once_while_libraries_load_and_is_heard_by_one_process_on
 
 def test_a_sweep_has_its_folder_budget_and_settings(monkeypatch, tmp_path, capsys):
     """Without a lens it ends with 1; interrupted, it says how to go on."""
-    from bstcad.sweep import results
-    from bstcad.sweep import tradeoff as sweeping
+    from bstcad.planning import results
+    from bstcad.planning import tradeoff as sweeping
 
     calls, lenses, stops = [], ["a run"], []
 

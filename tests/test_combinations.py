@@ -29,29 +29,29 @@ import bstcad
 from bstcad import commands, pipeline
 from bstcad.app.preview import PreviewSize, preview
 from bstcad.commands import ProofOptions
-from bstcad.optics.charts import HEIGHTS
-from bstcad.optics.measure import Effort, measure_goals, rrmsd_by_tubes, side_factor
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.reach import grazing_of, spread_at
-from bstcad.optics.sides import as_pair
-from bstcad.optics.surfaces import Sphere
-from bstcad.optics.trace import across
-from bstcad.optics.tubes import rays_to
+from bstcad.manufacture.shop import as_built
+from bstcad.manufacture.shop.as_built import AsBuilt
+from bstcad.optics.surfaces.charts import HEIGHTS
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.sides import as_pair
+from bstcad.optics.surfaces.surfaces import Sphere
+from bstcad.optics.trace.measure import Effort, measure_goals, rrmsd_by_tubes, side_factor
+from bstcad.optics.trace.reach import grazing_of, spread_at
+from bstcad.optics.trace.trace import across
+from bstcad.optics.trace.tubes import rays_to
 from bstcad.photometry import tm25
 from bstcad.photometry.intensity import Luminaire
 from bstcad.photometry.ray_set import RaySet
+from bstcad.planning.plan import plan
+from bstcad.planning.prediction import run_pilot
 from bstcad.report.figure_jobs import NoPictures
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import as_front, net_extent
 from bstcad.scene.lamp import IntensityFile, RayFile
-from bstcad.shop import as_built
-from bstcad.shop.as_built import AsBuilt
-from bstcad.sweep.plan import plan
-from bstcad.sweep.prediction import run_pilot
 from bstcad.tailoring.run import stage_effort
 from bstcad.tailoring.stage2 import PrecisionComparison
 from tests.conftest import verify_with
-from tests.sweep.conftest import typical_pilot
+from tests.planning.conftest import typical_pilot
 
 # --- the choices ------------------------------------------------------------------------------------------------------
 
@@ -463,7 +463,7 @@ MAY_REFUSE = (  # sentences of designs, and the choices that cannot be had toget
     ),
 )
 COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which figures are found
-    "optics.measure": {"SETS": 4, "MIN_TUBES": 48, "MIN_SOURCE_POINTS": 2, "MAX_SOURCE_POINTS": 4},
+    "optics.trace.measure": {"SETS": 4, "MIN_TUBES": 48, "MIN_SOURCE_POINTS": 2, "MAX_SOURCE_POINTS": 4},
     "scene.scene": {"VERIFICATION_POINTS": 4},
     "tailoring.run": {
         "FINE_EFFORT": Effort(48, accuracy=0.0, witness=False),
@@ -489,22 +489,22 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
     "analysis.neglected_effects": {"FACE_POINTS": 24, "GHOST_RAYS_PER_SIDE": 16},
     "analysis.shape": {"GRID_POINTS": 129},
     "app.preview": {"IMAGE_POINTS": 6, "TRANSPORT_CELLS": 16, "LEDGER_RAYS": 16, "SHAPE_POINTS": 33},
-    "sweep.estimates": {
+    "planning.estimates": {
         "COARSE_POINTS": 17,
         "COARSE_CELLS": 16,
         "COARSE_PIXELS": 24,
         "FRONT_NET": 9,
         "COARSE_STEPS": 5,
     },
-    "sweep.net_choice": {"DENSITY_TUBES": 32},
-    "sweep.prediction": {
+    "planning.net_choice": {"DENSITY_TUBES": 32},
+    "planning.prediction": {
         "PILOT_CELLS": (16, 16),
         "PILOT_LIMITS": (24, 17, 48),
         "PILOT_EFFORT": Effort(96, accuracy=1.0, witness=False),
         "PILOT_QUALITIES": ("draft",),
     },
     "verify.checks": {"LINE_TUBES": 48},
-    "sweep.plan": {"PILOT_QUALITIES": ("draft",)},
+    "planning.plan": {"PILOT_QUALITIES": ("draft",)},
 }
 
 
@@ -532,7 +532,7 @@ def quick():
     """Few rays and tubes, and no figures."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bstcad.commands.Pictures", Words)
-        patch.setattr("bstcad.sweep.plan.run_pilot", piloted())
+        patch.setattr("bstcad.planning.plan.run_pilot", piloted())
         verify_with(patch, EFFORT)
         for where, figures in COARSE.items():
             for name, figure in figures.items():

@@ -19,8 +19,8 @@ import bstcad
 from bstcad import cli, commands
 from bstcad import folder as folders
 from bstcad.commands import ProofOptions
-from bstcad.optics.bspline import knots
-from bstcad.optics.measure import Effort
+from bstcad.optics.surfaces.bspline import knots
+from bstcad.optics.trace.measure import Effort
 from bstcad.report import report
 from bstcad.report.record import Examined
 from bstcad.scene.errors import MachineError, SceneError

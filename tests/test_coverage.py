@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from bstcad.optics.measure import Effort, measure
-from bstcad.optics.wavefront_error import wavefront_error
+from bstcad.optics.trace.measure import Effort, measure
+from bstcad.optics.trace.wavefront_error import wavefront_error
 from bstcad.pipeline import DesignOptions, design
 from bstcad.scene.scene import load
 

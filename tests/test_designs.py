@@ -16,13 +16,13 @@ import torch
 
 import bstcad
 from bstcad import commands
-from bstcad.optics.measure import Effort
-from bstcad.optics.trace import trace
-from bstcad.optics.tubes import rays_to
+from bstcad.manufacture.tolerance import tolerancing as tolerances
+from bstcad.manufacture.tolerance.study import StudySettings
+from bstcad.optics.trace.measure import Effort
+from bstcad.optics.trace.trace import trace
+from bstcad.optics.trace.tubes import rays_to
 from bstcad.runs import files
 from bstcad.step_text import part21
-from bstcad.tolerance import tolerancing as tolerances
-from bstcad.tolerance.study import StudySettings
 from bstcad.transport.mapping import nodes
 from bstcad.verify import step_checks as step_checks
 from tests.conftest import draws_nothing, proofs, quick_effort, verify_with

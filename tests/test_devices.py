@@ -12,7 +12,9 @@ import pytest
 import torch
 
 from bstcad import pipeline
-from bstcad.optics import bspline, ops, tubes
+from bstcad.optics.numerics import ops
+from bstcad.optics.surfaces import bspline
+from bstcad.optics.trace import tubes
 from bstcad.pipeline import design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load

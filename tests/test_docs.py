@@ -21,14 +21,14 @@ import typer
 import bstcad
 from bstcad import cli, commands
 from bstcad.commands import ProofOptions
-from bstcad.optics.surfaces import sag
+from bstcad.manufacture.tolerance import tolerancing
+from bstcad.optics.surfaces.surfaces import sag
+from bstcad.planning import batch
+from bstcad.planning import tradeoff as sweeping
 from bstcad.runs.processes import ExitStatus
 from bstcad.scene.scene import load
-from bstcad.sweep import batch
-from bstcad.sweep import tradeoff as sweeping
-from bstcad.tolerance import tolerancing
 from tests.conftest import draws_nothing, quick_effort, verify_with
-from tests.sweep.conftest import Synthetic, typical_pilot
+from tests.planning.conftest import Synthetic, typical_pilot
 
 ROOT = Path(__file__).parent.parent
 sys.path.append(str(ROOT / "docs" / "_ext"))
@@ -110,7 +110,7 @@ def workplace(prepared, tmp_path, monkeypatch, request):
     """
     if request.node.callspec.params["page"].stem in LONG:
         request.getfixturevalue("second_design")
-    monkeypatch.setattr("bstcad.sweep.plan.run_pilot", typical_pilot)
+    monkeypatch.setattr("bstcad.planning.plan.run_pilot", typical_pilot)
     place = shutil.copytree(prepared, tmp_path / "work")
     monkeypatch.chdir(place)
     draws_nothing(monkeypatch)

@@ -14,13 +14,13 @@ import torch
 import bstcad
 from bstcad import commands, pipeline
 from bstcad.commands import ProofOptions
-from bstcad.optics.measure import Effort
-from bstcad.optics.radial import RadialSurface
+from bstcad.manufacture.tolerance import tolerancing
+from bstcad.manufacture.tolerance.study import StudySettings
+from bstcad.optics.surfaces.radial import RadialSurface
+from bstcad.optics.trace.measure import Effort
 from bstcad.report.photometric_figures import far_field_of
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
-from bstcad.tolerance import tolerancing
-from bstcad.tolerance.study import StudySettings
 from tests import domes
 from tests.conftest import DISK, draws_nothing, verify_with
 

@@ -11,23 +11,23 @@ import torch
 import bstcad
 from bstcad import commands
 from bstcad.commands import ProofOptions
-from bstcad.judges.comparison import compare
-from bstcad.optics.interfaces import Interface, Refract
-from bstcad.optics.media import refractive_index
-from bstcad.optics.motion import Motion
-from bstcad.optics.rays import Rays, Status
-from bstcad.optics.receivers import LevelPlane, TiltedPlane
-from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.tilted import TiltedSurface
-from bstcad.optics.trace import across
-from bstcad.optics.unfolding import image, image_screen
+from bstcad.manufacture.tolerance.perturbations import Setup
+from bstcad.optics.lens.interfaces import Interface, Refract
+from bstcad.optics.lens.media import refractive_index
+from bstcad.optics.receivers.receivers import LevelPlane, TiltedPlane
+from bstcad.optics.surfaces.motion import Motion
+from bstcad.optics.surfaces.rays import Rays, Status
+from bstcad.optics.surfaces.surfaces import Plane, Sphere
+from bstcad.optics.surfaces.tilted import TiltedSurface
+from bstcad.optics.trace.trace import across
+from bstcad.optics.trace.unfolding import image, image_screen
 from bstcad.report.figure_jobs import side_view
 from bstcad.report.light_figures import View
 from bstcad.scene.elements import Mirror, Window, interfaces
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import slope_map
-from bstcad.tolerance.perturbations import Setup
 from bstcad.verify import step_checks
+from bstcad.verify.judges.comparison import compare
 from tests.conftest import DISK, draws_nothing, quick_effort
 
 ROUND = {"shape": "circle", "radius": 300.0}

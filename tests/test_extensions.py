@@ -11,13 +11,13 @@ import torch
 import bstcad
 from bstcad import pipeline
 from bstcad.cad import mesh, patches
-from bstcad.judges import faces, mitsuba
-from bstcad.optics.emitters import Emitter, all_alive
-from bstcad.optics.motion import Motion
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Rays, Status
-from bstcad.optics.receivers import Receiver
-from bstcad.optics.surfaces import sag
+from bstcad.manufacture.tolerance.perturbations import Setup, kinds
+from bstcad.optics.light.emitters import Emitter, all_alive
+from bstcad.optics.receivers.receivers import Receiver
+from bstcad.optics.surfaces.motion import Motion
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.rays import Rays, Status
+from bstcad.optics.surfaces.surfaces import sag
 from bstcad.report import record
 from bstcad.report.data_sheet import DataSheet
 from bstcad.report.figure_jobs import light_path_of
@@ -25,7 +25,7 @@ from bstcad.report.light_figures import View
 from bstcad.report.units import about
 from bstcad.scene.errors import SceneError
 from bstcad.scene.target import Target
-from bstcad.tolerance.perturbations import Setup, kinds
+from bstcad.verify.judges import faces, mitsuba
 from tests.conftest import draws_nothing, quick_effort
 
 OUTLINE = Rectangle(16.0, 16.0)

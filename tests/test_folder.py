@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from bstcad import folder as folders
-from bstcad.optics.measure import Light
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.surfaces.surfaces import Sphere
+from bstcad.optics.trace.measure import Light
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 

@@ -14,10 +14,10 @@ from bstcad import commands
 from bstcad.cad import step_reading
 from bstcad.commands import ProofOptions
 from bstcad.folder import read_nominal
-from bstcad.optics.outlines import Circle
-from bstcad.optics.surfaces import Toroid, sag
+from bstcad.manufacture.tolerance import perturbations
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.surfaces import Toroid, sag
 from bstcad.scene.scene import load
-from bstcad.tolerance import perturbations
 from tests.conftest import draws_nothing, quick_effort
 
 

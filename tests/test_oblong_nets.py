@@ -11,16 +11,24 @@ import bstcad
 from bstcad import commands
 from bstcad.analysis.shape import _grid, survey
 from bstcad.commands import ProofOptions
-from bstcad.optics import trace
-from bstcad.optics.bspline import QUARTERS, BSplineSurface, Spans, evaluate, evaluate_plain, knots, net_gradient
 from bstcad.optics.kernels import spline
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.sides import coarser, scaled, side, simplified, spread
-from bstcad.optics.surfaces import Sphere
-from bstcad.optics.tubes import launch_tubes
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces.bspline import (
+    QUARTERS,
+    BSplineSurface,
+    Spans,
+    evaluate,
+    evaluate_plain,
+    knots,
+    net_gradient,
+)
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.sides import coarser, scaled, side, simplified, spread
+from bstcad.optics.surfaces.surfaces import Sphere
+from bstcad.optics.trace import trace
+from bstcad.optics.trace.tubes import launch_tubes
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import Tailoring
 from bstcad.step_text import part21

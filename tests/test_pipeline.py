@@ -8,7 +8,7 @@ import torch
 
 from bstcad import pipeline
 from bstcad.cad.solid import lens_solid
-from bstcad.optics.irradiance import Screen, efficiency, rrmsd
+from bstcad.optics.receivers.irradiance import Screen, efficiency, rrmsd
 from bstcad.scene import scene
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.run import Hooks

@@ -12,7 +12,7 @@ import torch
 
 import bstcad
 import bstcad.cad.plugin
-from bstcad.optics.measure import Effort
+from bstcad.optics.trace.measure import Effort
 from tests.cad.test_trimming import occ_volume
 from tests.conftest import draws_nothing, verify_with
 from tests.exact_volume import exact_volume

@@ -8,9 +8,9 @@ import pytest
 import bstcad
 from bstcad import commands
 from bstcad.commands import ProofOptions
-from bstcad.judges.comparison import compare
-from bstcad.optics.interfaces import Reflect, Refract
+from bstcad.optics.lens.interfaces import Reflect, Refract
 from bstcad.scene.effects import Fresnel
+from bstcad.verify.judges.comparison import compare
 from tests.conftest import draws_nothing, quick_effort
 from tests.test_seen import letter
 

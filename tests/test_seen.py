@@ -12,9 +12,9 @@ import torch
 from PIL import Image
 
 import bstcad
-from bstcad.optics.rays import Status
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.trace import trace
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces.rays import Status
+from bstcad.optics.trace.trace import trace
 from bstcad.scene.scene import load
 
 SIDE = 24  # number of pixels a side that the person makes out

@@ -11,10 +11,10 @@ import pytest
 import bstcad
 from bstcad import commands
 from bstcad.commands import ProofOptions
-from bstcad.judges import comparison
-from bstcad.judges.faces import FaceError, Traced
-from bstcad.optics.surfaces import sag
+from bstcad.optics.surfaces.surfaces import sag
 from bstcad.report.figure_jobs import NoPictures
+from bstcad.verify.judges import comparison
+from bstcad.verify.judges.faces import FaceError, Traced
 from tests.conftest import flat_pictures, quick_effort
 from tests.two_faces import made_of, scene_of
 

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from bstcad import cli, commands
-from bstcad.optics.irradiance import Screen
+from bstcad.optics.receivers.irradiance import Screen
 from bstcad.report import rendering
 from bstcad.report.figure_jobs import MILLIONTHS, corners
 

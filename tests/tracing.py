@@ -8,14 +8,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from bstcad.optics import sampling
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Landed, Rays
-from bstcad.optics.receivers import Receiver
-from bstcad.optics.trace import Simulation, across, launch_strips, simulate, simulate_plain
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import Receiver
+from bstcad.optics.surfaces import sampling
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.rays import Landed, Rays
+from bstcad.optics.trace.trace import Simulation, across, launch_strips, simulate, simulate_plain
 
 
 def stratified(window: Rectangle, n: int, seed: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:

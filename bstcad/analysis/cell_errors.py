@@ -1,14 +1,15 @@
 """Size of the smallest cell on which the light of a lens is still right.
 
-The RRMSD is measured on cells of several sizes (optics.measure.CellError), since light that is right on the pixels of
-the target may vary inside them.  On cells narrower than the image of the real source, the RRMSD with its size counts.
+The RRMSD is measured on cells of several sizes (optics.trace.measure.CellError), since light that is right on the
+pixels of the target may vary inside them.  On cells narrower than the image of the real source, the RRMSD with its size
+counts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from bstcad.optics.measure import CellError
+from bstcad.optics.trace.measure import CellError
 
 MAX_GROWTH = 1.5  # largest RRMSD on a cell / RRMSD on pixels at which the light on the cell counts as right
 SMALL_RRMSD = 0.03  # RRMSD up to which the light on a cell counts as right, whatever the RRMSD on pixels is

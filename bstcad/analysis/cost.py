@@ -17,7 +17,7 @@ import numpy as np
 import scipy.ndimage
 from scipy.fft import dctn
 
-from bstcad.optics.irradiance import Screen
+from bstcad.optics.receivers.irradiance import Screen
 
 # --- the end of the convergence curve ---------------------------------------------------------------------------------
 

@@ -16,13 +16,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bstcad.optics.bspline import QUARTERS, BSplineSurface, Spans, near_outline, span_points
-from bstcad.optics.interfaces import intersect
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import EVERYWHERE
-from bstcad.optics.radial import RadialSurface, cross, dot
-from bstcad.optics.rays import Rays, Status
-from bstcad.optics.surfaces import Surface
+from bstcad.optics.lens.interfaces import intersect
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import QUARTERS, BSplineSurface, Spans, near_outline, span_points
+from bstcad.optics.surfaces.outlines import EVERYWHERE
+from bstcad.optics.surfaces.radial import RadialSurface, cross, dot
+from bstcad.optics.surfaces.rays import Rays, Status
+from bstcad.optics.surfaces.surfaces import Surface
 
 SPANS_AT_A_TIME = 1 << 14  # number of spans whose curvatures are in memory together
 

@@ -23,17 +23,17 @@ import torch
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
-from bstcad.optics import sampling
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.goal import Goal
-from bstcad.optics.kernels.reductions import total
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.radial import RadialSurface
-from bstcad.optics.rays import Rays
-from bstcad.optics.receivers import Receiver
-from bstcad.optics.trace import clear_window, is_transmitted
-from bstcad.optics.unfolding import image_from_last_net
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.numerics.reductions import total
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.receivers import Receiver
+from bstcad.optics.surfaces import sampling
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.radial import RadialSurface
+from bstcad.optics.surfaces.rays import Rays
+from bstcad.optics.trace.trace import clear_window, is_transmitted
+from bstcad.optics.trace.unfolding import image_from_last_net
 
 ENTRANCE_POINTS, FACE_POINTS = 48, 9  # points per side of the entrance and of the last face
 AIMS_AT_A_TIME = 1 << 14  # number of pixels whose étendue is computed at a time

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bstcad.analysis.leaving_rays import rays_behind
-from bstcad.optics.channels import Channel, Draw
-from bstcad.optics.directions import Directions
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import (
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel, Draw
+from bstcad.optics.receivers.directions import Directions
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.trace.measure import (
     GHOST_DIVISOR,
     MAX_SOURCE_POINTS,
     MIN_SOURCE_POINTS,

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from bstcad.optics.channels import Channel, source_numbers
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import SETS
-from bstcad.optics.rays import Rays
-from bstcad.optics.trace import across, behind, launch_strips
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel, source_numbers
+from bstcad.optics.surfaces.rays import Rays
+from bstcad.optics.trace.measure import SETS
+from bstcad.optics.trace.trace import across, behind, launch_strips
 from bstcad.photometry.ray_set import RaySet
 
 PILOT_RAYS = 1 << 14  # number of rays, all channels together, that predict the fraction which leaves the lens

@@ -13,19 +13,20 @@ from torch import Tensor
 
 from bstcad.analysis.neglected_effects import difference
 from bstcad.analysis.shape import ripple
-from bstcad.optics import domes, sampling
-from bstcad.optics.channels import Channel, points_per_line
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.interfaces import cross, deflect, intersect
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import tubes_of, tubes_picture
-from bstcad.optics.outlines import Circle, Outline, Rectangle
-from bstcad.optics.rays import Rays
-from bstcad.optics.receivers import Receiver
-from bstcad.optics.source_images import IMAGE_POINTS_PER_SIDE, detail_width, images
-from bstcad.optics.trace import across, clear_window, launch_strips, to_first_net, trace, window
-from bstcad.optics.unfolding import image_from_lens, per_radian
+from bstcad.optics.lens import domes
+from bstcad.optics.lens.interfaces import cross, deflect, intersect
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel, points_per_line
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import Receiver
+from bstcad.optics.surfaces import sampling
+from bstcad.optics.surfaces.outlines import Circle, Outline, Rectangle
+from bstcad.optics.surfaces.rays import Rays
+from bstcad.optics.trace.measure import tubes_of, tubes_picture
+from bstcad.optics.trace.source_images import IMAGE_POINTS_PER_SIDE, detail_width, images
+from bstcad.optics.trace.trace import across, clear_window, launch_strips, to_first_net, trace, window
+from bstcad.optics.trace.unfolding import image_from_lens, per_radian
 
 
 def _at_interfaces(rays: Rays, lens: Lens) -> list[Rays]:
@@ -289,7 +290,7 @@ class FinestDetail:
     """Smallest width of a point of the picture for any lens: the image of the source, sampled by pixels.
 
     w = √(D² + 4/3 p²), where D is the diameter of the image of the source and p the side of a pixel
-    (optics.source_images.detail_width).  D is proportional to the distance L from the lens to the target: D = 2 L
+    (optics.trace.source_images.detail_width).  D is proportional to the distance L from the lens to the target: D = 2 L
     tan(δ / 2) for collimated light of divergence δ through a thin plate, and D = d L / l for a source of diameter d at
     the distance l before the plate.  At a distance L' it is D L' / L.  The resolution of the net is not included, but
     w is never below the side of the smallest cell on which the light is right (analysis.cell_errors).

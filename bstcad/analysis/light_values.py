@@ -25,7 +25,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from bstcad.optics.irradiance import Screen
+from bstcad.optics.receivers.irradiance import Screen
 from bstcad.photometry.intensity import Intensity
 
 MAX_STRIPS, MIN_STRIPS = 2048, 4  # strips along x: of all pixels near a disc, and of each, exact along y

@@ -27,15 +27,15 @@ import torch
 from torch import Tensor
 
 from bstcad.analysis.cost import DARK_LEVEL
-from bstcad.optics import sampling
-from bstcad.optics.channels import Channel
-from bstcad.optics.irradiance import Screen, landed_flux
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Landed
-from bstcad.optics.trace import clear_window, trace, trace_ghost
-from bstcad.optics.tubes import rays_to
-from bstcad.optics.unfolding import per_radian
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.receivers.irradiance import Screen, landed_flux
+from bstcad.optics.surfaces import sampling
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.rays import Landed
+from bstcad.optics.trace.trace import clear_window, trace, trace_ghost
+from bstcad.optics.trace.tubes import rays_to
+from bstcad.optics.trace.unfolding import per_radian
 
 FACE_POINTS = 64  # points per side of the last face from which light is traced
 GHOST_RAYS_PER_SIDE, GHOST_SMOOTHING = 128, 0.7  # rays per side for a ghost; standard deviation of its blur (cells)

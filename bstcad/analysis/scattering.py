@@ -22,9 +22,9 @@ from scipy.linalg import toeplitz
 from scipy.special import ndtr
 from scipy.stats import poisson
 
-from bstcad.optics.finish import Finish
-from bstcad.optics.interfaces import Refract
-from bstcad.optics.lens import Lens
+from bstcad.optics.lens.interfaces import Refract
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.trace.finish import Finish
 
 MM_PER_NM = 1e-6
 MAX_SERIES = 40.0  # largest g at which the series is summed; beyond it one Gaussian replaces the sum

@@ -1,7 +1,8 @@
 """Shape of a lens, in quantities that a machine shop needs; lengths in mm, angles in degrees, slope of a ripple in rad.
 
 Radii and slopes of a face are computed on a grid four times finer than its net.  Curvature jumps at the knots, so each
-knot span is sampled with its ends (optics.bspline.QUARTERS), inside the outline.  Slopes are computed on the rim too.
+knot span is sampled with its ends (optics.surfaces.bspline.QUARTERS), inside the outline.  Slopes are computed on the
+rim too.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ import torch
 from torch import Tensor
 
 from bstcad.analysis.dome_shape import extremes, radial_thickness
-from bstcad.optics.bspline import QUARTERS, BSplineSurface, span_points, weights
 from bstcad.optics.kernels import spline
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline
-from bstcad.optics.radial import RadialSurface
-from bstcad.optics.sampling import sample_rim
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import QUARTERS, BSplineSurface, span_points, weights
+from bstcad.optics.surfaces.outlines import Outline
+from bstcad.optics.surfaces.radial import RadialSurface
+from bstcad.optics.surfaces.sampling import sample_rim
 
 GRID_POINTS = 1025  # points per side of the grid for thickness, and along a quarter of the rim
 HEIGHT_ROUNDING = 1e-13  # rounding of the heights, relative to the largest height

@@ -1,9 +1,10 @@
 """Slope that a tailored face needs for the light of a target; it may exceed the slope of any surface z(x, y).
 
-To refract a ray from direction d to d', a face of relative index η = n / n' needs a normal along η d - d'.  A face
-z(x, y) is less steep than 90 degrees, and tailoring makes it no steeper than MAX_SLOPE_DEG; light that needs a steeper
-face misses its aim.  This concerns wide beams: light at 60 degrees to the axis in PMMA that shall leave at 40 degrees
-or less needs an overhanging face.  Light that no slope deflects far enough is not counted here (see optics/reach.py).
+To refract a ray from direction d to d', a face of relative index η = n / n' needs a normal along η d - d'.  A face z(x,
+y) is less steep than 90 degrees, and tailoring makes it no steeper than MAX_SLOPE_DEG; light that needs a steeper face
+misses its aim.  This concerns wide beams: light at 60 degrees to the axis in PMMA that shall leave at 40 degrees or
+less needs an overhanging face.  Light that no slope deflects far enough is not counted here (see
+optics/trace/reach.py).
 """
 
 from __future__ import annotations
@@ -13,17 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.goal import Goal
-from bstcad.optics.interfaces import intersect
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.reach import normal_towards
-from bstcad.optics.trace import across
-from bstcad.optics.tubes import rays_to
-from bstcad.optics.unfolding import image_screen
+from bstcad.optics.lens.interfaces import intersect
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.trace.reach import normal_towards
+from bstcad.optics.trace.trace import across
+from bstcad.optics.trace.tubes import rays_to
+from bstcad.optics.trace.unfolding import image_screen
 
-MAX_SLOPE_DEG = 70.0  # largest slope angle that tailoring makes (degrees); its tangent is optics.reach.MAX_SLOPE
+MAX_SLOPE_DEG = 70.0  # largest slope angle that tailoring makes (degrees); its tangent is optics.trace.reach.MAX_SLOPE
 MAX_POINTS_PER_SIDE = 65  # largest number of points of the target, per side, for which the slope is computed
 
 

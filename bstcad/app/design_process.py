@@ -88,7 +88,7 @@ class LightSnapshot:
     def _draw(self, lens: Any) -> None:
         from PIL import Image
 
-        from bstcad.optics.measure import side_factor, tubes_picture
+        from bstcad.optics.trace.measure import side_factor, tubes_picture
         from bstcad.report.light_figures import View
 
         scene, target = self._scene, self._scene.target
@@ -128,7 +128,7 @@ def design(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool)
 def tolerance(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool) -> State:
     """Study the tolerances of a finished design.  job: grade and yield (0 to 1), each of which may be None."""
     from bstcad import commands
-    from bstcad.tolerance.study import StudySettings
+    from bstcad.manufacture.tolerance.study import StudySettings
 
     progress = ProgressFile(run_folder / PROGRESS)
     commands.tolerance(output, StudySettings(job.get("grade"), job.get("yield"), progress=progress))
@@ -137,9 +137,9 @@ def tolerance(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bo
 
 def tradeoff(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool) -> State:
     """Study the trade-off of time against accuracy, in the folder NAME-tradeoff beside the design.  job: budget (s)."""
+    from bstcad.planning import tradeoff as sweeping
     from bstcad.runs.progress import Throttled
     from bstcad.scene.scene import load
-    from bstcad.sweep import tradeoff as sweeping
 
     folder = output.with_name(f"{output.name}-tradeoff")
     throttled = Throttled(ProgressFile(run_folder / PROGRESS), MIN_INTERVAL)
@@ -169,7 +169,7 @@ def compensate(job: Mapping[str, Any], run_folder: Path, output: Path, resume: b
 def retailor(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool) -> State:
     """Tailor the back anew to a blank as built.  job: thickness (mm) and index, one of which may be None."""
     from bstcad import commands
-    from bstcad.shop.as_built import AsBuilt
+    from bstcad.manufacture.shop.as_built import AsBuilt
 
     hooks = commands.Hooks(ProgressFile(run_folder / PROGRESS))
     built = AsBuilt(job.get("thickness"), job.get("index"))

@@ -19,20 +19,20 @@ from bstcad import pipeline
 from bstcad.analysis.light import Blur, blur
 from bstcad.analysis.shape import describe
 from bstcad.folder import Made
-from bstcad.optics.goal import Goal
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import side_factor, simulated, tubes_picture
-from bstcad.optics.sides import as_pair, coarser
-from bstcad.optics.source_images import landing_pixels
-from bstcad.optics.tubes import corners, middle
+from bstcad.manufacture.tolerance.as_made import AsMade, as_made
+from bstcad.manufacture.tolerance.lit_by import LitBy, lit_by
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.surfaces.sides import as_pair, coarser
+from bstcad.optics.trace.measure import side_factor, simulated, tubes_picture
+from bstcad.optics.trace.source_images import landing_pixels
+from bstcad.optics.trace.tubes import corners, middle
 from bstcad.report.light_figures import rrmsd
 from bstcad.scene.dome_back import MIN_DOME_POINTS
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Hooks, Progress
 from bstcad.tailoring.source_image import ExtendedSource
-from bstcad.tolerance.as_made import AsMade, as_made
-from bstcad.tolerance.lit_by import LitBy, lit_by
 
 COARSE_NET = 33  # control points per side in the first rounds of stage 1
 TRANSPORT_CELLS = 48  # cells per side of the transport map

@@ -18,12 +18,12 @@ from pathlib import Path
 from typing import Any
 
 from bstcad.app.preview import QUICK, REFINED, Outdated, Preview, preview
+from bstcad.planning.net_choice import with_net
+from bstcad.planning.plan import plan
 from bstcad.runs import processes
 from bstcad.scene.new_scene import Plate
 from bstcad.scene.scene import Scene, of_text
 from bstcad.scene.scene_file import tables
-from bstcad.sweep.net_choice import with_net
-from bstcad.sweep.plan import plan
 
 STAGES = ("preview", "settled", "made", "effects", "predicted")  # names of the answers to a request, in their order
 MAX_PAGES = 32  # largest number of pages with a stored request

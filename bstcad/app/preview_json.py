@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from bstcad.app.preview import Preview
+from bstcad.manufacture.tolerance.as_made import AsMade
+from bstcad.manufacture.tolerance.lit_by import LitBy
+from bstcad.planning.prediction import Interval
 from bstcad.report.figure_jobs import light_path_of
 from bstcad.report.light_figures import View
 from bstcad.report.record import LEFT_OUT, LeftOut, changes
 from bstcad.report.rendering import data_url, turnable
 from bstcad.report.report import lit_sentences, made_sentences
 from bstcad.report.units import Rows, duration, number, quantity, tables
-from bstcad.sweep.prediction import Interval
-from bstcad.tolerance.as_made import AsMade
-from bstcad.tolerance.lit_by import LitBy
 
 SOLID_CELLS = 96  # cells per side of the mesh of the solid on the page
 # Error of the preview's thicknesses and relief, as a fraction of the relief.  The largest differences from finished

@@ -37,6 +37,7 @@ from bstcad.app.guard import POLICY, SANDBOX, Guard, TooLarge
 from bstcad.app.preview import Preview
 from bstcad.app.preview_desk import STAGES, PreviewDesk, PreviewRequest
 from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
+from bstcad.manufacture.tolerance.lit_by import LIGHTS
 from bstcad.report import manual, record
 from bstcad.report.light_figures import View, dark_triptych
 from bstcad.report.report import VIEWER, cell_sentences, counts, doubts, first_figures
@@ -48,7 +49,6 @@ from bstcad.scene.picture import SAMPLES
 from bstcad.scene.quality import GRADE_NAMES
 from bstcad.scene.scene_file import MAX_DOTS
 from bstcad.scene.schema import rows
-from bstcad.tolerance.lit_by import LIGHTS
 
 Body = Mapping[str, Any]  # JSON object that a page sends
 ANSWER_TIMEOUT = 20.0  # time (s) until a waiting request returns without an answer and the page polls again

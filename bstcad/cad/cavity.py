@@ -20,7 +20,7 @@ from OCP.TopoDS import TopoDS
 
 from bstcad.cad import mounting, step_writing
 from bstcad.cad.solid import NamedSolid, named_solid
-from bstcad.optics.lens import Lens
+from bstcad.optics.lens.lens import Lens
 from bstcad.scene.moulding import Moulding
 from bstcad.scene.mount import Mount, Part
 

@@ -13,12 +13,12 @@ import numpy as np
 import torch
 
 from bstcad.cad.grids import cell_corners, inward_diagonals, nodes, on_diagonals, rim, triangles_over, wall_triangles
-from bstcad.optics import domes
 from bstcad.optics.kernels import dome_distance
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle
-from bstcad.optics.radial import RadialSurface
-from bstcad.optics.surfaces import Surface
+from bstcad.optics.lens import domes
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.radial import RadialSurface
+from bstcad.optics.surfaces.surfaces import Surface
 
 PROJECTION_STEPS = 3  # Newton steps of a projection onto the rim, from a point near it
 BASE_TOLERANCE = 1e-5  # largest |z - base| (mm) of the corners of a facet on the base plane, rounded to float32

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bstcad.optics import tubes
-from bstcad.optics.outlines import Outline
+from bstcad.optics.surfaces.outlines import Outline
+from bstcad.optics.trace import tubes
 
 
 def nodes(outline: Outline, cells: int) -> tuple[np.ndarray, np.ndarray]:

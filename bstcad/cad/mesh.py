@@ -35,11 +35,11 @@ from bstcad.cad.grids import (
     triangles_over,
     wall_triangles,
 )
-from bstcad.optics import domes
-from bstcad.optics.bspline import is_net
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Outline
-from bstcad.optics.surfaces import MIN_COS2, Recess, Surface, sag, sampled
+from bstcad.optics.lens import domes
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import is_net
+from bstcad.optics.surfaces.outlines import Circle, Outline
+from bstcad.optics.surfaces.surfaces import MIN_COS2, Recess, Surface, sag, sampled
 from bstcad.runs import files
 from bstcad.runs.kernel_cache import compiled_kernel
 from bstcad.scene.scene import FLOAT32_ROUNDING

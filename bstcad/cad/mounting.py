@@ -39,8 +39,8 @@ from bstcad.cad.solid import (
 )
 from bstcad.cad.walls import MIN_WALL, NO_DRAFT, Draft, Loop, NamedFace, face_inside, solid_of
 from bstcad.cad.wires import LoopPiece, shape_in
-from bstcad.optics.lens import Lens
-from bstcad.optics.surfaces import Plane
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.scene.mount import Box, Flange, Mount, Part, Round
 
 if TYPE_CHECKING:

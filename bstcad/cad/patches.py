@@ -27,11 +27,11 @@ from OCP.TColgp import TColgp_Array1OfPnt, TColgp_Array1OfPnt2d, TColgp_Array2Of
 from OCP.TColStd import TColStd_Array1OfInteger, TColStd_Array1OfReal, TColStd_Array2OfReal
 from OCP.TopoDS import TopoDS, TopoDS_Face, TopoDS_Shape
 
-from bstcad.optics.bspline import BSplineSurface, knots, parameter
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Outline
-from bstcad.optics.sides import MIN_SIDE
-from bstcad.optics.surfaces import Conic, Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import BSplineSurface, knots, parameter
+from bstcad.optics.surfaces.outlines import Circle, Outline
+from bstcad.optics.surfaces.sides import MIN_SIDE
+from bstcad.optics.surfaces.surfaces import Conic, Sphere
 
 PATCH_MARGIN = 1.02  # ratio of a conic patch's width to the rim's, so that the rim does not touch the patch's boundary
 PARABOLA_TOLERANCE = 1e-10  # deviation (mm) of a sphere from a parabola, below which the parabola is written instead

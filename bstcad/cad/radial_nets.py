@@ -1,4 +1,4 @@
-"""Recognition of a radial net (optics.radial) in a file, which states control points but no centre."""
+"""Recognition of a radial net (optics.surfaces.radial) in a file, which states control points but no centre."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from bstcad.optics.radial import RadialSurface
+from bstcad.optics.surfaces.radial import RadialSurface
 
 
 def radial_surface(net: np.ndarray) -> RadialSurface:

@@ -25,11 +25,11 @@ from bstcad.cad import patches, walls, wires
 from bstcad.cad.patches import Patch, back_patch, front_patch, level_patch
 from bstcad.cad.walls import MIN_WALL, NO_DRAFT, Draft, NamedFace, Rail, face_inside
 from bstcad.cad.wires import LoopPiece, RailCurve
-from bstcad.optics import domes
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.lens import Lens
-from bstcad.optics.sides import as_pair, coarser
-from bstcad.optics.surfaces import Plane, sag
+from bstcad.optics.lens import domes
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.sides import as_pair, coarser
+from bstcad.optics.surfaces.surfaces import Plane, sag
 from bstcad.scene.mount import parting
 
 if TYPE_CHECKING:

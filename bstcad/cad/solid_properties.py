@@ -1,8 +1,8 @@
 """Area, volume and centroid of a part with lenses, from its faces and edges, with a relative error of 1e-8.
 
-Each face is integrated along its boundary with Green's theorem: a freeform net in x and y (optics.quadrature), which
-for a dome are those of its chart, any other face in its parameters u and v.  OCC's own integrals take minutes for a
-large net.  They have errors of 1e-5 for a face that shares an edge with a large net, since this edge is a curve of
+Each face is integrated along its boundary with Green's theorem: a freeform net in x and y (optics.lens.quadrature),
+which for a dome are those of its chart, any other face in its parameters u and v.  OCC's own integrals take minutes for
+a large net.  They have errors of 1e-5 for a face that shares an edge with a large net, since this edge is a curve of
 thousands of knots.
 """
 
@@ -28,9 +28,16 @@ from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape
 
 from bstcad.cad import step_reading
 from bstcad.cad.step_reading import StepLens, parts_of
-from bstcad.optics import domes, quadrature
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.quadrature import EDGE_PARTS, GAUSS_POINTS_PER_PART, MIN_RELATIVE_DX, Border, MassProperties, Sums
+from bstcad.optics.lens import domes, quadrature
+from bstcad.optics.lens.quadrature import (
+    EDGE_PARTS,
+    GAUSS_POINTS_PER_PART,
+    MIN_RELATIVE_DX,
+    Border,
+    MassProperties,
+    Sums,
+)
+from bstcad.optics.surfaces.bspline import BSplineSurface
 
 if TYPE_CHECKING:
     import cadquery

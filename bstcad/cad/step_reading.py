@@ -37,12 +37,12 @@ from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from bstcad.cad import patches
 from bstcad.cad.radial_nets import radial_surface
-from bstcad.optics import domes
-from bstcad.optics.bspline import BSplineSurface, knots, position
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Outline, Rectangle, Rounded
-from bstcad.optics.sides import MIN_SIDE
-from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, sag
+from bstcad.optics.lens import domes
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import BSplineSurface, knots, position
+from bstcad.optics.surfaces.outlines import Circle, Outline, Rectangle, Rounded
+from bstcad.optics.surfaces.sides import MIN_SIDE
+from bstcad.optics.surfaces.surfaces import Conic, Plane, Recess, Sphere, Surface, sag
 from bstcad.step_text.placement import Placement, identity, own_frame
 
 GRID_TOLERANCE = 1e-9  # largest deviation (mm) of a net from a uniform grid in x and y, or from the net of a conic

@@ -62,9 +62,9 @@ from OCP.XCAFDoc import XCAFDoc_ColorSurf, XCAFDoc_DocumentTool, XCAFDoc_GeomTol
 from bstcad.cad import step_nets
 from bstcad.cad.solid import lens_shape
 from bstcad.cad.step_reading import parts_of, quiet_occ
-from bstcad.optics import quadrature
-from bstcad.optics.lens import Lens
-from bstcad.optics.quadrature import MassProperties
+from bstcad.optics.lens import quadrature
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.quadrature import MassProperties
 from bstcad.scene.mount import LENS_COLOUR, MIRROR_COLOUR, Part
 
 if TYPE_CHECKING:

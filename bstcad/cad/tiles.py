@@ -17,11 +17,11 @@ from bstcad.cad.patches import Patch
 from bstcad.cad.solid import cap, prepared
 from bstcad.cad.tiling import Cell, Side, Tiling
 from bstcad.cad.wires import LoopPiece
-from bstcad.optics import domes
-from bstcad.optics.bspline import is_net
-from bstcad.optics.lens import Lens
-from bstcad.optics.quadrature import MassProperties
-from bstcad.optics.surfaces import Surface
+from bstcad.optics.lens import domes
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.quadrature import MassProperties
+from bstcad.optics.surfaces.bspline import is_net
+from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.scene.mount import Part
 
 INVALID_TILE = "{}: its faces and walls do not bound a valid solid; give another number of tiles"

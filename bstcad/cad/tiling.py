@@ -11,8 +11,8 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from bstcad.optics.outlines import Outline
-from bstcad.optics.sides import Sides, as_pair
+from bstcad.optics.surfaces.outlines import Outline
+from bstcad.optics.surfaces.sides import Sides, as_pair
 
 MAX_TILES_PER_SIDE = 20  # largest number of columns and of rows
 ON_RIM = 1e-9  # distance (mm) below which a point counts as one on a line or on the rim

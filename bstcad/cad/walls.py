@@ -35,8 +35,8 @@ from scipy.interpolate import BSpline
 
 from bstcad.cad import patches, wires
 from bstcad.cad.wires import LoopPiece, RailCurve
-from bstcad.optics.bspline import DEGREE, BSplineSurface, is_net, knots
-from bstcad.optics.surfaces import Plane, Surface, sag, sampled
+from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface, is_net, knots
+from bstcad.optics.surfaces.surfaces import Plane, Surface, sag, sampled
 from bstcad.scene.mount import MAX_DRAFT, MIN_CLOSING
 
 SHAPE_TOLERANCE = 1e-7  # tolerance (mm) of every face, edge and vertex

@@ -15,9 +15,9 @@ from OCP.GeomAbs import GeomAbs_CurveType as Kind
 from OCP.TopAbs import TopAbs_Orientation
 from scipy.interpolate import BSpline, make_interp_spline
 
-from bstcad.optics.bspline import BSplineSurface, is_net
-from bstcad.optics.outlines import Circle, Outline
-from bstcad.optics.surfaces import Surface
+from bstcad.optics.surfaces.bspline import BSplineSurface, is_net
+from bstcad.optics.surfaces.outlines import Circle, Outline
+from bstcad.optics.surfaces.surfaces import Surface
 
 if TYPE_CHECKING:
     import cadquery

@@ -18,11 +18,11 @@ from functools import partial
 
 import numpy as np
 
-from bstcad.optics.measured_rays import MeasuredRays, RayFacts
-from bstcad.optics.outlines import Circle, Outline, Rectangle
-from bstcad.optics.profiles import Net, Profile
-from bstcad.optics.rays import Vector
-from bstcad.optics.sampling import hash_seed, jitter
+from bstcad.optics.light.measured_rays import MeasuredRays, RayFacts
+from bstcad.optics.light.profiles import Net, Profile
+from bstcad.optics.surfaces.outlines import Circle, Outline, Rectangle
+from bstcad.optics.surfaces.rays import Vector
+from bstcad.optics.surfaces.sampling import hash_seed, jitter
 from bstcad.photometry.ray_set import RaySet
 
 MODEL_RAYS = 1_000_000  # largest number of rays from which a model is made

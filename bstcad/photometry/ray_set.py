@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bstcad.optics.sampling import hash_seed, jitter
+from bstcad.optics.surfaces.sampling import hash_seed, jitter
 
 RAYS_PER_BLOCK = 1 << 16  # number of rays that are handled at a time
 READING, DRAWING, PARTING = range(3)  # uses of random numbers, which are independent

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.light import needed_apertures
-from bstcad.optics import domes
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline
+from bstcad.optics.lens import domes
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.outlines import Outline
 from bstcad.report import part_views
 from bstcad.report.drawing import GREY, styled
 from bstcad.report.exports import across

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 
 from bstcad.analysis.shape import MAX_RADIUS, Survey
-from bstcad.optics import domes
-from bstcad.optics.lens import Lens
+from bstcad.optics.lens import domes
+from bstcad.optics.lens.lens import Lens
 from bstcad.report.drawing import footnote, new_figure, round_up, steps, styled
 from bstcad.report.units import quantity
 

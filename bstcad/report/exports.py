@@ -23,11 +23,11 @@ import torch
 from bstcad.analysis.far_field import NOMINAL_LUMENS, FarField
 from bstcad.cad.mesh import DEFAULT_LABEL, Label, preview_files
 from bstcad.cad.tiling import Cell, Tiling
-from bstcad.optics import domes
-from bstcad.optics.bspline import is_net
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Outline
-from bstcad.optics.surfaces import Surface, sag
+from bstcad.optics.lens import domes
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import is_net
+from bstcad.optics.surfaces.outlines import Circle, Outline
+from bstcad.optics.surfaces.surfaces import Surface, sag
 from bstcad.photometry import eulumdat, ies, intensity_files, tm25
 from bstcad.photometry.intensity import Intensity, Luminaire
 from bstcad.report.grid_sag import MAX_POINTS, MIN_POINTS, GridLight, GridSag, axes, table_note

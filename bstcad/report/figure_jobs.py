@@ -19,14 +19,14 @@ import torch
 from bstcad.analysis.light import bundle, fan, ray_map
 from bstcad.analysis.shape import MAX_RADIUS, Survey, least_squares, survey, survey_front
 from bstcad.cad import mesh as meshes
-from bstcad.optics import domes
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Light, SpectralLine
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Surface, sag
-from bstcad.optics.wavefront_error import WavefrontError
+from bstcad.optics.lens import domes
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces.surfaces import Surface, sag
+from bstcad.optics.trace.measure import Light, SpectralLine
+from bstcad.optics.trace.wavefront_error import WavefrontError
 from bstcad.report import data_sheet, light_figures, photometric_figures, rendering
 from bstcad.report.data_sheet import DataSheet
 from bstcad.report.dome_figures import ANGLE_LABELS, dome_maps, in_angles

@@ -13,10 +13,10 @@ from pydantic import Field
 from bstcad.analysis.cell_errors import is_right, right_down_to
 from bstcad.analysis.etendue import Silhouette
 from bstcad.analysis.top_hat import FLAT_LEVEL, FlatTop
-from bstcad.optics.goal import Goal, suffix_of, words_of
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.measure import RESOLVED, CellError, Light
-from bstcad.optics.wavefront_error import WavefrontError
+from bstcad.optics.receivers.goal import Goal, suffix_of, words_of
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.trace.measure import RESOLVED, CellError, Light
+from bstcad.optics.trace.wavefront_error import WavefrontError
 from bstcad.scene.effects import reflection_of
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import drawing

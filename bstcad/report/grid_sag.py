@@ -1,9 +1,10 @@
 """Grid sag of a net for Zemax OpticStudio: its points, its file, and the shift of the light by its interpolation.
 
 OpticStudio interpolates between the points of a grid by bicubic Hermite patches.  Except in the end spans, a net is one
-biquadratic polynomial in each knot span (optics/bspline.py), and the patch over the four corners of the span equals
-this polynomial.  A grid that includes all knots is exact there.  In end spans x is quadratic in the parameter t, so the
-net is not a polynomial in x; if they reach inside the rim, the grid is refined until the shift is within MAX_SHIFT.
+biquadratic polynomial in each knot span (optics/surfaces/bspline.py), and the patch over the four corners of the span
+equals this polynomial.  A grid that includes all knots is exact there.  In end spans x is quadratic in the parameter t,
+so the net is not a polynomial in x; if they reach inside the rim, the grid is refined until the shift is within
+MAX_SHIFT.
 
 `Patches` is the surface that OpticStudio interpolates.  Rays through it and through the exact face give the shift.
 """
@@ -19,14 +20,14 @@ import torch
 from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface, basis_matrix
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels.reductions import total
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline
-from bstcad.optics.surfaces import Surface, sag
-from bstcad.optics.trace import launch_strips, trace
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.numerics.reductions import total
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.bspline import BSplineSurface, basis_matrix
+from bstcad.optics.surfaces.outlines import Outline
+from bstcad.optics.surfaces.surfaces import Surface, sag
+from bstcad.optics.trace.trace import launch_strips, trace
 from bstcad.report.units import number
 
 MIN_POINTS, MAX_POINTS = 3, 4097  # smallest and largest number of points along the wider side of a table

@@ -22,8 +22,8 @@ from PIL.PngImagePlugin import PngInfo
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from bstcad.cad.tiling import Cell
-from bstcad.optics.outlines import Outline
-from bstcad.optics.surfaces import Surface, sag
+from bstcad.optics.surfaces.outlines import Outline
+from bstcad.optics.surfaces.surfaces import Surface, sag
 
 WHITE = 65535  # largest grey of 16 bits
 PIXELS_PER_POINT = 4  # pixels per control point along the longer side, by default

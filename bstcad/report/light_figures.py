@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.cell_errors import MAX_GROWTH, SMALL_RRMSD
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.measure import CellError, SpectralLine
-from bstcad.optics.receivers import LevelPlane, Receiver
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import LevelPlane, Receiver
+from bstcad.optics.trace.measure import CellError, SpectralLine
 from bstcad.report.drawing import (
     BLUE,
     DARK_GROUND,
@@ -42,9 +42,9 @@ if TYPE_CHECKING:
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 
-    from bstcad.judges.comparison import Comparison
-    from bstcad.measured.made_part import MadePart
+    from bstcad.manufacture.measured.made_part import MadePart
     from bstcad.scene.scene import Scene
+    from bstcad.verify.judges.comparison import Comparison
 
 Extent = tuple[float, float]  # (min, max) in the receiver's unit
 

@@ -20,10 +20,10 @@ import numpy as np
 import shapely
 from scipy.optimize import brentq
 
-from bstcad.optics import domes
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Outline
-from bstcad.optics.surfaces import Surface, sag
+from bstcad.optics.lens import domes
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.outlines import Circle, Outline
+from bstcad.optics.surfaces.surfaces import Surface, sag
 from bstcad.report.drawing import BLUE, GLASS, GREY, STYLE, VERMILION, round_up
 from bstcad.report.exports import across, pitch_radius
 from bstcad.report.units import mm, number

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.far_field import RAYS, FarField, grid_of
-from bstcad.optics.directions import Directions
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Light
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.receivers.directions import Directions
+from bstcad.optics.trace.measure import Light
 from bstcad.photometry.intensity import Intensity
 from bstcad.report.drawing import BLUE, GREEN, GREY, VERMILION, footnote, new_figure, png, steps, styled
 from bstcad.report.light_figures import View, draw_picture

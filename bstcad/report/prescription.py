@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.shape import MAX_RADIUS, describe, heights, survey_front, thickness_range
-from bstcad.optics import domes, passes, quadrature
-from bstcad.optics.bspline import DEGREE, BSplineSurface
-from bstcad.optics.lens import Lens
-from bstcad.optics.media import density
-from bstcad.optics.surfaces import Surface, sag
+from bstcad.optics.lens import domes, passes, quadrature
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.media import density
+from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface
+from bstcad.optics.surfaces.surfaces import Surface, sag
 from bstcad.report.units import Rows, paragraphs, tables
 from bstcad.scene.fronts import FIT_TOLERANCE
 from bstcad.scene.mount import as_cut

@@ -27,13 +27,12 @@ from bstcad.analysis.etendue import Etendue, etendue
 from bstcad.analysis.light import Blur, FinestDetail, finest_detail
 from bstcad.analysis.steepness import Steepness
 from bstcad.analysis.top_hat import FlatTop
-from bstcad.judges.comparison import Judge
-from bstcad.measured.form_error import MAP_FILES
-from bstcad.measured.made_part import MadePart
-from bstcad.optics.goal import Goal, worst
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.reach import unreached
-from bstcad.optics.receivers import LevelPlane
+from bstcad.manufacture.measured.form_error import MAP_FILES
+from bstcad.manufacture.measured.made_part import MadePart
+from bstcad.optics.receivers.goal import Goal, worst
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.trace.reach import unreached
 from bstcad.report.goal_figures import (
     CellFigures,
     Fraction,
@@ -53,11 +52,12 @@ from bstcad.report.units import remarks as written
 from bstcad.runs import files
 from bstcad.scene.scene import Scene
 from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Nominal, Proof
+from bstcad.verify.judges.comparison import Judge
 from bstcad.verify.light_limits import LightValue
 from bstcad.verify.verdict import NO_LIMIT, Check, verdict
 
 if TYPE_CHECKING:
-    from bstcad.optics.emitters import Emitter
+    from bstcad.optics.light.emitters import Emitter
 
 BY_HAND = "by hand"  # DesignCourse.stopped of a lens that was changed after its design, or designed elsewhere
 MAX_REPORT_BYTES = 20_000_000  # size limit of a report (bytes): room for 300 000 points of the curve

@@ -25,9 +25,9 @@ import numpy as np
 
 if TYPE_CHECKING:
     from bstcad.cad.mesh import Mesh
-    from bstcad.optics.lens import Lens
-    from bstcad.optics.outlines import Outline
-    from bstcad.optics.surfaces import Surface
+    from bstcad.optics.lens.lens import Lens
+    from bstcad.optics.surfaces.outlines import Outline
+    from bstcad.optics.surfaces.surfaces import Surface
 
 PATIENCE = 120.0  # timeout of a picture (seconds)
 FEATURE_ANGLE = 35.0  # angle between facets above which their edge is drawn sharp (degrees)
@@ -333,8 +333,8 @@ def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> st
     the front and z of the back around the rim.  A path adds the keys of `_light`.
     """
     from bstcad.cad.grids import nodes, rim
-    from bstcad.optics import domes
-    from bstcad.optics.surfaces import sampled
+    from bstcad.optics.lens import domes
+    from bstcad.optics.surfaces.surfaces import sampled
 
     def at_nodes(surface: Surface) -> np.ndarray:
         """Return x, y, z (mm), ∂z/∂x and ∂z/∂y of a face at its nodes, (5, cells + 1, cells + 1)."""

@@ -13,8 +13,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bstcad.optics.goal import suffix_of
-from bstcad.optics.sides import size_text
+from bstcad.optics.receivers.goal import suffix_of
+from bstcad.optics.surfaces.sides import size_text
 from bstcad.report.goal_figures import GoalFigures
 from bstcad.report.prescription import LIGHT_DIRECTIONS, order_rows
 from bstcad.report.record import LEFT_OUT, Contents, Examined, LeftOut, bounds, changes

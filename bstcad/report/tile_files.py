@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from bstcad.cad.tiling import Cell, Tiling
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.outlines import Outline
 from bstcad.scene.mount import Part
 
 PLACES = "file,x_min_mm,x_max_mm,y_min_mm,y_max_mm,area_mm2,volume_mm3,centroid_x_mm,centroid_y_mm,centroid_z_mm"

@@ -1,7 +1,8 @@
 """tolerance.json as a record, its section of report.html and its table for the terminal.
 
-bstcad.tolerance computes the study.  A trial is one random draw of all errors.  Its superposed picture is the
-design's picture plus the change by each error, traced alone; its full trace is the picture with all errors together.
+bstcad.manufacture.tolerance computes the study.  A trial is one random draw of all errors.  Its superposed picture is
+the design's picture plus the change by each error, traced alone; its full trace is the picture with all errors
+together.
 """
 
 from __future__ import annotations

@@ -14,8 +14,8 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from bstcad.cad.tiling import Cell, Span
-from bstcad.optics.bspline import require_net
-from bstcad.optics.lens import Lens
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import require_net
 from bstcad.report.shop_figures import left_figure
 from bstcad.report.units import quantity
 from bstcad.toolpath import gcode

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from bstcad.optics.wavefront_error import WavefrontError
+    from bstcad.optics.trace.wavefront_error import WavefrontError
 
 LOOKING = "Seen from behind, looking towards the lens: x grows to the right.  +: the light arrives late."
 REMOVED = "piston and tilt removed"

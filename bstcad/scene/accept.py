@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_serializer
 
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.key import Key
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.surfaces.key import Key
 from bstcad.scene.schema import COORDINATES, LENGTHS, Record
 from bstcad.scene.target import MAX_TARGETS, Target
 

@@ -19,11 +19,11 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Discriminator, Tag
 
-from bstcad.optics import collimated
-from bstcad.optics.collimated import ProfileName
-from bstcad.optics.key import Key
-from bstcad.optics.outlines import STRICT
-from bstcad.optics.profiles import MeasuredProfile, Net, Profile
+from bstcad.optics.light import collimated
+from bstcad.optics.light.collimated import ProfileName
+from bstcad.optics.light.profiles import MeasuredProfile, Net, Profile
+from bstcad.optics.surfaces.key import Key
+from bstcad.optics.surfaces.outlines import STRICT
 from bstcad.runs import files
 from bstcad.scene import picture
 from bstcad.scene.errors import SceneError

@@ -10,12 +10,12 @@ from typing import Annotated, Any, Literal
 import torch
 from pydantic import ConfigDict, Field
 
-from bstcad.optics.key import Key
-from bstcad.optics.media import refractive_index
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.passes import LENS, MIRROR, SECOND_SURFACE, Face, Passes
-from bstcad.optics.sides import Sides, as_pair, coarser, in_proportion, simplified
-from bstcad.optics.surfaces import Surface
+from bstcad.optics.lens.media import refractive_index
+from bstcad.optics.lens.passes import LENS, MIRROR, SECOND_SURFACE, Face, Passes
+from bstcad.optics.surfaces.key import Key
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.sides import Sides, as_pair, coarser, in_proportion, simplified
+from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.runs.files import HEIGHT_EXPORTS, PATHS, TOOL_RADII
 from bstcad.scene.dome_back import RadialBack
 from bstcad.scene.errors import SceneError
@@ -252,7 +252,7 @@ class LensBlank(Record):
             return self.front_surface
         if self.front.file is not None:
             return self.front.file.surface(self.front.z).refined(self._tailored_front_net(net))
-        from bstcad.optics.bspline import BSplineSurface
+        from bstcad.optics.surfaces.bspline import BSplineSurface
 
         half_x, half_y = net_extent(self.outline, self._tailored_front_net(as_wide_as or net))
         heights = torch.zeros(as_pair(self._tailored_front_net(net)), dtype=torch.float64)

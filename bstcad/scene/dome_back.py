@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, ClassVar, Literal
 
-from bstcad.optics.charts import SphereChart
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.key import Key
-from bstcad.optics.outlines import Circle
-from bstcad.optics.sides import Sides
-from bstcad.optics.sphere_light import SphereLight, light_angle
-from bstcad.optics.surfaces import Surface
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.light.sphere_light import SphereLight, light_angle
+from bstcad.optics.surfaces.charts import SphereChart
+from bstcad.optics.surfaces.key import Key
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.sides import Sides
+from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.scene.errors import SceneError
 from bstcad.scene.schema import COORDINATES, LENGTHS, NET_SIZES, Record
 

@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
 
 from pydantic import Field, PrivateAttr
 
-from bstcad.optics import media
-from bstcad.optics.key import Key
+from bstcad.optics.lens import media
+from bstcad.optics.surfaces.key import Key
 from bstcad.scene.blank import INDICES, LensBlank
 from bstcad.scene.schema import Record
 
 if TYPE_CHECKING:
-    from bstcad.optics.emitters import Emitter
-    from bstcad.optics.losses import Losses
-    from bstcad.optics.measure import GhostTracer
+    from bstcad.optics.lens.losses import Losses
+    from bstcad.optics.light.emitters import Emitter
+    from bstcad.optics.trace.measure import GhostTracer
 
 METAL = "Al"  # default metal of a mirror
 PACKAGES = "bstcad.effects"  # group of entry points with which an installed package adds effects
-LossFactory = Callable[[float], Any]  # function of a wavelength (nm) that returns a loss (optics.interfaces.Loss)
+LossFactory = Callable[[float], Any]  # function of a wavelength (nm) that returns a loss (optics.lens.interfaces.Loss)
 _REGISTERED: dict[str, LossFactory] = {}  # functions registered by `effect`, by name
 
 
@@ -157,13 +157,13 @@ def ghost(effects: Effects) -> GhostTracer | None:
     """Return the function that traces light reflected twice inside the lens; None if the scene has no ghost."""
     if find_effect(effects, Ghost) is None:
         return None
-    from bstcad.optics.trace import ghost_light
+    from bstcad.optics.trace.trace import ghost_light
 
     return ghost_light
 
 
 def losses(effects: Effects, lens: LensBlank, wavelength: float) -> Losses | None:
-    """Return the losses at a wavelength (nm), or None (without loading optics.losses) if the scene has no losses.
+    """Return the losses at a wavelength (nm), or None (without loading optics.lens.losses) if the scene has no losses.
 
     Raises ValueError, in one sentence, if the data of the material do not suffice.
     """
@@ -171,7 +171,7 @@ def losses(effects: Effects, lens: LensBlank, wavelength: float) -> Losses | Non
     others = [effect for effect in effects if isinstance(effect, Own)]
     if fresnel is None and absorption is None and not others:
         return None
-    from bstcad.optics import losses as physics
+    from bstcad.optics.lens import losses as physics
 
     reflection = absorbed = coating = None
     if fresnel is not None:

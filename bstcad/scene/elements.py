@@ -13,13 +13,13 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
 
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.interfaces import Interface, Reflect, Refract
-from bstcad.optics.key import Key
-from bstcad.optics.rays import Status, Vector, axes
-from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.tilted import TiltedSurface
-from bstcad.optics.unfolding import Image, image
+from bstcad.optics.lens.interfaces import Interface, Reflect, Refract
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.surfaces.key import Key
+from bstcad.optics.surfaces.rays import Status, Vector, axes
+from bstcad.optics.surfaces.surfaces import Plane, Sphere
+from bstcad.optics.surfaces.tilted import TiltedSurface
+from bstcad.optics.trace.unfolding import Image, image
 from bstcad.scene.blank import INDICES, LensBlank, Outlined, stated_index
 from bstcad.scene.errors import with_target_key
 from bstcad.scene.fronts import CURVATURES

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
-from bstcad.optics.key import Key
-from bstcad.optics.outlines import STRICT, Circle, Outline
-from bstcad.optics.sides import MIN_SIDE, Sides, as_pair
-from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere, Surface, Toroid
+from bstcad.optics.surfaces.key import Key
+from bstcad.optics.surfaces.outlines import STRICT, Circle, Outline
+from bstcad.optics.surfaces.sides import MIN_SIDE, Sides, as_pair
+from bstcad.optics.surfaces.surfaces import Conic, Plane, Recess, Sphere, Surface, Toroid
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 from bstcad.scene.schema import (
@@ -34,7 +34,7 @@ from bstcad.step_text import part21
 from bstcad.step_text.placement import own_frame
 
 if TYPE_CHECKING:  # importing this module loads numba
-    from bstcad.optics.bspline import BSplineSurface
+    from bstcad.optics.surfaces.bspline import BSplineSurface
 
 # Range of (1 + k) c² r² of a conic at the rim: at 1 its tangent is vertical; below the minimum it is nearly a cone.
 MIN_CONIC_BEND, MAX_CONIC_BEND = -7.0, 0.85
@@ -76,7 +76,7 @@ class FileNet(FileContent):
 
     def surface(self, z: float) -> BSplineSurface:
         """Return the net as a surface with its vertex at z (mm)."""
-        from bstcad.optics.bspline import BSplineSurface
+        from bstcad.optics.surfaces.bspline import BSplineSurface
 
         heights = np.frombuffer(self.data, "<f8").reshape(self.shape).astype(np.float64)
         return BSplineSurface(z, torch.from_numpy(heights), self.x, self.y)
@@ -94,7 +94,7 @@ def read_net(path: Path) -> FileNet:
 
     A net from a STEP file keeps its position in x and y, and its vertex is moved to z = 0.
     """
-    from bstcad.optics.bspline import BSplineSurface
+    from bstcad.optics.surfaces.bspline import BSplineSurface
 
     name = repr(str(path))
     path = path / "design.npz" if path.is_dir() else path
@@ -115,7 +115,7 @@ def read_net(path: Path) -> FileNet:
 
 
 def _net_of_step(path: Path) -> np.ndarray:
-    from bstcad.optics.bspline import knots
+    from bstcad.optics.surfaces.bspline import knots
 
     text = part21.read(path)
     if text.solids != 1:
@@ -415,7 +415,7 @@ def as_front(value: Any, outline: Outline | None = None) -> Any:
 
 def fit_net(surface: Surface, outline: Outline) -> BSplineSurface:
     """Fit the smallest net within FIT_TOLERANCE of a surface inside the outline; SceneError if there is none."""
-    from bstcad.optics.bspline import BSplineSurface
+    from bstcad.optics.surfaces.bspline import BSplineSurface
 
     for m in FIT_SIZES:
         half_x, half_y = net_extent(outline, m)

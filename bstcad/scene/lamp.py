@@ -11,11 +11,11 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from bstcad.optics import point
-from bstcad.optics.key import Key
-from bstcad.optics.measured_rays import MeasuredRays, RayFacts, RayOrder
-from bstcad.optics.outlines import STRICT
-from bstcad.optics.profiles import MeasuredProfile, Net, Profile
+from bstcad.optics.light import point
+from bstcad.optics.light.measured_rays import MeasuredRays, RayFacts, RayOrder
+from bstcad.optics.light.profiles import MeasuredProfile, Net, Profile
+from bstcad.optics.surfaces.key import Key
+from bstcad.optics.surfaces.outlines import STRICT
 from bstcad.photometry import intensity_files, ray_files, tm25
 from bstcad.photometry.intensity import Intensity, Luminaire, PhotometricError
 from bstcad.photometry.ray_model import RayModel, model_of, rays_of_lines

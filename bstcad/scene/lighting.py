@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from bstcad.optics import sampling
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.outlines import Outline
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.surfaces import sampling
+from bstcad.optics.surfaces.outlines import Outline
 from bstcad.scene.blank import INDICES, LensBlank
 from bstcad.scene.dome_back import MIN_DOME_POINTS, own_outline
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-from bstcad.optics.key import Key
+from bstcad.optics.surfaces.key import Key
 from bstcad.scene.schema import OneOrThreeNumbers, Record
 
 MAX_SHRINKAGE = 0.2  # largest shrinkage; polymers have 0.001 to 0.04, sintered ceramics up to 0.2

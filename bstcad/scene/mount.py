@@ -12,11 +12,11 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 import numpy as np
 from pydantic import Field
 
-from bstcad.optics.key import Key
-from bstcad.optics.lens import Lens
-from bstcad.optics.media import medium
-from bstcad.optics.outlines import STRICT, Circle, Outline, Rectangle, Rounded
-from bstcad.optics.surfaces import Surface, sag, sampled
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.media import medium
+from bstcad.optics.surfaces.key import Key
+from bstcad.optics.surfaces.outlines import STRICT, Circle, Outline, Rectangle, Rounded
+from bstcad.optics.surfaces.surfaces import Surface, sag, sampled
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.schema import COORDINATES, LENGTHS, Record
 

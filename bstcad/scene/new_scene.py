@@ -118,7 +118,9 @@ class Plate:
 
     def detail(self, distance: float) -> float:
         """Return the width (mm) of the finest detail on a wall at this distance; see source_images.detail_width."""
-        from bstcad.optics.source_images import detail_width  # loads torch, which a list of the templates does not need
+        from bstcad.optics.trace.source_images import (
+            detail_width,  # loads torch, which a list of the templates does not need
+        )
 
         as_a_disc = math.sqrt(4 / 3) if self.light.square else 1.0
         return detail_width(as_a_disc * self.source_image(distance), self.pixel)
@@ -143,8 +145,8 @@ class Plate:
 
     def blur_rrmsd(self, scene: Scene) -> float | None:
         """Return the RRMSD of the scene's picture blurred by the source's image; None for a source without size."""
-        from bstcad.optics.outlines import Circle, Rectangle
-        from bstcad.optics.source_images import even_image
+        from bstcad.optics.surfaces.outlines import Circle, Rectangle
+        from bstcad.optics.trace.source_images import even_image
 
         if not self.light.size:
             return None

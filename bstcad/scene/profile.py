@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 from scipy.special import erf
 
-from bstcad.optics.key import Key
+from bstcad.optics.surfaces.key import Key
 from bstcad.scene.schema import LENGTHS, Record, leaving_out
 
 # Gauss-Legendre nodes per cell of a super-Gaussian of radius w and order n: in cells up to w / n wide; below w / (4 n).

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
-from bstcad.optics.key import Key
-from bstcad.optics.sides import MIN_SIDE, Sides, as_pair, coarser, side
+from bstcad.optics.surfaces.key import Key
+from bstcad.optics.surfaces.sides import MIN_SIDE, Sides, as_pair, coarser, side
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.schema import NET_SIZES, OneOrTwo, Record
 
@@ -171,7 +171,7 @@ Name = Literal[
 FORM, RIPPLE = ("back.form", "front.form"), ("back.ripple",)
 FACE_ERRORS = {"correlation_length": FORM, "period": RIPPLE, "pattern": RIPPLE}  # key -> errors that can have this key
 FINISH_KEYS = ("layer_height", "smoothing_length", "roughness", "roughness_length")  # keys of tables without a name
-GRADE_NAMES = (  # grades of manufacture, which tolerance/grades.py defines
+GRADE_NAMES = (  # grades of manufacture, which manufacture/tolerance/grades.py defines
     "moulded", "diamond-turned", "precise", "milled-polished", "milled-sanded", "resin-printed", "resin-printed-coated",
 )  # fmt: skip
 TWO_FACE_ERRORS = ("front.", "lens.wedge")  # prefixes of errors that are zero unless a [[tolerance]] names them

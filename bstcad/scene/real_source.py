@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from bstcad.optics.channels import Channel
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle
-from bstcad.optics.source_images import images
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.trace.source_images import images
 
 DEFAULT_DIAMETER = 0.1  # assumed diameter of a point source, mm
 DEFAULT_DIVERGENCE = 0.1  # assumed divergence of parallel light, degrees

@@ -21,15 +21,15 @@ import tomli_w
 import torch
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_serializer, model_validator
 
-from bstcad.optics.channels import Channel, Draw, channels_of, drawn_channels, given_channels, merge_wavelengths
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.goal import Goal
-from bstcad.optics.key import Key
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline
-from bstcad.optics.rays import Status
-from bstcad.optics.sides import Sides, as_pair
-from bstcad.optics.wavefront import MAX_RAY_ANGLE, PlaneWave, Wave, ZernikeWave
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel, Draw, channels_of, drawn_channels, given_channels, merge_wavelengths
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.light.wavefront import MAX_RAY_ANGLE, PlaneWave, Wave, ZernikeWave
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.surfaces.key import Key
+from bstcad.optics.surfaces.outlines import Outline
+from bstcad.optics.surfaces.rays import Status
+from bstcad.optics.surfaces.sides import Sides, as_pair
 from bstcad.runs import files
 from bstcad.scene import effects, elements, lighting, mount, picture, quality, scene_file
 from bstcad.scene.accept import Accept
@@ -50,7 +50,7 @@ from bstcad.scene.schema import FILE, FileContent, Record, contents, of_model
 from bstcad.scene.target import FAR_Z, AngularTarget, Target, Targets, coplanar_complaints
 
 if TYPE_CHECKING:
-    from bstcad.optics.measure import GhostTracer
+    from bstcad.optics.trace.measure import GhostTracer
 
 MESH_TOLERANCE = 1e-3  # mm; default maximum distance of mesh facets from a lens up to 100 mm wide
 IMAGE_KEY = re.compile(r"target(\[\d+\])?\.image|source\.profile\.image")  # dotted keys of images
@@ -307,7 +307,7 @@ class Scene(Record):
         finest net to which `net` will be refined (default: `net`), whose spans determine how far the nets extend past
         the rim.
         """
-        from bstcad.optics.bspline import BSplineSurface  # loads numba, which a scene alone does not need
+        from bstcad.optics.surfaces.bspline import BSplineSurface  # loads numba, which a scene alone does not need
 
         if self.lens.dome is not None:
             return self.assembled(self._flat_dome(self.lens.dome, net, as_wide_as or net))
@@ -319,7 +319,7 @@ class Scene(Record):
 
     def _flat_dome(self, dome: RadialBack, net: Sides, as_wide_as: Sides) -> Lens:
         """Return a lens with a sphere about the centre as its back; its outline is the lit disc of the back's chart."""
-        from bstcad.optics.radial import RadialSurface
+        from bstcad.optics.surfaces.radial import RadialSurface
 
         back = RadialSurface.sphere(dome.centre[2], dome.radius, net_extent(dome.lit, as_wide_as), as_pair(net))
         front, passes = self.lens.flat_front(net, as_wide_as), self.lens.passes

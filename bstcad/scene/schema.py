@@ -28,7 +28,7 @@ from pydantic import (
 from pydantic.functional_serializers import PlainSerializer, model_serializer
 from pydantic.json_schema import GenerateJsonSchema, WithJsonSchema
 
-from bstcad.optics.sides import MIN_SIDE
+from bstcad.optics.surfaces.sides import MIN_SIDE
 from bstcad.runs import files
 
 FILE = Path(__file__).with_name("schema.json")

@@ -17,13 +17,13 @@ import torch
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag
 from scipy.sparse import csr_array
 
-from bstcad.optics.directions import Angles, Directions
-from bstcad.optics.goal import interpolated
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.key import Key
-from bstcad.optics.outlines import Circle, Outline
-from bstcad.optics.rays import Vector
-from bstcad.optics.receivers import PlaneReceiver
+from bstcad.optics.receivers.directions import Angles, Directions
+from bstcad.optics.receivers.goal import interpolated
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import PlaneReceiver
+from bstcad.optics.surfaces.key import Key
+from bstcad.optics.surfaces.outlines import Circle, Outline
+from bstcad.optics.surfaces.rays import Vector
 from bstcad.scene import picture
 from bstcad.scene.blank import LensBlank, Outlined
 from bstcad.scene.dotted_keys import PICTURE_KEYS

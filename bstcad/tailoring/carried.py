@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import torch
 
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.goal import Goal
-from bstcad.optics.lens import Lens
-from bstcad.optics.reach import wanted_slopes
-from bstcad.optics.trace import behind
-from bstcad.optics.unfolding import image_screen
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.trace.reach import wanted_slopes
+from bstcad.optics.trace.trace import behind
+from bstcad.optics.trace.unfolding import image_screen
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.tailoring.slope_map import face_grid, lit_window
 

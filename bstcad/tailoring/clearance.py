@@ -19,11 +19,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics.bspline import QUARTERS, SPANS_AT_A_TIME, BSplineSurface, evaluate, net_gradient, span
-from bstcad.optics.kernels.reductions import total
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import inside
-from bstcad.optics.sampling import sample_rim
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.numerics.reductions import total
+from bstcad.optics.surfaces.bspline import QUARTERS, SPANS_AT_A_TIME, BSplineSurface, evaluate, net_gradient, span
+from bstcad.optics.surfaces.outlines import inside
+from bstcad.optics.surfaces.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 
 PENALTY_MARGIN = 0.01  # relative distance before a bound at which its penalty begins (thickness: distance / `unit`)

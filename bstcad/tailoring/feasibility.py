@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from bstcad.optics.lens import Lens
-from bstcad.optics.reach import largest_deflection
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.trace.reach import largest_deflection
 from bstcad.tailoring import light_behind
 from bstcad.tailoring.light_behind import LightBehind
 from bstcad.tailoring.run import Task, no_progress

@@ -20,13 +20,13 @@ import torch
 from scipy.ndimage import gaussian_filter, minimum_filter
 from torch import Tensor
 
-from bstcad.optics import ops
-from bstcad.optics.channels import Channel, weighted_sum
-from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import Scale, scaled
-from bstcad.optics.kernels.reductions import total
-from bstcad.optics.rays import Landed
-from bstcad.optics.tubes import Tubes, triangles
+from bstcad.optics.light.channels import Channel, weighted_sum
+from bstcad.optics.numerics import ops
+from bstcad.optics.numerics.reductions import total
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Scale, scaled
+from bstcad.optics.surfaces.rays import Landed
+from bstcad.optics.trace.tubes import Tubes, triangles
 
 FOLD_WEIGHT = 0.05  # weight of the penalty in the merit
 LEAST_AREA, MOST_LACK = 0.1, 5.0  # smallest relative area without penalty; largest lack of area that has a gradient

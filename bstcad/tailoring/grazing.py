@@ -6,9 +6,10 @@ reachable part has one more term, which depends on the slopes of the face alone:
 
     PENALTY_WEIGHT · mean over the light of max(0, u)²,    u = (η² sin² θ - sin² θ'_max) / (1 - sin² θ'_max)
 
-θ is the angle of incidence, θ'_max the largest angle of refraction allowed (optics.reach.grazing_of), and η the index
-before the face / index behind it: u = 0 at θ'_max, and u = 1 at total internal reflection.  Within a knot span ∂z/∂x is
-linear in x and quadratic in y, and ∂z/∂y the reverse; both are near their extremes at the ends and centres of spans.
+θ is the angle of incidence, θ'_max the largest angle of refraction allowed (optics.trace.reach.grazing_of), and η the
+index before the face / index behind it: u = 0 at θ'_max, and u = 1 at total internal reflection.  Within a knot span
+∂z/∂x is linear in x and quadratic in y, and ∂z/∂y the reverse; both are near their extremes at the ends and centres of
+spans.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ import torch
 from scipy.ndimage import maximum_filter
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface, evaluate
-from bstcad.optics.kernels.reductions import total
-from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Rays
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.numerics.reductions import total
+from bstcad.optics.surfaces.bspline import BSplineSurface, evaluate
+from bstcad.optics.surfaces.rays import Rays
 from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.minimise import lbfgs, minimise
 from bstcad.tailoring.run import Edge

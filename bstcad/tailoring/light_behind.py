@@ -35,11 +35,11 @@ from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.rays import Vector
-from bstcad.optics.receivers import Receiver
-from bstcad.optics.surfaces import Surface
-from bstcad.optics.wavefront import SphericalWave, Wave
+from bstcad.optics.light.wavefront import SphericalWave, Wave
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import Receiver
+from bstcad.optics.surfaces.rays import Vector
+from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.run import Task
 from bstcad.tailoring.slope_map import centroid, pixel_corners, resample_picture

@@ -20,14 +20,14 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from bstcad.optics import bspline
-from bstcad.optics.bspline import BSplineSurface, Jet, Spans
-from bstcad.optics.kernels.reductions import total
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline
-from bstcad.optics.passes import Face
-from bstcad.optics.radial import RadialSurface
-from bstcad.optics.sampling import sample_rim
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import Face
+from bstcad.optics.numerics.reductions import total
+from bstcad.optics.surfaces import bspline
+from bstcad.optics.surfaces.bspline import BSplineSurface, Jet, Spans
+from bstcad.optics.surfaces.outlines import Outline
+from bstcad.optics.surfaces.radial import RadialSurface
+from bstcad.optics.surfaces.sampling import sample_rim
 from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.clearance import PENALTY_MARGIN, QUARTER_RIM_POINTS, clearance

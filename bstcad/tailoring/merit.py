@@ -52,23 +52,23 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface, resampling_matrix
-from bstcad.optics.channels import Channel, weighted_sum
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.goal import SUM_ROUNDING, Goal
-from bstcad.optics.interfaces import Law, Refract
-from bstcad.optics.irradiance import CellTarget, picture_error
-from bstcad.optics.kernels.reductions import elementary, quotient, total
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import RayTubes
-from bstcad.optics.rays import Landed, Rays
-from bstcad.optics.reach import wanted_slopes
-from bstcad.optics.receivers import Receiver
-from bstcad.optics.trace import behind, through
-from bstcad.optics.tubes import Tubes, arriving_flux, rays_to
-from bstcad.optics.unfolding import image_from_last_net
-from bstcad.optics.wavefront import MM_PER_NM, Wave
-from bstcad.optics.wavefront_error import path_from_reference
+from bstcad.optics.lens.interfaces import Law, Refract
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel, weighted_sum
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.light.wavefront import MM_PER_NM, Wave
+from bstcad.optics.numerics.reductions import elementary, quotient, total
+from bstcad.optics.receivers.goal import SUM_ROUNDING, Goal
+from bstcad.optics.receivers.irradiance import CellTarget, picture_error
+from bstcad.optics.receivers.receivers import Receiver
+from bstcad.optics.surfaces.bspline import BSplineSurface, resampling_matrix
+from bstcad.optics.surfaces.rays import Landed, Rays
+from bstcad.optics.trace.measure import RayTubes
+from bstcad.optics.trace.reach import wanted_slopes
+from bstcad.optics.trace.trace import behind, through
+from bstcad.optics.trace.tubes import Tubes, arriving_flux, rays_to
+from bstcad.optics.trace.unfolding import image_from_last_net
+from bstcad.optics.trace.wavefront_error import path_from_reference
 from bstcad.tailoring.folds import Folds
 from bstcad.tailoring.source_image import BlurOperator, ExtendedSource, blur_error, blurred, blurs, with_border
 

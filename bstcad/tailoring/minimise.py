@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from bstcad.optics.kernels.reductions import dot, shift, total
+from bstcad.optics.numerics.reductions import dot, shift, total
 
 Objective = Callable[[list[Tensor]], tuple[float, list[Tensor], float]]  # parameters -> (merit, gradients, figure)
 

@@ -31,10 +31,10 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse import csr_array, diags_array
 from torch import Tensor
 
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.goal import Goal
-from bstcad.optics.lens import Lens
-from bstcad.optics.trace import across, behind
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.trace.trace import across, behind
 from bstcad.tailoring.merit import CoarseVariable, SobolevVariable, control_point_axes
 from bstcad.transport.mapping import grid_coordinates
 

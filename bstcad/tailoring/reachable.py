@@ -1,6 +1,6 @@
 """The reachable part of a target, which a design can light, computed before the design.
 
-Each point of the face reaches a part of the target that is known in closed form (optics/reach.py).  A pixel is
+Each point of the face reaches a part of the target that is known in closed form (optics/trace/reach.py).  A pixel is
 reachable if each of its corners is reached by some point of the face.  A design may not give it as much light as it
 asks for, if few points reach it or if these are needed elsewhere; but what a face can light is not called dark.
 """
@@ -17,15 +17,15 @@ import torch
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from bstcad.optics.charts import HEIGHTS
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.goal import Goal
-from bstcad.optics.interfaces import Law
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.reach import MAX_EXIT_ANGLE, reach_margin
-from bstcad.optics.receivers import Receiver
-from bstcad.optics.unfolding import image_from_last_net
+from bstcad.optics.lens.interfaces import Law
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import Receiver
+from bstcad.optics.surfaces.charts import HEIGHTS
+from bstcad.optics.trace.reach import MAX_EXIT_ANGLE, reach_margin
+from bstcad.optics.trace.unfolding import image_from_last_net
 from bstcad.scene.target import average
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.slope_map import FaceGrid
@@ -82,7 +82,7 @@ def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
 
 
 def reach_from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver, law: Law, grazing: float) -> Tensor:
-    """Return `optics.reach.reach_margin` from every FACE_STRIDE-th lit point of the face to each aim, (points, …).
+    """Return `trace.reach.reach_margin` from every FACE_STRIDE-th lit point of the face to each aim, (points, …).
 
     aims: x and y of the aims, in the receiver's unit, of one shape (…).  grazing: see `reachable`.
     """

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from bstcad.optics.channels import Channel
-from bstcad.optics.goal import Goal
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, measure_goal, rrmsds_by_rays
-from bstcad.optics.sides import Sides
-from bstcad.optics.unfolding import image_screen
-from bstcad.optics.wavefront import Wave
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.wavefront import Wave
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.surfaces.sides import Sides
+from bstcad.optics.trace.measure import Effort, measure_goal, rrmsds_by_rays
+from bstcad.optics.trace.unfolding import image_screen
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import ResolvedTailoring
 from bstcad.tailoring.merit import Merit

@@ -1,9 +1,10 @@
 """The slope fit of stage 1: a linear least-squares fit of a surface to given slopes.
 
-Wang et al. 2023 minimise Σ |P_t - P|², from landing point P to aim P_t, by Adam (baselines/paper.py).  The slopes
-here are those of the transport map (`slope_map.fit_to_map`), or those that send each ray to its aim (`tailor_to_aim`):
-at a known point of the face they follow from Snell's law in closed form.  The spline is linear in its heights, so the
-best fit is a linear least-squares problem, which takes a few preconditioned conjugate-gradient steps.
+Wang et al. 2023 minimise Σ |P_t - P|², from landing point P to aim P_t, by Adam (tailoring/baselines/paper.py).  The
+slopes here are those of the transport map (`slope_map.fit_to_map`), or those that send each ray to its aim
+(`tailor_to_aim`): at a known point of the face they follow from Snell's law in closed form.  The spline is linear in
+its heights, so the best fit is a linear least-squares problem, which takes a few preconditioned conjugate-gradient
+steps.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from bstcad.optics.bspline import BSplineSurface, evaluate, net_gradient
-from bstcad.optics.interfaces import intersect
-from bstcad.optics.kernels.reductions import total
-from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Rays
-from bstcad.optics.reach import wanted_slopes
-from bstcad.optics.receivers import Receiver
-from bstcad.optics.trace import across
-from bstcad.optics.unfolding import image_from_last_net
+from bstcad.optics.lens.interfaces import intersect
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.numerics.reductions import total
+from bstcad.optics.receivers.receivers import Receiver
+from bstcad.optics.surfaces.bspline import BSplineSurface, evaluate, net_gradient
+from bstcad.optics.surfaces.rays import Rays
+from bstcad.optics.trace.reach import wanted_slopes
+from bstcad.optics.trace.trace import across
+from bstcad.optics.trace.unfolding import image_from_last_net
 from bstcad.tailoring.merit import Spectrum
 
 BLOCK_POINTS = 1 << 22  # number of points whose slopes and residuals are in memory together: 0.3 GB

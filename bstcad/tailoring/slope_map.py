@@ -12,10 +12,10 @@ nearly sends all light to m.  The coordinate
 hardly depends on b for a fixed t.  The optimal transport map b -> y is ∇φ of a convex φ, so that σ y + ∇g are the
 slopes of a surface.  σ = 1 where light leaves the glass.  Mirrors, and faces where light enters the glass, deflect
 light against their slope: there σ = -1, so that rays of neighbouring points do not cross.  If there are surfaces behind
-the net, light is aimed at the image of the target through them (optics/unfolding.py).  y still depends on b a little,
-in proportion to t - m.  Therefore each round computes y(t) at the b(t) of the previous round, and the rounds are a
-fixed-point iteration.  At the fixed point the surface solves the Monge-Ampère problem of the system, also off axis, in
-the near field and behind a curved front; g does not change it.
+the net, light is aimed at the image of the target through them (optics/trace/unfolding.py).  y still depends on b a
+little, in proportion to t - m.  Therefore each round computes y(t) at the b(t) of the previous round, and the rounds
+are a fixed-point iteration.  At the fixed point the surface solves the Monge-Ampère problem of the system, also off
+axis, in the near field and behind a curved front; g does not change it.
 
 `map_to_target` and `aim_points` give the map of the paper, from the vertex plane of the first surface to the target,
 and the aim of each ray.  Stage 1 falls back on this map, and the baselines use it.
@@ -31,22 +31,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics import sampling
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.charts import HEIGHTS
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.goal import Goal
-from bstcad.optics.interfaces import Reflect
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline, Rectangle
-from bstcad.optics.rays import Rays
-from bstcad.optics.reach import MAX_EXIT_ANGLE, limit_refraction, reach_margin, wanted_slopes
-from bstcad.optics.receivers import Receiver
-from bstcad.optics.sides import Sides, as_pair
-from bstcad.optics.trace import across, behind, clear_window, is_transmitted
-from bstcad.optics.tubes import rays_to
-from bstcad.optics.unfolding import image_screen
+from bstcad.optics.lens.interfaces import Reflect
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import Receiver
+from bstcad.optics.surfaces import sampling
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.charts import HEIGHTS
+from bstcad.optics.surfaces.outlines import Outline, Rectangle
+from bstcad.optics.surfaces.rays import Rays
+from bstcad.optics.surfaces.sides import Sides, as_pair
+from bstcad.optics.trace.reach import MAX_EXIT_ANGLE, limit_refraction, reach_margin, wanted_slopes
+from bstcad.optics.trace.trace import across, behind, clear_window, is_transmitted
+from bstcad.optics.trace.tubes import rays_to
+from bstcad.optics.trace.unfolding import image_screen
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit, blocks, fit_slopes, monomials, with_polynomial
 from bstcad.transport.density import Density, resample_flux

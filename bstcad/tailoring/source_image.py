@@ -29,15 +29,15 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from bstcad.optics.channels import Channel, Draw
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.irradiance import Screen, tent
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import side_factor, simulated
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.rays import Landed
-from bstcad.optics.sampling import point_pairs
-from bstcad.optics.source_images import landing_pixels
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel, Draw
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.receivers.irradiance import Screen, tent
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.rays import Landed
+from bstcad.optics.surfaces.sampling import point_pairs
+from bstcad.optics.trace.measure import side_factor, simulated
+from bstcad.optics.trace.source_images import landing_pixels
 
 IMAGE_NODES = 5  # nodes t_n per side of the screen; the outermost lie on its edges
 IMAGE_GRID = 32  # cells per side of the back through which the images of the source are traced

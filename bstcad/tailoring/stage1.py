@@ -22,14 +22,14 @@ import numpy as np
 import scipy.optimize
 from torch import Tensor
 
-from bstcad.optics import sampling
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.goal import Goal
-from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Rays
-from bstcad.optics.reach import MAX_EXIT_ANGLE
-from bstcad.optics.sides import as_pair, coarser
-from bstcad.optics.trace import clear_window, trace
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.surfaces import sampling
+from bstcad.optics.surfaces.rays import Rays
+from bstcad.optics.surfaces.sides import as_pair, coarser
+from bstcad.optics.trace.reach import MAX_EXIT_ANGLE
+from bstcad.optics.trace.trace import clear_window, trace
 from bstcad.scene.fronts import CONIC_CONSTANTS
 from bstcad.scene.quality import COARSEST_GRID
 from bstcad.scene.scene import SEARCH_RANGE

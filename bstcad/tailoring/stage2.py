@@ -15,7 +15,7 @@ Adam on the heights needs thousands.  Most rounds of stage 2 have more tubes tha
 For a source of finite size, stage 3 replaces stage 2 and also starts from the surface of stage 1.  It traces the light
 of the centre of the source and blurs the picture by the image of the source (source_image.py), in rounds that increase
 the size of the source to its full size; coarse rounds for the centre alone may precede.  The paper's procedure
-(baselines/paper.py) is an exception: it runs stage 2 for the centre of the source, and then stage 3.
+(tailoring/baselines/paper.py) is an exception: it runs stage 2 for the centre of the source, and then stage 3.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bstcad.optics.channels import Channel, channels_of, points_per_line
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import rrmsd_by_tubes, side_factor
-from bstcad.optics.sides import as_pair, coarser
-from bstcad.optics.source_images import images
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel, channels_of, points_per_line
+from bstcad.optics.surfaces.sides import as_pair, coarser
+from bstcad.optics.trace.measure import rrmsd_by_tubes, side_factor
+from bstcad.optics.trace.source_images import images
 from bstcad.scene.blank import Bounds
 from bstcad.scene.quality import ResolvedTailoring
 from bstcad.tailoring.folds import Folds, needs_no_folds

@@ -23,13 +23,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics import sampling
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.kernels.reductions import total
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Rays
-from bstcad.optics.reach import limit_refraction, slopes_towards
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.numerics.reductions import total
+from bstcad.optics.surfaces import sampling
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.rays import Rays
+from bstcad.optics.trace.reach import limit_refraction, slopes_towards
 from bstcad.scene.quality import COARSEST_GRID
 from bstcad.tailoring import slope_map, stage1
 from bstcad.tailoring.light_behind import LightBehind, light_for_task, without_crossings

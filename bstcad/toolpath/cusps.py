@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bstcad.optics.bspline import Jet, span_points
+from bstcad.optics.surfaces.bspline import Jet, span_points
 from bstcad.toolpath.machined_face import RoundTool
 
 POSITIONS = (0.25, 0.75)  # positions in each knot span at which the cusp is computed

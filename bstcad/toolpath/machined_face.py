@@ -19,10 +19,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics import bspline
-from bstcad.optics.bspline import BSplineSurface, Jet, Spans, span_points
 from bstcad.optics.kernels.tool_contact import MAX_LATTICE, NetFrame, Search, ball_heights, nose_heights
-from bstcad.optics.outlines import Outline, Rectangle
+from bstcad.optics.surfaces import bspline
+from bstcad.optics.surfaces.bspline import BSplineSurface, Jet, Spans, span_points
+from bstcad.optics.surfaces.outlines import Outline, Rectangle
 
 ROLLING = 0.98  # radius of the tool times the largest curvature of a valley, up to which each place has one contact
 POINTS_PER_SPAN = 4  # lattice places per knot span along x and y

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from bstcad.optics.kernels.reductions import on_threads
+from bstcad.optics.numerics.reductions import on_threads
 from bstcad.runs.kernel_cache import compiled_kernel
 from bstcad.toolpath.cusps import Passes
 from bstcad.toolpath.machined_face import MachinedFace

@@ -21,11 +21,13 @@ import torch
 from bstcad.analysis.light import Blur, blur, margins, mount_losses, rrmsd_of_ripple
 from bstcad.analysis.shape import AT_BOUND, Extreme, describe, survey, survey_front
 from bstcad.cad import mesh as meshes
-from bstcad.optics import domes, quadrature
-from bstcad.optics.channels import Channel
-from bstcad.optics.goal import Goal, worst
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import (
+from bstcad.optics.lens import domes, quadrature
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import Face
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.receivers.goal import Goal, worst
+from bstcad.optics.surfaces.outlines import Outline
+from bstcad.optics.trace.measure import (
     FULL,
     RESOLVED,
     Effort,
@@ -36,9 +38,7 @@ from bstcad.optics.measure import (
     squared_distance,
     tubes_of,
 )
-from bstcad.optics.outlines import Outline
-from bstcad.optics.passes import Face
-from bstcad.optics.wavefront_error import WavefrontError, wavefront_error
+from bstcad.optics.trace.wavefront_error import WavefrontError, wavefront_error
 from bstcad.runs.processes import Overdue, Submit, end, result, return_freed, run_here
 from bstcad.scene.accept import Accept
 from bstcad.scene.blank import LensBlank

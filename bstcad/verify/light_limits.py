@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 from bstcad.analysis.far_field import ANGLE_STEP, PLANE_STEP, RAYS, SEED, FarField
 from bstcad.analysis.light_values import GLARE_ANGLES, Estimate, LightSets, glare
-from bstcad.optics.channels import Channel
-from bstcad.optics.goal import Goal
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import SETS, Light
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.trace.measure import SETS, Light
 from bstcad.scene.accept import CutOff, PointLimit, Uniformity, pixel_size, step_of
 from bstcad.scene.scene import Scene
 from bstcad.verify.verdict import Check

@@ -21,12 +21,12 @@ from bstcad.analysis.shape import thickness_range
 from bstcad.cad import mounting, solid_properties, step_reading
 from bstcad.cad.solid_properties import WholePart
 from bstcad.cad.step_reading import StatedFace, StatedSolid, StepLens
-from bstcad.optics import domes
-from bstcad.optics.bspline import BSplineSurface, is_net
-from bstcad.optics.lens import Lens
-from bstcad.optics.passes import LENS, Passes
-from bstcad.optics.quadrature import MassProperties
-from bstcad.optics.surfaces import Surface, sampled
+from bstcad.optics.lens import domes
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import LENS, Passes
+from bstcad.optics.lens.quadrature import MassProperties
+from bstcad.optics.surfaces.bspline import BSplineSurface, is_net
+from bstcad.optics.surfaces.surfaces import Surface, sampled
 from bstcad.runs import processes
 from bstcad.scene.mount import Mount, Part
 from bstcad.step_text import part21

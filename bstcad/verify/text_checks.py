@@ -11,10 +11,10 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from bstcad.optics.bspline import knots
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline
-from bstcad.optics.quadrature import MassProperties
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.quadrature import MassProperties
+from bstcad.optics.surfaces.bspline import knots
+from bstcad.optics.surfaces.outlines import Outline
 from bstcad.scene.mount import Part
 from bstcad.step_text.part21 import FreeformSurface, StepText, ValidationProperties
 from bstcad.verify.verdict import Check

@@ -24,7 +24,7 @@ RECORDS = {  # JSON file: (module, names of its records), with the record of the
         ("verify/verdict.py", ["Check"]),
         ("verify/light_limits.py", ["LightValue"]),
         ("analysis/light.py", ["Blur", "FinestDetail"]),
-        ("judges/comparison.py", ["Judge"]),
+        ("verify/judges/comparison.py", ["Judge"]),
         ("report/prescription.py", ["Order"]),
     ],
     "tolerance.json": [
@@ -33,10 +33,10 @@ RECORDS = {  # JSON file: (module, names of its records), with the record of the
             ["Tolerances", "Grade", "Sensitivity", "Trial", "Inverse", "TargetStudy", "WavefrontStudy"],
         )
     ],
-    "batch.json": [("sweep/batch.py", ["Batch", "BatchEntry"])],
+    "batch.json": [("planning/batch.py", ["Batch", "BatchEntry"])],
     "tradeoff.json": [
-        ("sweep/results.py", ["TradeoffTable", "TableKnob", "Calibration", "Preset", "KnobPoint"]),
-        ("sweep/cold_run.py", ["ColdRun", "HistoryPoint"]),
+        ("planning/results.py", ["TradeoffTable", "TableKnob", "Calibration", "Preset", "KnobPoint"]),
+        ("planning/cold_run.py", ["ColdRun", "HistoryPoint"]),
     ],
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from bstcad.analysis.cell_errors import is_right, right_down_to
-from bstcad.optics.measure import CellError
+from bstcad.optics.trace.measure import CellError
 
 SIZES = (4.0, 2.0, 1.0, 0.5, 0.25)
 

@@ -7,8 +7,8 @@ import pytest
 
 import bstcad
 from bstcad.analysis.etendue import FORBIDDEN, Silhouette, etendue
-from bstcad.sweep.plan import plan
-from tests.sweep.conftest import typical_pilot
+from bstcad.planning.plan import plan
+from tests.planning.conftest import typical_pilot
 
 LAMP = {
     "name": "lamp",
@@ -77,7 +77,7 @@ def test_a_hemisphere_is_seen_as_a_disc_and_a_half():
 
 
 def test_a_plan_begins_with_it(monkeypatch):
-    monkeypatch.setattr("bstcad.sweep.plan.run_pilot", typical_pilot)
+    monkeypatch.setattr("bstcad.planning.plan.run_pilot", typical_pilot)
     scene = bstcad.load("templates/disk.toml").changed(
         LAMP | CHIP | {"target.outline": {"shape": "circle", "radius": 0.3}}
     )

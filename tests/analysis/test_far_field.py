@@ -10,16 +10,16 @@ import pytest
 
 import bstcad
 from bstcad.analysis.far_field import SEED, FarField, default_grid, grid_of
-from bstcad.optics.channels import Channel
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.directions import Directions
-from bstcad.optics.irradiance import Screen, leaving
-from bstcad.optics.losses import FresnelLoss, Losses
-from bstcad.optics.measure import GHOST_DIVISOR, simulated
-from bstcad.optics.outlines import Circle
-from bstcad.optics.point import Point
-from bstcad.optics.surfaces import Plane
-from bstcad.optics.trace import ghost_light
+from bstcad.optics.lens.losses import FresnelLoss, Losses
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.directions import Directions
+from bstcad.optics.receivers.irradiance import Screen, leaving
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.surfaces import Plane
+from bstcad.optics.trace.measure import GHOST_DIVISOR, simulated
+from bstcad.optics.trace.trace import ghost_light
 from bstcad.photometry import intensity_files, ray_files
 from bstcad.photometry.intensity import Intensity
 from tests.lenses import lens_of, net

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from bstcad.analysis.leaving_rays import rays_behind
-from bstcad.optics.channels import Channel
-from bstcad.optics.irradiance import Screen, leaving
-from bstcad.optics.losses import FresnelLoss, Losses
-from bstcad.optics.measure import simulated
-from bstcad.optics.outlines import Circle
-from bstcad.optics.point import Point
-from bstcad.optics.surfaces import Plane
+from bstcad.optics.lens.losses import FresnelLoss, Losses
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.irradiance import Screen, leaving
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.surfaces import Plane
+from bstcad.optics.trace.measure import simulated
 from tests.lenses import lens_of, wavy
 
 LENS = lens_of(wavy(), Plane(12.0), Circle(9.0), 1.5)

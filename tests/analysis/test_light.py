@@ -20,15 +20,15 @@ from bstcad.analysis.light import (
     needed_apertures,
     ray_map,
 )
-from bstcad.optics.channels import Channel
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.source_images import even_image, images
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Plane, Sphere
+from bstcad.optics.trace.source_images import even_image, images
 from tests.lenses import net
 
 INDEX = 1.5

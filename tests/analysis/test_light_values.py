@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from bstcad.analysis.light_values import LightSets, glare
-from bstcad.optics.channels import Channel
-from bstcad.optics.directions import Directions
-from bstcad.optics.irradiance import Screen, landed_flux
-from bstcad.optics.measure import Effort, measure
-from bstcad.optics.outlines import Circle
-from bstcad.optics.point import Point
-from bstcad.optics.surfaces import Plane
-from bstcad.optics.trace import trace, window
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.directions import Directions
+from bstcad.optics.receivers.irradiance import Screen, landed_flux
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.surfaces import Plane
+from bstcad.optics.trace.measure import Effort, measure
+from bstcad.optics.trace.trace import trace, window
 from bstcad.photometry.intensity import Intensity
 from tests.lenses import lens_of, wavy
 

@@ -8,14 +8,14 @@ import pytest
 
 from bstcad.analysis import neglected_effects
 from bstcad.analysis.neglected_effects import Reference, Spline, blur_by_gaussian, difference, to_pixels
-from bstcad.optics.channels import Channel
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.losses import AbsorptionLoss, FresnelLoss, Losses
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.surfaces import Plane
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Plane
 from tests.lenses import tilted
 
 INDEX, THICKNESS = 1.5, 4.0

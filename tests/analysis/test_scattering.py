@@ -9,11 +9,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from bstcad.analysis.scattering import Scatter
-from bstcad.optics.finish import Finish
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.passes import SECOND_SURFACE
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import SECOND_SURFACE
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.surfaces import Plane, Sphere
+from bstcad.optics.trace.finish import Finish
 from tests.lenses import net
 
 N, LINE = 1.49, 550.0  # index; wavelength, nm

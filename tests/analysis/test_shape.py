@@ -12,10 +12,10 @@ import torch
 from scipy.interpolate import BSpline
 
 from bstcad.analysis.shape import describe, ripple, slope_octaves, survey, thickness_range
-from bstcad.optics.bspline import BSplineSurface, knots
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import BSplineSurface, knots
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Plane, Sphere
 from tests.lenses import half_over, net
 
 M = 65

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from bstcad.analysis.steepness import MAX_SLOPE_DEG, needed_steepness
-from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle
-from bstcad.optics.point import Point
-from bstcad.optics.surfaces import Recess, Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.surfaces import Recess, Sphere
 from tests.lenses import net
 
 N, HEIGHT, FAR, PIXELS = 1.5, 15.0, 1e7, 40

@@ -53,8 +53,8 @@ QUICK_PREVIEWS = """
 from dataclasses import replace
 from bstcad.app import preview, preview_desk
 from bstcad.cli import main
-from bstcad.sweep import plan
-from tests.sweep.conftest import typical_pilot
+from bstcad.planning import plan
+from tests.planning.conftest import typical_pilot
 preview_desk.QUICK = replace(preview.QUICK, net=33, tubes=64, rounds=1, evaluations=3, blurred=2)
 preview_desk.REFINED = replace(preview.QUICK, net=49, tubes=96, rounds=1, evaluations=4, blurred=2)
 preview.preview.__defaults__ = preview_desk.QUICK, *preview.preview.__defaults__[1:]  # that of the first scene, too

@@ -23,17 +23,17 @@ WITHOUT_BOUND = {  # caches without a bound, and the reason why no request makes
         (
             "app.form._kind_meanings", "app.form.environment", "report.light_figures.srgb_grey", "report.manual.pages",
             "report.manual.sections", "report.part_views._letters", "report.units._plain_text",
-            "report.units.environment", "runs.environment.version", "scene.schema.schema", "sweep.prediction.pace",
+            "report.units.environment", "runs.environment.version", "scene.schema.schema", "planning.prediction.pace",
         ),
         "the function has no argument",
     ),
-    "optics.kernels.compiling._caches": "the argument is a setting of numba",
-    "optics.kernels.reductions._pool": "the argument is the number of threads of torch",
-    "optics.ops._loaded": "the argument is the name of a kernel",
-    "optics.quadrature.gauss_rule": "the argument is a constant of the package",
+    "optics.numerics.compiling._caches": "the argument is a setting of numba",
+    "optics.numerics.reductions._pool": "the argument is the number of threads of torch",
+    "optics.numerics.ops._loaded": "the argument is the name of a kernel",
+    "optics.lens.quadrature.gauss_rule": "the argument is a constant of the package",
     "report.record._adapter": "the argument is a class of the package",
-    "sweep.cold_run.calibration_kernel": "the argument is a constant of the package",
-    "tolerance.study._cardinal": "the argument is an entry of SPLINE_NODES",
+    "planning.cold_run.calibration_kernel": "the argument is a constant of the package",
+    "manufacture.tolerance.study._cardinal": "the argument is an entry of SPLINE_NODES",
 }  # fmt: skip
 WINDOW = {"kind": "window", "z": 1.0, "thickness": 1.0, "material": "PMMA"}
 WINDOW |= {"outline": {"shape": "circle", "diameter": 40.0}}
@@ -122,6 +122,6 @@ def test_previews_of_several_sizes_leave_no_more_than_one_does(found, tmp_path):
         kept.append({name: megabytes(found[name]) for name in large})
         tables.append(sizes())
     assert counts[0] == counts[1] == counts[2] and tables[0] == tables[1] == tables[2]
-    assert kept[0]["optics.trace._useful"] > 0.3  # the law of this lamp, MB
+    assert kept[0]["optics.trace.trace._useful"] > 0.3  # the law of this lamp, MB
     assert all(kept[2][name] < size + 0.05 for name, size in kept[0].items()), kept
     assert len(_SHARED) < 10

@@ -10,7 +10,7 @@ import pytest
 from bstcad.app import dome_offer
 from bstcad.app.followers import take_change
 from bstcad.app.scene_text import changed
-from bstcad.optics.point import Point
+from bstcad.optics.light.point import Point
 from bstcad.runs.files import SentenceError
 from bstcad.scene.scene import of_text
 from tests.app.conftest import PATIENCE, SEEN

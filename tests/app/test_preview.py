@@ -14,11 +14,11 @@ from bstcad.app import preview_json
 from bstcad.app.preview import Outdated, PreviewSize, preview
 from bstcad.app.preview_desk import STAGES, PreviewDesk, PreviewRequest
 from bstcad.app.preview_json import DARK_SHAPE_ERROR, MIN_LIT_FRACTION, SHAPE_ERROR, figures
-from bstcad.optics.measure import tubes_picture
+from bstcad.optics.trace.measure import tubes_picture
 from bstcad.report.units import quantity
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
-from tests.sweep.conftest import typical_pilot
+from tests.planning.conftest import typical_pilot
 
 SMALL = {"tailoring.quality": "draft", "lens.back.control_points": 129, "target.pixels": 64}
 NEAR = 0.05  # RRMSD between two pictures
@@ -98,7 +98,7 @@ def test_the_desk_answers_the_newest_request_of_each_page_in_order(monkeypatch):
     """Previews are small, and predictions have no pilots."""
     monkeypatch.setattr("bstcad.app.preview_desk.QUICK", FEW)
     monkeypatch.setattr("bstcad.app.preview_desk.REFINED", MORE)
-    monkeypatch.setattr("bstcad.sweep.plan.run_pilot", typical_pilot)
+    monkeypatch.setattr("bstcad.planning.plan.run_pilot", typical_pilot)
     desk = PreviewDesk()
     scene = load("templates/disk.toml", {"lens.back.control_points": 33, "target.pixels": 16})
     try:

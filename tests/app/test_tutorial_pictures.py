@@ -12,8 +12,8 @@ from PIL import Image
 
 import bstcad
 from bstcad.app.preview import QUICK, REFINED
-from bstcad.optics.surfaces import sag
-from bstcad.tolerance.grades import GRADES
+from bstcad.manufacture.tolerance.grades import GRADES
+from bstcad.optics.surfaces.surfaces import sag
 from tests.app.conftest import begin
 
 TUTORIALS = Path(__file__).parents[2] / "docs" / "tutorials"

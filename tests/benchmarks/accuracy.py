@@ -32,14 +32,14 @@ import psutil
 import torch
 
 from bstcad.folder import read_nominal
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import measure
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.trace.measure import measure
+from bstcad.planning.cold_run import REFERENCE_EFFORT, round_numbers
+from bstcad.planning.prediction import pace
+from bstcad.planning.results import draw_legend, draw_runs
 from bstcad.report.drawing import new_figure, png, styled
 from bstcad.runs import environment, files
 from bstcad.scene.scene import load
-from bstcad.sweep.cold_run import REFERENCE_EFFORT, round_numbers
-from bstcad.sweep.prediction import pace
-from bstcad.sweep.results import draw_legend, draw_runs
 from tests import markdown
 from tests.benchmarks import growth
 from tests.benchmarks.cold import ROOT, TEMPLATES, generate
@@ -106,7 +106,7 @@ class Named(SimpleNamespace):
 
     @property
     def time_and_error(self):
-        """Time (seconds) and RRMSD of a run, as of `sweep.cold_run.ColdRun`."""
+        """Time (seconds) and RRMSD of a run, as of `planning.cold_run.ColdRun`."""
         return self.seconds, self.rrmsd
 
 

@@ -30,11 +30,11 @@ from skimage.data import astronaut
 from bstcad.cad import mesh as meshes
 from bstcad.cad import step_reading, step_writing
 from bstcad.folder import Made, write_geometry
-from bstcad.optics.channels import Channel
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort
-from bstcad.optics.sampling import grid
-from bstcad.optics.tubes import launch_tubes
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.surfaces.sampling import grid
+from bstcad.optics.trace.measure import Effort
+from bstcad.optics.trace.tubes import launch_tubes
 from bstcad.pipeline import design
 from bstcad.scene.scene import Scene, load
 from bstcad.step_text import part21

@@ -20,8 +20,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 from skimage import data
 
-from bstcad.optics.measure import Effort, rrmsds_by_rays
-from bstcad.optics.sides import as_pair, coarser, spread
+from bstcad.optics.surfaces.sides import as_pair, coarser, spread
+from bstcad.optics.trace.measure import Effort, rrmsds_by_rays
 from bstcad.pipeline import design
 from bstcad.scene.scene import Scene, load
 from tests.benchmarks.cold import TEMPLATES

@@ -25,9 +25,9 @@ from PIL import Image, ImageOps
 from skimage.metrics import structural_similarity
 
 from bstcad.folder import read_nominal
+from bstcad.planning.cold_run import round_numbers
 from bstcad.report.light_figures import View
 from bstcad.runs import files
-from bstcad.sweep.cold_run import round_numbers
 from tests import markdown
 from tests.benchmarks import accuracy
 from tests.benchmarks.cold import ROOT, TEMPLATES, generate

@@ -18,12 +18,12 @@ import psutil
 import pytest
 
 from bstcad import commands
+from bstcad.manufacture.tolerance import tolerancing
+from bstcad.manufacture.tolerance.study import StudySettings
+from bstcad.planning import batch as batches
+from bstcad.planning.batch import BatchScene
 from bstcad.runs import cluster
 from bstcad.scene.scene import load
-from bstcad.sweep import batch as batches
-from bstcad.sweep.batch import BatchScene
-from bstcad.tolerance import tolerancing
-from bstcad.tolerance.study import StudySettings
 from tests.benchmarks.cold import TEMPLATES
 
 pytestmark = pytest.mark.bench

@@ -14,9 +14,11 @@ from unittest import mock
 import pytest
 import torch
 
-from bstcad.optics import bspline, ops, tubes
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.trace import from_first_net, to_first_net
+from bstcad.optics.numerics import ops
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces import bspline
+from bstcad.optics.trace import tubes
+from bstcad.optics.trace.trace import from_first_net, to_first_net
 from bstcad.scene import scene
 from tests.benchmarks.growth import SERIES, exponent, last_step, measured
 from tests.lenses import net

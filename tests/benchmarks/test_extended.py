@@ -15,8 +15,8 @@ import pytest
 from scipy.signal import fftconvolve
 
 from bstcad.analysis.light import blur
-from bstcad.optics.measure import measure, side_factor, tubes_picture
-from bstcad.optics.source_images import images
+from bstcad.optics.trace.measure import measure, side_factor, tubes_picture
+from bstcad.optics.trace.source_images import images
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.run import Driver, Task

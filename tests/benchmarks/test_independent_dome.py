@@ -13,16 +13,16 @@ from OCP.TColgp import TColgp_Array2OfPnt
 from OCP.TColStd import TColStd_Array1OfInteger, TColStd_Array1OfReal
 from scipy.interpolate import BSpline
 
-from bstcad.optics import trace
-from bstcad.optics.charts import SphereChart
-from bstcad.optics.directions import Directions
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle
-from bstcad.optics.point import Point
-from bstcad.optics.radial import RadialSurface
-from bstcad.optics.sphere_light import SphereLight
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.point import Point
+from bstcad.optics.light.sphere_light import SphereLight
+from bstcad.optics.receivers.directions import Directions
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.charts import SphereChart
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.radial import RadialSurface
+from bstcad.optics.surfaces.surfaces import Sphere
+from bstcad.optics.trace import trace
 from tests.benchmarks import independent_dome, judged_dome
 from tests.benchmarks.cold import generate
 from tests.benchmarks.independent import Conic

@@ -20,23 +20,23 @@ from scipy.ndimage import binary_dilation
 
 from bstcad.cad import step_reading, step_writing
 from bstcad.cad.solid import lens_solid
-from bstcad.judges import comparison, mitsuba
-from bstcad.optics.bspline import DEGREE, knots
-from bstcad.optics.lens import Lens
-from bstcad.optics.losses import FresnelLoss, Losses
-from bstcad.optics.measure import tubes_picture
-from bstcad.optics.quadrature import of_lens
-from bstcad.optics.trace import ghost_light, to_first_net, trace_ghost
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.losses import FresnelLoss, Losses
+from bstcad.optics.lens.quadrature import of_lens
+from bstcad.optics.surfaces.bspline import DEGREE, knots
+from bstcad.optics.trace.measure import tubes_picture
+from bstcad.optics.trace.trace import ghost_light, to_first_net, trace_ghost
 from bstcad.pipeline import design
 from bstcad.report.grid_sag import GridSag
 from bstcad.scene.new_scene import templates
 from bstcad.scene.scene import Scene, load
+from bstcad.verify.judges import comparison, mitsuba
 from tests.benchmarks.cold import TEMPLATES
 from tests.cad.test_dome import CASES
 from tests.cad.test_trimming import plate
-from tests.judges.paths import paths_apart
 from tests.report.test_exports import read_zemax
 from tests.tracing import launch
+from tests.verify.judges.paths import paths_apart
 
 pytestmark = pytest.mark.bench
 
@@ -135,7 +135,7 @@ EXACT = 0.9
 
 
 def test_rays_land_where_batoid_has_them(sphere):
-    """The landings show an index that is off by 2e-7 (tests/judges/test_optical_path.py)."""
+    """The landings show an index that is off by 2e-7 (tests/verify/judges/test_optical_path.py)."""
     [channel] = sphere.scene.channels()
     apart = paths_apart(channel.through(sphere.lens), channel.source, sphere.scene.target.z)
     print(f"\n{apart.rays} rays, a metre's throw: {apart.place:.1e} mm apart", end="")
@@ -145,7 +145,7 @@ def test_rays_land_where_batoid_has_them(sphere):
 def test_the_ghost_lands_where_batoid_has_it(sphere):
     """Down again from the back and up again from the front; rays that meet the back off batoid's grid are left out."""
     program, lens, screen = pytest.importorskip("batoid"), sphere.lens, sphere.scene.target.screen
-    from bstcad.judges import batoid
+    from bstcad.verify.judges import batoid
 
     scene = sphere.scene
     rays = launch(scene.channels()[0].source, lens, RAYS, seed=3)

@@ -10,13 +10,13 @@ import photompy
 import pytest
 
 import bstcad
-from bstcad.optics.directions import Directions
-from bstcad.optics.irradiance import leaving
+from bstcad.optics.receivers.directions import Directions
+from bstcad.optics.receivers.irradiance import leaving
 from bstcad.photometry import eulumdat, tm25
 from bstcad.photometry.intensity import Luminaire, checked
 from bstcad.photometry.ray_set import RaySet
+from bstcad.planning.prediction import pace
 from bstcad.scene.scene import load
-from bstcad.sweep.prediction import pace
 from tests.benchmarks.cold import TEMPLATES
 from tests.photometry.other_readers import assert_is_an_l, read_by_others
 

@@ -12,13 +12,13 @@ import pytest
 
 from bstcad import pipeline
 from bstcad.analysis.neglected_effects import difference
-from bstcad.optics import media
-from bstcad.optics.channels import channels_of
-from bstcad.optics.measure import tubes_picture
-from bstcad.optics.trace import ghost_light
+from bstcad.optics.lens import media
+from bstcad.optics.light.channels import channels_of
+from bstcad.optics.trace.measure import tubes_picture
+from bstcad.optics.trace.trace import ghost_light
+from bstcad.planning.estimates import DEFAULT_DIAMETER, DEFAULT_DIVERGENCE, band, coarse_lens, left_out
 from bstcad.scene.effects import Absorption, Fresnel
 from bstcad.scene.scene import load
-from bstcad.sweep.estimates import DEFAULT_DIAMETER, DEFAULT_DIVERGENCE, band, coarse_lens, left_out
 from tests.benchmarks.cold import TEMPLATES
 
 pytestmark = pytest.mark.bench

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from bstcad.optics.sides import side
-from bstcad.sweep.net_choice import choose_net
-from bstcad.sweep.prediction import typical_seconds
+from bstcad.optics.surfaces.sides import side
+from bstcad.planning.net_choice import choose_net
+from bstcad.planning.prediction import typical_seconds
 from tests.benchmarks.net_scenes import CASES, FIGURES, NET, scene_of, with_net
 
 KNOWN = json.loads(FIGURES.read_text())

@@ -10,9 +10,9 @@ import math
 
 import pytest
 
+from bstcad.planning.net_choice import with_net
+from bstcad.planning.prediction import INTERVAL_FACTORS, PILOT_QUALITIES, predict, run_pilot
 from bstcad.scene.scene import load
-from bstcad.sweep.net_choice import with_net
-from bstcad.sweep.prediction import INTERVAL_FACTORS, PILOT_QUALITIES, predict, run_pilot
 from tests.benchmarks.cold import ROOT, TEMPLATES, generate
 from tests.benchmarks.judged_cells import HALF, stated_by_cell
 

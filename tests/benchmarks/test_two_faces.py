@@ -10,11 +10,11 @@ import tomli_w
 import torch
 
 from bstcad import folder as folders
-from bstcad.optics.wavefront import MM_PER_NM
-from bstcad.optics.wavefront_error import optical_path
+from bstcad.optics.light.wavefront import MM_PER_NM
+from bstcad.optics.trace.wavefront_error import optical_path
 from tests.benchmarks.beam_shaper import BeamShaper
 from tests.benchmarks.cold import TEMPLATES, generate
-from tests.judges.paths import paths_apart
+from tests.verify.judges.paths import paths_apart
 
 pytestmark = pytest.mark.bench
 

@@ -19,7 +19,7 @@ import pytest
 from PIL import Image
 
 from bstcad.cad import step_reading
-from bstcad.optics.measure import tubes_picture
+from bstcad.optics.trace.measure import tubes_picture
 from bstcad.scene.picture import from_srgb, to_srgb
 from bstcad.scene.scene import load
 from bstcad.scene.target import Target, drawing

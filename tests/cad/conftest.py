@@ -9,11 +9,11 @@ import torch
 
 from bstcad.cad import step_writing
 from bstcad.cad.solid import named_solid
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Outline, Rectangle
-from bstcad.optics.quadrature import of_lens
-from bstcad.optics.surfaces import Plane, Surface
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.quadrature import of_lens
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Outline, Rectangle
+from bstcad.optics.surfaces.surfaces import Plane, Surface
 from bstcad.scene.mount import Part
 from tests.lenses import half_over, net, rough
 

@@ -11,10 +11,10 @@ from OCP.Geom import Geom_BSplineSurface
 
 from bstcad.cad import cavity, mounting
 from bstcad.cad.solid import named_solid
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.surfaces import Sphere
 from bstcad.scene.moulding import Moulding
 from bstcad.scene.mount import Mount, Part
 from tests.cad.test_dome import dome

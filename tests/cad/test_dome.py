@@ -12,12 +12,12 @@ from bstcad.analysis.shape import survey
 from bstcad.cad import dome_mesh, mesh, mounting, solid, solid_properties, step_reading, step_writing
 from bstcad.cad.radial_nets import radial_surface
 from bstcad.cad.walls import Draft
-from bstcad.optics import domes, quadrature
-from bstcad.optics.charts import SphereChart
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.radial import RadialSurface
-from bstcad.optics.surfaces import Conic, Plane, Sphere
+from bstcad.optics.lens import domes, quadrature
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.charts import SphereChart
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.radial import RadialSurface
+from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere
 from bstcad.scene.mount import Flange, Mount, Part, Round
 from bstcad.step_text import part21
 from bstcad.verify import step_checks

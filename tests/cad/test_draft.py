@@ -12,8 +12,8 @@ from bstcad.cad.mounting import PlacedLens, mounted, wire
 from bstcad.cad.solid import lens_solid, named_solid
 from bstcad.cad.solid_properties import of_solid
 from bstcad.cad.walls import Draft
-from bstcad.optics.outlines import Circle
-from bstcad.optics.surfaces import Sphere, sag
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.surfaces import Sphere, sag
 from bstcad.scene.mount import LAND, Box, Round
 from bstcad.step_text import part21
 from tests.cad.test_mounting import disc

@@ -13,9 +13,9 @@ import trimesh
 
 from bstcad.cad import mesh
 from bstcad.cad.mesh import Mesh, chordal_error, is_closed, lens_mesh, volume_and_area
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Plane, Sphere, sag
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Plane, Sphere, sag
 from bstcad.verify.checks import VERTEX_ROUNDING
 from tests.exact_volume import exact_volume
 from tests.lenses import lens_of, net

@@ -10,7 +10,7 @@ from cadquery import Location, Vector
 
 from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.step_text import part21
 from bstcad.verify import step_checks
 from tests.cad.conftest import FRONT, OUTLINE, rough_back

@@ -13,8 +13,8 @@ import trimesh
 from bstcad.cad import mesh
 from bstcad.cad.mesh import MIRROR_RGBA, Label, Mesh, chordal_error
 from bstcad.cad.solid import coarse_copy, lens_solid
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Plane, Sphere, sag
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Plane, Sphere, sag
 from tests.cad.test_trimming import plate, waves
 from tests.exact_volume import exact_volume
 

@@ -15,9 +15,9 @@ from OCP.ShapeAnalysis import ShapeAnalysis_ShapeTolerance
 from bstcad.cad import patches, step_reading, step_writing, walls, wires
 from bstcad.cad.patches import back_patch, conic_net, front_patch
 from bstcad.cad.solid import image, lens_solid
-from bstcad.optics.bspline import knots
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
+from bstcad.optics.surfaces.bspline import knots
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere, sag
 from bstcad.step_text import part21
 from tests.cad.test_trimming import occ_volume
 from tests.exact_volume import exact_volume

@@ -14,9 +14,9 @@ from scipy.interpolate import NdBSpline
 from bstcad import commands
 from bstcad.cad import step_reading, step_writing
 from bstcad.cad.solid import lens_solid
-from bstcad.optics.bspline import knots, parameter
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.surfaces.bspline import knots, parameter
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Sphere
 from bstcad.runs import processes
 from bstcad.runs.files import SceneError
 from bstcad.step_text import part21

@@ -7,7 +7,7 @@ import pytest
 
 from bstcad import folder
 from bstcad.cad import patches, step_writing
-from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.scene.scene import load
 
 M = 67  # control points a side: more than patches.SMALL_NET in all

@@ -17,13 +17,13 @@ from bstcad import cli
 from bstcad.cad import patches, solid_properties, step_reading
 from bstcad.cad.tiles import tiles_of
 from bstcad.cad.tiling import Tiling
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.irradiance import Screen, collect
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.quadrature import of_lens
-from bstcad.optics.surfaces import Conic, Plane, Recess, Sphere
-from bstcad.optics.trace import trace
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.quadrature import of_lens
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.receivers.irradiance import Screen, collect
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Conic, Plane, Recess, Sphere
+from bstcad.optics.trace.trace import trace
 from bstcad.scene.errors import SceneError
 from bstcad.scene.mount import Part
 from tests.cad.conftest import rough_back

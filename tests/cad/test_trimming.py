@@ -17,9 +17,9 @@ from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Conic, Plane, Sphere, sag
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere, sag
 from bstcad.step_text import part21
 from tests.exact_volume import exact_volume
 from tests.lenses import net, rough

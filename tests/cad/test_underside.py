@@ -14,10 +14,10 @@ import trimesh
 from bstcad.cad import mesh, solid_properties, step_reading, step_writing
 from bstcad.cad.mounting import part_of
 from bstcad.cad.solid import lens_solid, named_solid
-from bstcad.optics import quadrature
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Conic, Recess, Sphere
+from bstcad.optics.lens import quadrature
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Conic, Recess, Sphere
 from bstcad.scene.mount import Flange, Mount, Round
 from bstcad.verify import step_checks
 from tests.lenses import half_over, net

@@ -11,8 +11,8 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 
-from bstcad.optics.bspline import knots
-from bstcad.optics.lens import Lens
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import knots
 
 DIGITS = 60
 SMALL = Decimal(10) ** -45  # mm: where Newton's method ends

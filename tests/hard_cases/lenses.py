@@ -10,12 +10,13 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
-from bstcad.optics import ops, trace
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.kernels import forward
-from bstcad.optics.lens import Lens
-from bstcad.optics.rays import Landed, Rays
-from bstcad.optics.receivers import LevelPlane
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.numerics import ops
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.rays import Landed, Rays
+from bstcad.optics.trace import trace
 from tests.tracing import from_first_net_plain
 
 DTYPES = pytest.mark.parametrize("dtype", (torch.float32, torch.float64), ids=("float32", "float64"))

@@ -18,15 +18,15 @@ from unittest import mock
 import pytest
 import torch
 
-from bstcad.optics import trace, tubes
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.irradiance import Screen, collect
 from bstcad.optics.kernels import forward
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.rays import Rays, Status
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.irradiance import Screen, collect
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.rays import Rays, Status
+from bstcad.optics.surfaces.surfaces import Sphere
+from bstcad.optics.trace import trace, tubes
 from tests.hard_cases.lenses import DTYPES, ENGINES, tracing
 from tests.lenses import bundle, lens_of, uniform, wavy
 from tests.tracing import stratified

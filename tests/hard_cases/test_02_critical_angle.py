@@ -16,15 +16,15 @@ from decimal import Decimal, localcontext
 import pytest
 import torch
 
-from bstcad.optics import tubes
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.interfaces import MIN_COS_REFRACTION, Refract
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.outlines import Circle
-from bstcad.optics.point import Point
-from bstcad.optics.rays import Rays, Status
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Plane
+from bstcad.optics.lens.interfaces import MIN_COS_REFRACTION, Refract
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.rays import Rays, Status
+from bstcad.optics.surfaces.surfaces import Plane
+from bstcad.optics.trace import tubes
 from tests.by_slope import deflect
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import DTYPES, NAMES, eps, landing_gradient, largest

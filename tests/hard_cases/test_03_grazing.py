@@ -14,16 +14,16 @@ from decimal import localcontext
 import pytest
 import torch
 
-from bstcad.optics import trace
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.interfaces import Refract
 from bstcad.optics.kernels import forward
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.rays import Status
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import MIN_COS2, Plane, Sphere
+from bstcad.optics.lens.interfaces import Refract
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.rays import Status
+from bstcad.optics.surfaces.surfaces import MIN_COS2, Plane, Sphere
+from bstcad.optics.trace import trace
 from tests.by_slope import deflect, intersect
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import DTYPES, ENGINES, NAMES, eps, first_crossing, largest, tracing

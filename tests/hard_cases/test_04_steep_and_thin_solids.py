@@ -25,10 +25,10 @@ from OCP.StlAPI import StlAPI_Writer
 from bstcad.analysis.shape import describe
 from bstcad.cad import mesh as meshes
 from bstcad.cad import step_reading, step_writing
-from bstcad.optics.bspline import BSplineSurface, knots
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Outline, Rectangle
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import BSplineSurface, knots
+from bstcad.optics.surfaces.outlines import Circle, Outline, Rectangle
+from bstcad.optics.surfaces.surfaces import Plane, Sphere
 from bstcad.scene.scene import MESH_TOLERANCE
 from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks

@@ -15,15 +15,15 @@ import math
 import pytest
 import torch
 
-from bstcad.optics import trace
-from bstcad.optics.bspline import BSplineSurface
 from bstcad.optics.kernels import forward
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle
-from bstcad.optics.point import Point
-from bstcad.optics.rays import Status
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.rays import Status
+from bstcad.optics.surfaces.surfaces import Plane, Sphere
+from bstcad.optics.trace import trace
 from tests.by_slope import intersect
 from tests.hard_cases.lenses import DTYPES, ENGINES, NAMES, eps, first_crossing, largest, tracing
 from tests.lenses import SQUARE, N, bundle, net, places, uniform

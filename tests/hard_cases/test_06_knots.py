@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import bspline
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.collimated import Collimated
 from bstcad.optics.kernels import forward, spline
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Plane
-from bstcad.optics.trace import to_first_net
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces import bspline
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.surfaces import Plane
+from bstcad.optics.trace.trace import to_first_net
 from tests.hard_cases.lenses import DTYPES, NAMES, eps, largest, tracing
 from tests.lenses import uniform
 

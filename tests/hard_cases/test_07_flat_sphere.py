@@ -14,13 +14,13 @@ from decimal import Decimal, localcontext
 import pytest
 import torch
 
-from bstcad.optics import trace
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.rays import Status
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.rays import Status
+from bstcad.optics.surfaces.surfaces import Plane, Sphere
+from bstcad.optics.trace import trace
 from tests.by_slope import intersect
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import DTYPES, NAMES, engines, eps, largest

@@ -14,14 +14,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.optics import tubes
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Sphere
+from bstcad.optics.trace import tubes
 from tests.hard_cases import exact
 from tests.hard_cases.lenses import DTYPES, NAMES, engines, eps
 from tests.lenses import lens_of, uniform, wavy

@@ -11,16 +11,17 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bstcad.optics import bspline, ops, trace, tubes
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import reductions
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Rays
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Plane
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.numerics import ops, reductions
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces import bspline
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.rays import Rays
+from bstcad.optics.surfaces.surfaces import Plane
+from bstcad.optics.trace import trace, tubes
 from tests.tracing import simulated
 
 HITS = 20_000_000

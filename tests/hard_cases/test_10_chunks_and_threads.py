@@ -2,7 +2,7 @@
 
 optiland #739: 1 W became 1.405 W when rays were traced in batches.  And where each thread has a sum of its own, the
 last bit depends on the number of threads, which a line search turns into another lens.  Here the number of parts of a
-sum depends on the number of rays only (bstcad/optics/kernels/reductions.py), so that image, flux, merit, gradient and
+sum depends on the number of rays only (bstcad/optics/numerics/reductions.py), so that image, flux, merit, gradient and
 the design itself are the same bits from any number of threads; other strips and the plain form differ by rounding.
 """
 
@@ -21,23 +21,25 @@ import pytest
 import torch
 
 from bstcad import pipeline
-from bstcad.baselines.paper import TentMerit
-from bstcad.optics import ops, sampling, tubes
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.channels import Channel
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.losses import AbsorptionLoss, FresnelLoss, Losses
-from bstcad.optics.measure import RayTubes
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Sphere
-from bstcad.optics.trace import Simulation, from_first_net, to_first_net
-from bstcad.optics.wavefront import SphericalWave
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.point import Point
+from bstcad.optics.light.wavefront import SphericalWave
+from bstcad.optics.numerics import ops
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces import sampling
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Sphere
+from bstcad.optics.trace import tubes
+from bstcad.optics.trace.measure import RayTubes
+from bstcad.optics.trace.trace import Simulation, from_first_net, to_first_net
 from bstcad.scene.scene import load
+from bstcad.tailoring.baselines.paper import TentMerit
 from bstcad.tailoring.merit import Merit, SobolevVariable
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.transport.density import Density

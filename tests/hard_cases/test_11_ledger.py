@@ -13,14 +13,16 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import irradiance, ops, trace, tubes
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.rays import Landed, Status
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.point import Point
+from bstcad.optics.numerics import ops
+from bstcad.optics.receivers import irradiance
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.rays import Landed, Status
+from bstcad.optics.surfaces.surfaces import Sphere
+from bstcad.optics.trace import trace, tubes
 from tests.tracing import from_first_net_plain, launch, simulated, simulated_plain, stratified
 
 SOURCE = Point(position=(1.0, -2.0, 3.0), profile="gaussian", half_angle_1e2=30.0)

@@ -15,16 +15,18 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import irradiance, sampling, trace
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.channels import Channel
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.irradiance import Screen, rrmsd
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Effort, Light, measure
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Plane
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.receivers import irradiance
+from bstcad.optics.receivers.irradiance import Screen, rrmsd
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces import sampling
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.surfaces import Plane
+from bstcad.optics.trace import trace
+from bstcad.optics.trace.measure import Effort, Light, measure
 from bstcad.scene.accept import Accept
 from bstcad.verify import checks
 from tests.tracing import simulated, simulated_plain

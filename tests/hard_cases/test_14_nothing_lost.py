@@ -25,7 +25,7 @@ import torch
 
 from bstcad import cli, commands
 from bstcad.commands import ProofOptions
-from bstcad.optics.measure import Effort
+from bstcad.optics.trace.measure import Effort
 from bstcad.pipeline import DesignState, design
 from bstcad.report import rendering
 from bstcad.runs import checkpoint

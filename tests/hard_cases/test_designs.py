@@ -14,7 +14,7 @@ import pytest
 
 from bstcad import commands
 from bstcad.commands import ProofOptions
-from bstcad.optics.measure import Effort
+from bstcad.optics.trace.measure import Effort
 from bstcad.pipeline import design
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load

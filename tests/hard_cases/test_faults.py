@@ -3,8 +3,10 @@
 import pytest
 import torch
 
-from bstcad.optics import interfaces, irradiance, surfaces
-from bstcad.optics.rays import Status
+from bstcad.optics.lens import interfaces
+from bstcad.optics.receivers import irradiance
+from bstcad.optics.surfaces import surfaces
+from bstcad.optics.surfaces.rays import Status
 from tests.hard_cases import test_02_critical_angle, test_03_grazing, test_07_flat_sphere, test_11_ledger
 
 DOUBLE = torch.float64

@@ -25,7 +25,7 @@ from PIL import Image
 from bstcad import commands
 from bstcad import folder as folders
 from bstcad.commands import ProofOptions
-from bstcad.optics.measure import Effort
+from bstcad.optics.trace.measure import Effort
 from bstcad.report import record
 from bstcad.report.record import DesignCourse
 from bstcad.scene.picture import Picture, read_picture

@@ -22,7 +22,7 @@ from bstcad import commands
 from bstcad.cad import step_reading, step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.folder import read_nominal
-from bstcad.optics.measure import Effort
+from bstcad.optics.trace.measure import Effort
 from bstcad.report import report
 from bstcad.runs import processes
 from bstcad.scene.scene import SceneError

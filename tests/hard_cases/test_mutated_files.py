@@ -26,29 +26,29 @@ from bstcad import folder as folders
 from bstcad.app import server
 from bstcad.app.design_runs import Run, State
 from bstcad.cad import mesh
-from bstcad.measured import cloud
-from bstcad.optics.outlines import Circle
+from bstcad.manufacture.measured import cloud
+from bstcad.manufacture.shop import rounds
+from bstcad.optics.surfaces.outlines import Circle
 from bstcad.photometry import eulumdat, ies, intensity_files, ray_files, tm25, zemax_rays
 from bstcad.photometry.intensity import Intensity, Luminaire, PhotometricError
 from bstcad.photometry.ray_set import RaySet
 from bstcad.pipeline import DesignState, design
+from bstcad.planning import batch, tradeoff
+from bstcad.planning.tradeoff import predicted_work
 from bstcad.report import production, record, tolerances
 from bstcad.runs import checkpoint, environment
 from bstcad.runs.files import MachineError, SceneError
 from bstcad.scene.beam import table
 from bstcad.scene.scene import load
-from bstcad.shop import rounds
-from bstcad.sweep import batch, tradeoff
-from bstcad.sweep.tradeoff import predicted_work
 from bstcad.tailoring.run import Hooks, no_progress
 from tests.app.asking import bench, made, png
 from tests.app.conftest import SMALL
 from tests.conftest import DISK
 from tests.hard_cases import fuzz
-from tests.measured.gauge_files import BY_SURFACE_TOPOGRAPHY, WRITERS
+from tests.manufacture.measured.gauge_files import BY_SURFACE_TOPOGRAPHY, WRITERS
+from tests.planning.conftest import TINY
+from tests.planning.conftest import record as run_of
 from tests.runs.test_kernel_cache import hits, kernel
-from tests.sweep.conftest import TINY
-from tests.sweep.conftest import record as run_of
 
 SECONDS = 10.0  # largest CPU seconds of one file; machines differ by a factor of ten at most
 MEGABYTES = 300.0  # largest memory of the files of a reader (MB), as Python and numpy count it

@@ -13,16 +13,16 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bstcad.optics import trace
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.interfaces import Refract
-from bstcad.optics.irradiance import LEDGER, Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.rays import Status
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.lens.interfaces import Refract
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.irradiance import LEDGER, Screen
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.rays import Status
+from bstcad.optics.surfaces.surfaces import Sphere
+from bstcad.optics.trace import trace
 from bstcad.scene.scene import load
 from tests.by_slope import deflect, intersect
 from tests.conftest import DISK

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.photometry.ray_model import MAX_LINES, line_numbers, lines_of, model_of, rays_of_lines
 from bstcad.photometry.ray_set import RaySet
 

@@ -15,8 +15,8 @@ from PIL import Image
 
 from bstcad import commands
 from bstcad import folder as folders
-from bstcad.judges.comparison import Judge
 from bstcad.report import prescription, record, rendering, report
+from bstcad.verify.judges.comparison import Judge
 from tests.app.conftest import launched
 
 # Text of the lens's picture for those who cannot see it.

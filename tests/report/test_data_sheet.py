@@ -26,9 +26,9 @@ from pypdf import PdfReader
 from bstcad.analysis.light import needed_apertures
 from bstcad.analysis.shape import describe
 from bstcad.cad import mounting
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Light
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.trace.measure import Light
 from bstcad.report import data_sheet, part_views, prescription
 from bstcad.report.data_sheet import DataSheet
 from bstcad.report.drawing import GLASS

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bstcad.cad import dome_mesh, mesh
-from bstcad.optics import domes
+from bstcad.optics.lens import domes
 from bstcad.report import dome_figures, exports, prescription, rendering
 from tests.cad.test_dome import CASES, dome, offset_sphere
 

@@ -37,7 +37,7 @@ def calls(source):
 
 
 def test_each_check_has_an_id_and_each_id_a_section():
-    source = text_of("verify/*.py", "judges/*.py", "measured/*.py")
+    source = text_of("verify/*.py", "verify/judges/*.py", "manufacture/measured/*.py")
     made = list(calls(source))
     assert len(made) > 60 and [call for call in made if "id=" not in call] == []
     assert set(re.findall(r"\bid=\"([a-z-]+)\"", source)) <= ids("checks")

@@ -15,10 +15,10 @@ import torch
 import bstcad
 from bstcad import cli
 from bstcad.cad.mesh import Label
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Sphere, sag
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Sphere, sag
 from bstcad.report import exports
 from bstcad.report.grid_sag import GridSag
 from bstcad.runs import files

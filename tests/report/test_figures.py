@@ -11,12 +11,12 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from bstcad.analysis.shape import describe, survey
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import CellError, SpectralLine
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Plane, Sphere
+from bstcad.optics.trace.measure import CellError, SpectralLine
 from bstcad.report import drawing, figure_jobs, light_figures
 from bstcad.report.drawing import png
 from bstcad.report.light_figures import (

@@ -7,13 +7,13 @@ import pytest
 import torch
 from scipy.interpolate import CubicHermiteSpline
 
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.surfaces import Plane, sag
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Plane, sag
 from bstcad.report import grid_sag
 from bstcad.report.grid_sag import MAX_SHIFT, GridLight, GridSag, shift_by_patches, table_note
 from tests.report.test_exports import read_zemax

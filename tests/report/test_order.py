@@ -11,7 +11,7 @@ import torch
 import bstcad
 from bstcad import Circle, Lens, Plane, Rectangle, Sphere
 from bstcad.analysis.shape import describe
-from bstcad.optics.bspline import BSplineSurface
+from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.report import prescription as order
 from bstcad.report.record import of_json
 from bstcad.report.report import first_figures, html

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import bstcad
-from bstcad.optics.directions import Directions
-from bstcad.optics.measure import Light
+from bstcad.optics.receivers.directions import Directions
+from bstcad.optics.trace.measure import Light
 from bstcad.photometry.intensity import Intensity
 from bstcad.report import photometric_figures as figures
 from bstcad.report.light_figures import View

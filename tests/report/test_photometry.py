@@ -11,10 +11,10 @@ import pytest
 from lxml import etree
 from rich.console import Console
 
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import Light
-from bstcad.optics.outlines import Circle
-from bstcad.optics.surfaces import Plane
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.surfaces import Plane
+from bstcad.optics.trace.measure import Light
 from bstcad.report import report as reports
 from bstcad.report.goal_figures import photometry
 from bstcad.report.light_figures import View

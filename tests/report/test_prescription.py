@@ -12,7 +12,7 @@ import pytest
 from bstcad.analysis.shape import describe
 from bstcad.cad import step_reading, step_writing
 from bstcad.folder import read_nominal
-from bstcad.optics.surfaces import Plane
+from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.pipeline import design, resolved
 from bstcad.report import prescription as prescriptions
 from bstcad.scene.errors import SceneError

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from bstcad.analysis.light import Blur, FinestDetail
-from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import Screen
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Screen
 from bstcad.report.goal_figures import CellFigures
 from bstcad.report.record import LeftOut, remarks
 from bstcad.report.report import doubts

@@ -20,9 +20,9 @@ from PIL import Image
 
 from bstcad import Circle, Lens, Plane, Rectangle, Sphere, commands
 from bstcad.cad.mesh import Mesh
-from bstcad.optics import quadrature
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.surfaces import Recess
+from bstcad.optics.lens import quadrature
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.surfaces import Recess
 from bstcad.report import rendering
 from bstcad.report.figure_jobs import Pictures
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bstcad.optics.wavefront_error import OpdSize, WavefrontError
+from bstcad.optics.trace.wavefront_error import OpdSize, WavefrontError
 from bstcad.report.drawing import png
 from bstcad.report.wavefront_figure import wavefront_map
 from tests.report.test_figures import pixel_at

@@ -22,7 +22,7 @@ ROOT = Path(__file__).parent.parent.parent
 # draws nothing.
 FEW_RAYS = """
 from bstcad import commands
-from bstcad.optics.measure import Effort
+from bstcad.optics.trace.measure import Effort
 from bstcad.report.figure_jobs import NoPictures
 from bstcad.verify import checks
 checks.FULL = Effort(256)

@@ -14,7 +14,7 @@ import torch
 from PIL import Image, ImageFile
 
 import bstcad
-from bstcad.optics.outlines import EVERYWHERE
+from bstcad.optics.surfaces.outlines import EVERYWHERE
 from bstcad.scene import beam
 from bstcad.scene.beam import MeasuredBeam, background, lit, moments, read_beam
 from bstcad.scene.errors import SceneError

@@ -13,10 +13,10 @@ import torch
 
 import bstcad
 from bstcad.cad import step_reading, step_writing
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Conic, Plane, Sphere, Toroid, sag
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere, Toroid, sag
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import FRONTS, NET_FILE, ConicFront, Front, NetFront, SphereFront, net_extent
 from bstcad.scene.scene import load

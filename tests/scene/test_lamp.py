@@ -13,8 +13,8 @@ import torch
 
 import bstcad
 from bstcad.app.preview import PreviewSize, preview
-from bstcad.optics import sampling
-from bstcad.optics.outlines import Rectangle
+from bstcad.optics.surfaces import sampling
+from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.photometry import eulumdat, ies, tm25
 from bstcad.photometry.intensity import Luminaire, checked
 from bstcad.photometry.ray_set import RaySet

@@ -7,12 +7,12 @@ import math
 import pytest
 import torch
 
-from bstcad.optics.channels import Channel
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.outlines import Circle
-from bstcad.optics.point import Point
-from bstcad.optics.surfaces import Plane
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.scene.real_source import image_diameters, real_size
 from tests.lenses import lens_of, net
 

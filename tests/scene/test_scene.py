@@ -9,12 +9,12 @@ import torch
 from PIL import Image
 
 from bstcad.cad.mounting import wire
-from bstcad.optics.losses import CoatingLayer, FresnelLoss
-from bstcad.optics.media import refractive_index
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.receivers import LevelPlane, TiltedPlane
-from bstcad.optics.surfaces import Plane, Recess, Sphere
-from bstcad.optics.trace import ghost_light
+from bstcad.optics.lens.losses import CoatingLayer, FresnelLoss
+from bstcad.optics.lens.media import refractive_index
+from bstcad.optics.receivers.receivers import LevelPlane, TiltedPlane
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Plane, Recess, Sphere
+from bstcad.optics.trace.trace import ghost_light
 from bstcad.report.record import simulated
 from bstcad.scene.accept import Accept
 from bstcad.scene.beam import Collimated

@@ -11,7 +11,7 @@ import jsonschema
 import pytest
 
 from bstcad import cli
-from bstcad.optics.key import Key
+from bstcad.optics.surfaces.key import Key
 from bstcad.scene import schema
 from bstcad.scene.scene import OUTLINES, Scene
 

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from bstcad.folder import scene_files
-from bstcad.optics.outlines import Circle
+from bstcad.optics.surfaces.outlines import Circle
 from bstcad.scene import schema
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from bstcad import folder as folders
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.sides import in_proportion
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.sides import in_proportion
 from bstcad.pipeline import purpose, resolved
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import NetFront, net_extent

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageOps
 
-from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.scene.errors import SceneError
 from bstcad.scene.picture import Picture
 from bstcad.scene.target import Target, drawing, inside, overlap, shown_size

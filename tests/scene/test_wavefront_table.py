@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bstcad.optics.wavefront import PlaneWave, SphericalWave, ZernikeWave
+from bstcad.optics.light.wavefront import PlaneWave, SphericalWave, ZernikeWave
 from bstcad.scene.scene import load
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"

@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from bstcad.analysis.shape import thickness_range
-from bstcad.optics.bspline import QUARTERS, BSplineSurface
-from bstcad.optics.channels import Channel
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.bspline import QUARTERS, BSplineSurface
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Sphere
 from bstcad.scene.blank import Bounds
 from bstcad.tailoring import machinability
 from bstcad.tailoring.clearance import PENALTY_MARGIN, CellGrid, clearance, unit

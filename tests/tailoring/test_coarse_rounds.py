@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from bstcad import pipeline
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.measure import Effort, measure
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.trace.measure import Effort, measure
 from bstcad.pipeline import DesignOptions, design
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import stage1, stage2

@@ -18,17 +18,17 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from bstcad.optics import trace
-from bstcad.optics.charts import SphereChart
-from bstcad.optics.directions import Directions
-from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle
-from bstcad.optics.point import Point
-from bstcad.optics.radial import RadialSurface
-from bstcad.optics.sphere_light import SphereLight
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.point import Point
+from bstcad.optics.light.sphere_light import SphereLight
+from bstcad.optics.receivers.directions import Directions
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.charts import SphereChart
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.radial import RadialSurface
+from bstcad.optics.surfaces.surfaces import Sphere
+from bstcad.optics.trace import trace
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.slope_map import Solver
 from bstcad.tailoring.stage1 import COARSE_FACE_FIT, FINE_FACE_FIT

@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.surfaces import Conic, Plane, Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere
 from bstcad.scene.fronts import as_front
 from bstcad.tailoring.stage1 import best_front
 from tests.lenses import SQUARE, net

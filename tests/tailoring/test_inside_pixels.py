@@ -15,9 +15,9 @@ import pytest
 import torch
 
 from bstcad import pipeline
-from bstcad.optics import ops
-from bstcad.optics.irradiance import CellTarget, picture_error
-from bstcad.optics.measure import Effort, measure_goals
+from bstcad.optics.numerics import ops
+from bstcad.optics.receivers.irradiance import CellTarget, picture_error
+from bstcad.optics.trace.measure import Effort, measure_goals
 from bstcad.scene.scene import Scene, load
 from bstcad.tailoring import folds, stage2
 

@@ -5,12 +5,12 @@ from functools import partial
 import pytest
 import torch
 
-from bstcad.optics import ops
-from bstcad.optics.channels import Channel
-from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.losses import AbsorptionLoss, FresnelLoss, Losses
-from bstcad.optics.point import Point
+from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.point import Point
+from bstcad.optics.numerics import ops
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Screen
 from bstcad.scene.blank import Bounds
 from bstcad.tailoring.machinability import excess
 from bstcad.tailoring.merit import Merit

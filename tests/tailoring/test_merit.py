@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.baselines.paper import TentMerit
-from bstcad.optics.channels import Channel
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import RayTubes
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Landed
-from bstcad.optics.surfaces import Plane
-from bstcad.optics.tubes import Tubes
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.rays import Landed
+from bstcad.optics.surfaces.surfaces import Plane
+from bstcad.optics.trace.measure import RayTubes
+from bstcad.optics.trace.tubes import Tubes
 from bstcad.tailoring import merit
+from bstcad.tailoring.baselines.paper import TentMerit
 from bstcad.tailoring.merit import Landings, Merit, SobolevVariable, local_weight
 from tests.lenses import net
 

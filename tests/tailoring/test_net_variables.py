@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from bstcad.analysis.shape import slope_octaves
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.trace import behind
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.trace.trace import behind
 from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.net_variables import NetVariables, along_light
 from tests.lenses import net

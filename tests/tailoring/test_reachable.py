@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from bstcad import cli
-from bstcad.optics.bspline import BSplineSurface
-from bstcad.optics.channels import Channel
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.reach import largest_deflection
-from bstcad.optics.surfaces import Plane
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.surfaces import Plane
+from bstcad.optics.trace.reach import largest_deflection
 from bstcad.pipeline import design, reachable_part
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.measure import Effort
+from bstcad.optics.trace.measure import Effort
 from bstcad.pipeline import DesignState, design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load

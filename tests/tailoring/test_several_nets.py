@@ -8,18 +8,18 @@ import pytest
 import torch
 
 from bstcad.analysis.shape import thickness_range
-from bstcad.optics.channels import Channel
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.goal import Goal
-from bstcad.optics.interfaces import Interface, Reflect, Refract
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import EVERYWHERE, Rectangle
-from bstcad.optics.passes import Pass, Passes
-from bstcad.optics.point import Point
-from bstcad.optics.rays import Status
-from bstcad.optics.source_images import images
-from bstcad.optics.surfaces import Plane
+from bstcad.optics.lens.interfaces import Interface, Reflect, Refract
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import Pass, Passes
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.outlines import EVERYWHERE, Rectangle
+from bstcad.optics.surfaces.rays import Status
+from bstcad.optics.surfaces.surfaces import Plane
+from bstcad.optics.trace.source_images import images
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.machinability import active_bounds, enforce_bounds
 from bstcad.tailoring.merit import Merit

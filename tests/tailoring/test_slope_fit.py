@@ -5,17 +5,17 @@ import math
 import pytest
 import torch
 
-from bstcad.optics import sampling
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.interfaces import Refract
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.rays import Status
-from bstcad.optics.reach import MAX_SLOPE, largest_deflection, wanted_slopes
-from bstcad.optics.receivers import LevelPlane, TiltedPlane
-from bstcad.optics.surfaces import Plane, Sphere
-from bstcad.optics.trace import to_first_net, trace
+from bstcad.optics.lens.interfaces import Refract
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.receivers import LevelPlane, TiltedPlane
+from bstcad.optics.surfaces import sampling
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.rays import Status
+from bstcad.optics.surfaces.surfaces import Plane, Sphere
+from bstcad.optics.trace.reach import MAX_SLOPE, largest_deflection, wanted_slopes
+from bstcad.optics.trace.trace import to_first_net, trace
 from bstcad.tailoring.merit import mean_square_miss
 from bstcad.tailoring.slope_fit import Fit, fit_slopes, tailor_to_aim
 from tests.by_slope import deflect, intersect

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import Screen, efficiency
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Screen, efficiency
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.surfaces import Plane, Sphere
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import face_grid, fit_to_map, lit_corners, lit_window, slope_map, square_grid

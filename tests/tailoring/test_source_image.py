@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.channels import channels_of, drawn_channels
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels.reductions import total
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import RayTubes, simulated, squared_distance
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import channels_of, drawn_channels
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.point import Point
+from bstcad.optics.numerics.reductions import total
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Sphere
+from bstcad.optics.trace.measure import RayTubes, simulated, squared_distance
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Task

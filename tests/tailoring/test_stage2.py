@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bstcad import pipeline
-from bstcad.optics.measure import rrmsd_by_tubes
+from bstcad.optics.trace.measure import rrmsd_by_tubes
 from bstcad.pipeline import design
 from bstcad.scene.quality import VERIFICATION_DRAW
 from bstcad.scene.scene import load

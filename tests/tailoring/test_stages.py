@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.baselines import paper
-from bstcad.optics.irradiance import efficiency
+from bstcad.optics.receivers.irradiance import efficiency
 from bstcad.scene import scene
 from bstcad.tailoring import stage1, stage2
+from bstcad.tailoring.baselines import paper
 from bstcad.tailoring.merit import Landings, Merit
 from bstcad.tailoring.run import Driver, Hooks, StageStep, Task
 from tests.tracing import simulated

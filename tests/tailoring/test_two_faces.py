@@ -8,17 +8,17 @@ import torch
 
 import bstcad
 from bstcad import pipeline
-from bstcad.optics.channels import Channel
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.goal import Goal
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.lens import Lens
-from bstcad.optics.measure import rrmsds_by_rays
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.surfaces import Plane
-from bstcad.optics.tubes import collect
-from bstcad.optics.wavefront import PlaneWave, SphericalWave, ZernikeWave
-from bstcad.optics.wavefront_error import wavefront_error
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.wavefront import PlaneWave, SphericalWave, ZernikeWave
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.surfaces import Plane
+from bstcad.optics.trace.measure import rrmsds_by_rays
+from bstcad.optics.trace.tubes import collect
+from bstcad.optics.trace.wavefront_error import wavefront_error
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import light_behind
 from bstcad.tailoring.merit import Merit

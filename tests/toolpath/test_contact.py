@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.bspline import BSplineSurface, interpolating_net
-from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.bspline import BSplineSurface, interpolating_net
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.toolpath import chords, cusps
 from bstcad.toolpath.cutting import Cutting
 from bstcad.toolpath.machined_face import MachinedFace, RoundTool

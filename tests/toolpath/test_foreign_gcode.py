@@ -7,7 +7,7 @@ import gcodeparser
 import numpy as np
 import pytest
 
-from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.toolpath.raster import PLUNGE, SAFE_HEIGHT
 from tests.toolpath.test_simulated_shop import lens_of, waves, written
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from bstcad.optics.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from tests.toolpath.test_simulated_shop import Router, exact, highest, lens_of, points_on, stated, waves, written
 
 

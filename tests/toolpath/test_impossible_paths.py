@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from bstcad import commands
-from bstcad.optics.outlines import Rectangle
+from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.report.exports import export
 from bstcad.report.figure_jobs import NoPictures
 from bstcad.report.toolpath_files import refuse_hopeless

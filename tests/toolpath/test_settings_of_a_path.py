@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from bstcad.cad.tiling import Tiling
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Sphere
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Sphere
 from bstcad.report.heightmap import HeightMap
 from bstcad.report.toolpath_files import toolpath_files
 from bstcad.toolpath import chords

@@ -20,8 +20,8 @@ from bstcad.analysis import shape
 from bstcad.cad import mesh as meshes
 from bstcad.cad import step_reading, step_writing
 from bstcad.folder import read_nominal
-from bstcad.optics import measure
-from bstcad.optics.measure import CellError, Effort, Light
+from bstcad.optics.trace import measure
+from bstcad.optics.trace.measure import CellError, Effort, Light
 from bstcad.scene.accept import Accept
 from bstcad.verify import checks, step_checks
 from bstcad.verify.checks import Check

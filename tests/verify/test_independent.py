@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import goal
-from bstcad.optics.irradiance import joined_cells
+from bstcad.optics.receivers import goal
+from bstcad.optics.receivers.irradiance import joined_cells
 from tests.benchmarks.independent import faces, interpolated, joined, judge, net_of, paired
 from tests.benchmarks.judged_cells import finer_targets, stated_by_cell
 

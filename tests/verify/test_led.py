@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from bstcad import commands
-from bstcad.optics.measure import Effort
+from bstcad.optics.trace.measure import Effort
 from bstcad.report import report as reports
 from bstcad.report.record import of_json
 from bstcad.scene.scene import load

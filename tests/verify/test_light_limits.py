@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.goal import Goal
-from bstcad.optics.measure import Light
+from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.trace.measure import Light
 from bstcad.report.record import Contents, of_json, plain
 from bstcad.scene.scene import load
 from bstcad.verify.light_limits import LightValue, light_values

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 from bstcad.analysis.shape import describe, survey
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Plane
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.verify.checks import bound_checks
 from tests.lenses import net
 

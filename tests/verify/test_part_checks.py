@@ -14,8 +14,8 @@ import bstcad
 from bstcad import commands
 from bstcad.cad import mounting, step_reading
 from bstcad.commands import ProofOptions
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.surfaces import Plane
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.report.prescription import part
 from bstcad.scene.errors import SceneError
 from bstcad.step_text import part21

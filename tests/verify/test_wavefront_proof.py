@@ -12,8 +12,8 @@ from rich.console import Console
 from bstcad import commands
 from bstcad import folder as folders
 from bstcad.commands import ProofOptions
-from bstcad.optics.wavefront import ZernikeWave
-from bstcad.optics.wavefront_error import wavefront_error
+from bstcad.optics.light.wavefront import ZernikeWave
+from bstcad.optics.trace.wavefront_error import wavefront_error
 from bstcad.report import record, report
 from bstcad.verify import checks
 from tests.conftest import flat_pictures, proofs, quick_effort

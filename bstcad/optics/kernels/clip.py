@@ -29,9 +29,9 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from bstcad.optics.irradiance import Scale
-from bstcad.optics.kernels import reductions
-from bstcad.optics.kernels.compiling import compiled
+from bstcad.optics.numerics import reductions
+from bstcad.optics.numerics.compiling import compiled
+from bstcad.optics.receivers.irradiance import Scale
 
 MAX_DISTANCE = 1e15  # largest |x| + |y| of a corner (pixels); farther away, rounding approaches a pixel
 NO_BORDER = 1e300  # s of the next border of an edge that crosses no more borders along an axis

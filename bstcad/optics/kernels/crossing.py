@@ -24,14 +24,15 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from bstcad.optics.interfaces import Interface, apply_losses, net_bounds
-from bstcad.optics.kernels import forward, kernel_arguments, reductions
-from bstcad.optics.kernels.compiling import compiled
+from bstcad.optics.kernels import forward, kernel_arguments
 from bstcad.optics.kernels.forward import BLOCK, DX, DY, DZ, FATE, FLUX, SAG, SLOPE_X, SLOPE_Y, WORK, S, U, V, X, Y, Z
-from bstcad.optics.kernels.records import Faces, Screens
 from bstcad.optics.kernels.spline import curved, net_of, sag, scatter
-from bstcad.optics.rays import Landed, Rays, Status
-from bstcad.optics.receivers import Receiver
+from bstcad.optics.lens.interfaces import Interface, apply_losses, net_bounds
+from bstcad.optics.numerics import reductions
+from bstcad.optics.numerics.compiling import compiled
+from bstcad.optics.numerics.records import Faces, Screens
+from bstcad.optics.receivers.receivers import Receiver
+from bstcad.optics.surfaces.rays import Landed, Rays, Status
 
 # Further offsets in `work`: the hit and its status before rays land on the first of several screens.
 HIT_X, HIT_Y, HIT_FATE = (WORK + BLOCK * k for k in range(3))

@@ -29,11 +29,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from bstcad.optics import radial
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.interfaces import Interface
 from bstcad.optics.kernels import crossing, dome_light, forward, kernel_arguments
-from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.crossing import (
     ADJOINT_WORK,
     COS_OUT,
@@ -69,12 +65,16 @@ from bstcad.optics.kernels.forward import (
     Z,
     to_screen,
 )  # fmt: skip
-from bstcad.optics.kernels.records import DomeFront, Faces, floats
 from bstcad.optics.kernels.spline import basis, bend, beyond2, curved_piece, net_of, piece, scatter
-from bstcad.optics.lens import Lens
-from bstcad.optics.radial import RadialSurface
-from bstcad.optics.rays import Rays
-from bstcad.optics.receivers import Receiver
+from bstcad.optics.lens.interfaces import Interface
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.numerics.compiling import compiled
+from bstcad.optics.numerics.records import DomeFront, Faces, floats
+from bstcad.optics.receivers.receivers import Receiver
+from bstcad.optics.surfaces import radial
+from bstcad.optics.surfaces.radial import RadialSurface
+from bstcad.optics.surfaces.rays import Rays
 
 # Further offsets in `work`: unit normal N; for the adjoint ∂S/∂x, ∂S/∂y and the second derivatives, three components
 # each, and ∂L/∂(S, ∂S/∂u, ∂S/∂v), L the merit.

@@ -17,11 +17,11 @@ import numpy as np
 import torch
 from numba import njit
 
-from bstcad.optics.kernels import reductions
-from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.dome import clamped, dot, patch, times
 from bstcad.optics.kernels.spline import net_of
-from bstcad.optics.radial import RadialSurface
+from bstcad.optics.numerics import reductions
+from bstcad.optics.numerics.compiling import compiled
+from bstcad.optics.surfaces.radial import RadialSurface
 
 MAX_STEPS = 4  # largest number of Newton steps to a foot
 # Step δ, in spacings of the control points, at which the search ends.  The height is then exact to κ δ² / 2, κ the

@@ -1,7 +1,7 @@
 """Light of a lamp inside a dome, in the fused CPU kernels (numba): `SphereLight` and the front, for blocks of rays.
 
 All positions are relative to the centre of the dome.  The steps are those of the plain torch form: a ray leads from the
-lamp through the point (x, y) of the sphere of radius R (optics/sphere_light.py), meets the front, a surface of
+lamp through the point (x, y) of the sphere of radius R (optics/light/sphere_light.py), meets the front, a surface of
 revolution c r² - 2 h + (1 + k) c h² = 0 of height h over its vertex, and is refracted by the normal
 
     N ∥ (-c x, -c y, 1 - (1 + k) c h).
@@ -14,7 +14,6 @@ from collections.abc import Sequence
 
 from numba import njit
 
-from bstcad.optics.interfaces import Interface
 from bstcad.optics.kernels import kernel_arguments
 from bstcad.optics.kernels.crossing import cosine_behind
 from bstcad.optics.kernels.forward import (
@@ -35,8 +34,9 @@ from bstcad.optics.kernels.forward import (
     shape,
     tilt,
 )  # fmt: skip
-from bstcad.optics.kernels.records import DomeFront
 from bstcad.optics.kernels.spline import beyond2
+from bstcad.optics.lens.interfaces import Interface
+from bstcad.optics.numerics.records import DomeFront
 
 
 def front_of(before: Sequence[Interface], centre: float) -> DomeFront:

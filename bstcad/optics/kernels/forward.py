@@ -18,16 +18,17 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.irradiance import LEDGER, Screen
-from bstcad.optics.kernels import kernel_arguments, reductions
-from bstcad.optics.kernels.compiling import compiled
-from bstcad.optics.kernels.records import NO_LOSS_TABLES
+from bstcad.optics.kernels import kernel_arguments
 from bstcad.optics.kernels.spline import beyond2, net_of, sag
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Landed, Status
-from bstcad.optics.receivers import Receiver
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.numerics import reductions
+from bstcad.optics.numerics.compiling import compiled
+from bstcad.optics.numerics.records import NO_LOSS_TABLES
+from bstcad.optics.receivers.irradiance import LEDGER, Screen
+from bstcad.optics.receivers.receivers import Receiver
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.rays import Landed, Status
 
 BLOCK = 256  # number of rays in a block
 # Offset of each quantity in `work`; constants, so that the compiler sees that they do not overlap.

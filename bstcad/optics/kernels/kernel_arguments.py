@@ -13,13 +13,12 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from bstcad.optics import interfaces, rays, sampling, surfaces
-from bstcad.optics.bspline import interpolating_net, midpoint_values
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.interfaces import Interface
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import records
-from bstcad.optics.kernels.records import (
+from bstcad.optics.lens import interfaces
+from bstcad.optics.lens.interfaces import Interface
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.numerics import records
+from bstcad.optics.numerics.records import (
     Beam,
     Faces,
     Fates,
@@ -31,10 +30,12 @@ from bstcad.optics.kernels.records import (
     Screens,
     floats,
 )
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.rays import Status
-from bstcad.optics.receivers import Receiver
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import Receiver
+from bstcad.optics.surfaces import rays, sampling, surfaces
+from bstcad.optics.surfaces.bspline import interpolating_net, midpoint_values
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.rays import Status
 
 TRANSMISSION_NODES = 4097  # number of nodes of a table of a face's transmission
 TABLE_SIDES = 65, 129, 257, 513  # control points per side of a table of light, tried in this order
@@ -98,7 +99,7 @@ def losses(lens: Lens) -> LossTables:
     """Return the losses of a lens as numbers, from the plain forms of losses.py."""
     if lens.losses is None:
         return records.NO_LOSS_TABLES
-    from bstcad.optics.losses import AbsorptionLoss  # loaded already, since the lens has losses
+    from bstcad.optics.lens.losses import AbsorptionLoss  # loaded already, since the lens has losses
 
     *front, back = (_table(interface) for interface in lens.interfaces)
     glass = [loss.coefficient for i in lens.interfaces for loss in i.losses if isinstance(loss, AbsorptionLoss)]

@@ -10,7 +10,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from bstcad.optics.kernels.compiling import compiled
+from bstcad.optics.numerics.compiling import compiled
 
 ROWS_PER_STRIP = 16  # rows of tubes that one thread computes at a time
 

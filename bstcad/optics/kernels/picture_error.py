@@ -12,9 +12,9 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from bstcad.optics.irradiance import CellTarget
-from bstcad.optics.kernels import reductions
-from bstcad.optics.kernels.compiling import compiled
+from bstcad.optics.numerics import reductions
+from bstcad.optics.numerics.compiling import compiled
+from bstcad.optics.receivers.irradiance import CellTarget
 
 SUMS = 4  # sums of each row of pixels: the error, and E^s, (E^s)² and E^s E of the pixels
 ERROR, LIGHT, SQUARE, PRODUCT = range(SUMS)

@@ -1,4 +1,4 @@
-"""Fused CPU kernel (numba) behind `tubes.Path.search`: rays of sources that meet given points behind a front.
+"""Fused CPU kernel (numba) behind `tubes.search`: rays of sources that meet given points behind a front.
 
 Blocks of rays go through the steps of forward.py (launch, front face) and on to their heights.  Broyden's method takes
 steps for all rays of a block until their largest error is below the tolerance.  The plain form does so for all rays.
@@ -9,16 +9,14 @@ are those of its chart, and a height is the distance from the centre.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numba import njit
 from torch import Tensor
 
-from bstcad.optics import surfaces, tubes
-from bstcad.optics.kernels import kernel_arguments, reductions
-from bstcad.optics.kernels.compiling import compiled
+from bstcad.optics.kernels import kernel_arguments
 from bstcad.optics.kernels.dome_light import arrive_on_sphere, cross_front, front_of, launch_from_sphere
 from bstcad.optics.kernels.forward import (
     BLOCK,
@@ -37,12 +35,13 @@ from bstcad.optics.kernels.forward import (
     shape,
     tilt,
 )  # fmt: skip
-from bstcad.optics.kernels.records import DomeFront, SphereBeam
-from bstcad.optics.radial import RadialSurface
-from bstcad.optics.rays import Rays
-
-if TYPE_CHECKING:
-    from bstcad.optics.tubes import Found, Path
+from bstcad.optics.light.path import MAX_BROYDEN_STEPS, MIN_BROYDEN_DIVISOR, Found, Path
+from bstcad.optics.numerics import reductions
+from bstcad.optics.numerics.compiling import compiled
+from bstcad.optics.numerics.records import DomeFront, SphereBeam
+from bstcad.optics.surfaces import surfaces
+from bstcad.optics.surfaces.radial import RadialSurface
+from bstcad.optics.surfaces.rays import Rays
 
 # Rows of `state`: hit, point, inverse Jacobian, last step, and distance left before it, of each ray of a block.
 HIT_X, HIT_Y, P, Q, XX, XY, YX, YY, STEP_X, STEP_Y, OFF_X, OFF_Y = range(12)
@@ -64,7 +63,7 @@ class Limits(NamedTuple):
     step: float  # step of the difference quotients (mm)
     tolerance: float  # error (mm) at which the search ends
     steps: float  # maximum number of Broyden steps
-    divisor: float  # tubes.MIN_BROYDEN_DIVISOR
+    divisor: float  # path.MIN_BROYDEN_DIVISOR
     cosine: float  # surfaces.MIN_ARRIVAL_COSINE
 
 
@@ -202,7 +201,7 @@ def search(path: Path, x: Tensor, y: Tensor, height: Tensor) -> Found:
         front_face = front_of(path.before, face.z)
         domes = [DomeStart(beam, front_face, face.radius) for beam in beams if isinstance(beam, SphereBeam)]
     front = kernel_arguments.front_face(path.before, path.sense)
-    numbers = path.step, path.tolerance, tubes.MAX_BROYDEN_STEPS, tubes.MIN_BROYDEN_DIVISOR, surfaces.MIN_ARRIVAL_COSINE
+    numbers = path.step, path.tolerance, MAX_BROYDEN_STEPS, MIN_BROYDEN_DIVISOR, surfaces.MIN_ARRIVAL_COSINE
     limits = Limits(*map(float, numbers))
 
     def some(k: int, first: int, last: int) -> None:
@@ -215,4 +214,4 @@ def search(path: Path, x: Tensor, y: Tensor, height: Tensor) -> Found:
         rays[2].neg_()
     axial = all(source.is_shift_invariant for source in path.sources) and all(f.surface.level for f in path.before)
     found = Rays(torch.stack([x, y, height]), rays, flux, fate, axial=axial, z=path.face.z, sense=path.sense)
-    return tubes.Found(points[0], points[1], found, error)
+    return Found(points[0], points[1], found, error)

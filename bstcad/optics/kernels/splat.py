@@ -10,8 +10,8 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from bstcad.optics.kernels import reductions
-from bstcad.optics.kernels.compiling import compiled
+from bstcad.optics.numerics import reductions
+from bstcad.optics.numerics.compiling import compiled
 
 RAYS_PER_TASK = 4096  # number of rays per task, whose coordinates and results stay in the second-level cache
 

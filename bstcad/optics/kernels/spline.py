@@ -16,9 +16,9 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from bstcad.optics.kernels import reductions
-from bstcad.optics.kernels.compiling import compiled
-from bstcad.optics.kernels.reductions import on_threads
+from bstcad.optics.numerics import reductions
+from bstcad.optics.numerics.compiling import compiled
+from bstcad.optics.numerics.reductions import on_threads
 
 POINTS_PER_TASK = 4096  # number of points per task, whose coordinates and results stay in the second-level cache
 

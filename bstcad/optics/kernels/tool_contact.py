@@ -26,9 +26,9 @@ import numpy as np
 from numba import njit
 from torch import Tensor
 
-from bstcad.optics.kernels import reductions
-from bstcad.optics.kernels.compiling import compiled
 from bstcad.optics.kernels.spline import curved, net_of, sag
+from bstcad.optics.numerics import reductions
+from bstcad.optics.numerics.compiling import compiled
 
 NEWTON_STEPS = 40  # largest number of Newton steps from a start to the contact
 CONTACT_TOLERANCE = 1e-12  # step at which the contact is found, relative to the radius of the tool

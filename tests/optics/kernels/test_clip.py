@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-from bstcad.optics import tubes
-from bstcad.optics.kernels import clip, reductions
+from bstcad.optics.kernels import clip
+from bstcad.optics.numerics import reductions
+from bstcad.optics.trace import tubes
 
 SHAPE = (11, 13)  # rows, columns
 BOTH = (tubes.collect, tubes.collect_plain)

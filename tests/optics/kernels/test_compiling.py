@@ -7,15 +7,17 @@ import numba
 import pytest
 import torch
 
-from bstcad.optics import interfaces, rays, sampling, surfaces, tubes
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.kernels import compiling
-from bstcad.optics.lens import Lens
-from bstcad.optics.outlines import Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.receivers import LevelPlane
-from bstcad.optics.surfaces import Sphere
-from bstcad.optics.tubes import launch_tubes
+from bstcad.optics.lens import interfaces
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.light.point import Point
+from bstcad.optics.numerics import compiling
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import LevelPlane
+from bstcad.optics.surfaces import rays, sampling, surfaces
+from bstcad.optics.surfaces.outlines import Rectangle
+from bstcad.optics.surfaces.surfaces import Sphere
+from bstcad.optics.trace import tubes
+from bstcad.optics.trace.tubes import launch_tubes
 from tests.lenses import net
 from tests.tracing import simulated
 

@@ -5,17 +5,18 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.optics import sampling, trace
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.lens import Lens
-from bstcad.optics.losses import AbsorptionLoss, FresnelLoss, Losses
-from bstcad.optics.outlines import Circle, Rectangle, Rounded
-from bstcad.optics.point import Point
-from bstcad.optics.receivers import LevelPlane, TiltedPlane
-from bstcad.optics.surfaces import Plane, Sphere
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.point import Point
+from bstcad.optics.receivers.receivers import LevelPlane, TiltedPlane
+from bstcad.optics.surfaces import sampling
+from bstcad.optics.surfaces.outlines import Circle, Rectangle, Rounded
+from bstcad.optics.surfaces.surfaces import Plane, Sphere
+from bstcad.optics.trace import trace
 from tests.lenses import lens_of, uniform, wavy
 from tests.optics.kernels.arrays import DTYPES, close
-from tests.optics.test_mirror import LIGHTS, bumpy, mirror
+from tests.optics.lens.test_mirror import LIGHTS, bumpy, mirror
 from tests.tracing import from_first_net_plain, from_first_net_to_each_plain, stratified
 
 

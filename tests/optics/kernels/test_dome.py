@@ -8,15 +8,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.optics import sampling, trace
-from bstcad.optics.charts import SphereChart
-from bstcad.optics.directions import Directions
-from bstcad.optics.interfaces import Interface, Law, Reflect, Refract, cross
-from bstcad.optics.losses import AbsorptionLoss, FresnelLoss, Losses
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.radial import RadialSurface
-from bstcad.optics.rays import Rays, Status
-from bstcad.optics.receivers import LevelPlane, TiltedPlane
+from bstcad.optics.lens.interfaces import Interface, Law, Reflect, Refract, cross
+from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
+from bstcad.optics.receivers.directions import Directions
+from bstcad.optics.receivers.receivers import LevelPlane, TiltedPlane
+from bstcad.optics.surfaces import sampling
+from bstcad.optics.surfaces.charts import SphereChart
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.radial import RadialSurface
+from bstcad.optics.surfaces.rays import Rays, Status
+from bstcad.optics.trace import trace
 from tests.lenses import bundle, uniform
 
 R, Z, INDEX = 15.0, 3.0, 1.5  # radius and z of the centre (mm), refractive index

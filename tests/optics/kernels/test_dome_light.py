@@ -8,18 +8,19 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.optics import ops, trace, tubes
-from bstcad.optics.channels import Channel
-from bstcad.optics.charts import SphereChart
-from bstcad.optics.directions import Directions
-from bstcad.optics.interfaces import Interface
-from bstcad.optics.irradiance import Screen
-from bstcad.optics.losses import AbsorptionLoss, FresnelLoss, Losses
-from bstcad.optics.outlines import Circle
-from bstcad.optics.point import Point
-from bstcad.optics.source_images import landing_pixels
-from bstcad.optics.sphere_light import SphereLight
-from bstcad.optics.surfaces import Conic, Plane, Sphere, Surface
+from bstcad.optics.lens.interfaces import Interface
+from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
+from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.point import Point
+from bstcad.optics.light.sphere_light import SphereLight
+from bstcad.optics.numerics import ops
+from bstcad.optics.receivers.directions import Directions
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.charts import SphereChart
+from bstcad.optics.surfaces.outlines import Circle
+from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere, Surface
+from bstcad.optics.trace import trace, tubes
+from bstcad.optics.trace.source_images import landing_pixels
 from tests.lenses import lens_of
 from tests.optics.kernels.test_dome import INDEX, OUTLINE, R, Z, dome
 

@@ -7,24 +7,26 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics import irradiance, ops, trace
-from bstcad.optics.collimated import Collimated
-from bstcad.optics.emitters import Emitter
-from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import forward
 from bstcad.optics.kernels.forward import land
 from bstcad.optics.kernels.kernel_arguments import IRRADIANCE_TOLERANCE, MIN_IRRADIANCE
-from bstcad.optics.lens import Lens
-from bstcad.optics.losses import AbsorptionLoss, FresnelLoss, Losses
-from bstcad.optics.outlines import Circle, Rectangle, Rounded
-from bstcad.optics.point import Point
-from bstcad.optics.profiles import Net, Profile
-from bstcad.optics.rays import Landed
-from bstcad.optics.receivers import LevelPlane, TiltedPlane
-from bstcad.optics.surfaces import Conic, Plane, Sphere
-from bstcad.optics.trace import simulate, simulate_plain, whole_kernel, window
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
+from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.light.point import Point
+from bstcad.optics.light.profiles import Net, Profile
+from bstcad.optics.numerics import ops
+from bstcad.optics.receivers import irradiance
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.receivers import LevelPlane, TiltedPlane
+from bstcad.optics.surfaces.outlines import Circle, Rectangle, Rounded
+from bstcad.optics.surfaces.rays import Landed
+from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere
+from bstcad.optics.trace import trace
+from bstcad.optics.trace.trace import simulate, simulate_plain, whole_kernel, window
 from tests.lenses import SQUARE, Measured, lens_of, net, tilted, wavy
-from tests.optics.test_mirror import LIGHTS, bumpy, mirror
+from tests.optics.lens.test_mirror import LIGHTS, bumpy, mirror
 from tests.tracing import from_first_net_plain, simulated, simulated_plain, stratified
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.kernels import reductions
+from bstcad.optics.numerics import reductions
 
 
 @pytest.fixture

@@ -3,11 +3,12 @@
 import pytest
 import torch
 
-from bstcad.optics import ops, tubes
-from bstcad.optics.outlines import Circle, Rectangle
-from bstcad.optics.point import Point
-from bstcad.optics.surfaces import Sphere
-from bstcad.optics.trace import to_first_net
+from bstcad.optics.light.point import Point
+from bstcad.optics.numerics import ops
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Sphere
+from bstcad.optics.trace import tubes
+from bstcad.optics.trace.trace import to_first_net
 from tests.lenses import lens_of, wavy
 from tests.optics.kernels.test_forward import SCENES, deep
 

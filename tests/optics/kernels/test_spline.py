@@ -7,12 +7,14 @@ import pytest
 import torch
 
 from bstcad.analysis import shape
-from bstcad.optics import bspline, irradiance, ops
-from bstcad.optics.bspline import QUARTERS, Spans, span_points
-from bstcad.optics.irradiance import Screen
 from bstcad.optics.kernels import spline
-from bstcad.optics.outlines import Circle, Rectangle, Rounded
-from bstcad.optics.rays import Landed
+from bstcad.optics.numerics import ops
+from bstcad.optics.receivers import irradiance
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces import bspline
+from bstcad.optics.surfaces.bspline import QUARTERS, Spans, span_points
+from bstcad.optics.surfaces.outlines import Circle, Rectangle, Rounded
+from bstcad.optics.surfaces.rays import Landed
 from tests.lenses import rough, uniform
 from tests.optics.kernels.arrays import DTYPES, LAYOUTS, close
 

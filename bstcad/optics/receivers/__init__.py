@@ -1,0 +1,1 @@
+"""Where light is collected: planes and directions, their pixels, and the goals on them."""

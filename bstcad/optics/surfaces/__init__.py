@@ -1,0 +1,1 @@
+"""Surfaces, their nets and outlines, rays, and points over a face."""

@@ -1,0 +1,287 @@
+"""Predict time, RRMSD and memory of a design from a pilot: a small version of the same design, run on this machine.
+
+Net, pixels, flux tubes and transport cells of a pilot are those of the scene divided by one factor.  A pixel therefore
+has as many control cells and tubes as in the scene, and the search makes as many evaluations.  The pilot includes all
+faces, goals, losses, wavelengths and bounds of the scene.  How the time of each stage scales with its sizes is known
+from the method.  A pilot has no detail finer than its pixels; the error of this detail is estimated from the picture.
+The constants ending in _SECONDS (s) and _GB (GB) are for the sizes UNIT_…, on two cores of pace 1 (`pace`).
+
+tests/benchmarks/test_prediction.py compares predictions with designs of the templates and of the gallery.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+from numba.core.event import RecordingListener, install_listener
+
+from bstcad import pipeline
+from bstcad.analysis.light import blur
+from bstcad.analysis.steepness import Steepness
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.sides import Sides, as_pair, coarser
+from bstcad.optics.trace.measure import Effort, measure_goals
+from bstcad.planning.cold_run import KERNEL_REPEATS, calibration_kernel, measure_seconds
+from bstcad.runs.processes import Tick
+from bstcad.scene.quality import COARSEST_GRID
+from bstcad.scene.scene import Scene
+from bstcad.tailoring.run import RRMSD_SECONDS, Hooks, Task
+from bstcad.tailoring.slope_map import SUBCELLS
+from bstcad.tailoring.stage2 import round_shares, sheet_sizes, stage3_sheet_sizes
+
+Interval = tuple[float, float, float]  # (low, likely, high); nine of ten designs lie between low and high
+QUALITIES = ("draft", "standard", "fine")  # qualities with a prediction
+PILOT_QUALITIES = ("draft", "standard")  # qualities with a pilot; "fine" uses the pilot of "standard"
+# High / likely and likely / low of the intervals.
+INTERVAL_FACTORS = {"seconds": 1.5, "rrmsd": 1.5, "rrmsd_half": 1.5, "memory_gb": 1.25}
+
+# --- the pilot --------------------------------------------------------------------------------------------------------
+
+PILOT_LIMITS = 128, 193, 512  # maximum pixels (unless MIN_PILOT_POINTS needs more), control points, tubes per side
+MIN_PILOT_POINTS = 65  # minimum control points per side of a pilot, unless its scene has fewer
+MIN_PILOT_TUBES = 16  # minimum tubes per side of a pilot
+PILOT_CELLS = (16, 256)  # minimum and maximum cells per side of the transport of a pilot
+PILOT_EFFORT = Effort(rays=2048, accuracy=0.02, witness=False, cells=2)  # effort of the measurement of a pilot's RRMSDs
+SEARCH_STAGES = ("stage 2", "stage 3")  # beginnings of the names of stages that use the minimiser
+COARSE_ROUND_TEXT = " pixels, "  # text in the names of rounds with few pixels, whose sizes do not depend on the scene
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Seconds that the parts of a design take."""
+
+    first: float  # stage 1
+    search: float  # stage 2 or 3
+    rest: float  # start, writing, verification, report; for a pilot: loading, and rounds with COARSE_ROUND_TEXT
+
+    @property
+    def total(self) -> float:
+        """Time of the whole command, seconds."""
+        return self.first + self.search + self.rest
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """Result of a small design."""
+
+    scene: Scene  # scene of the small design
+    seconds: Seconds  # duration of each part (s)
+    rrmsd: float  # largest RRMSD of all goals
+    half_ratio: float  # largest ratio of the RRMSD on half pixels to that on pixels
+    factor: float  # pixels per side of the full scene / pixels per side of the pilot
+    detail: float  # relative RMS of the detail of the full picture that is finer than the pilot's pixels
+    blur: float  # RRMSD by blur of the source: on pixels of the full scene, minus RRMSD on pixels of the pilot
+    steep: Steepness  # steepness that the map requires of the back
+
+
+def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
+    """Design a small version of a scene in a quality (QUALITIES); raise SceneError if the design is refused."""
+    small, factor = pilot_scene(with_quality(scene, quality))
+    compilations = RecordingListener()
+    hooks, options = Hooks(progress=lambda *event: tick()), pipeline.DesignOptions(compare_later=True)
+    make_design = partial(pipeline.design, small, hooks=hooks, options=options)
+    with install_listener("numba:compile", compilations):
+        finished = make_design()
+    if compilations.buffer:  # the first design after an installation waits for the compiler; time another one
+        finished = make_design()
+    light, finer = small.channels(), factor > 1
+    lights = measure_goals(finished.lens, light, finished.goals, PILOT_EFFORT, ghost=None, draw=small.draw)
+    rrmsd = max(each.rrmsd for each in lights)
+    ratios = [each.half.rrmsd / each.rrmsd for each in lights if each.half is not None and each.rrmsd > 0]
+    sides = [max(goal.receiver.shape) for goal in finished.goals]
+    pairs = zip(scene.single_target_scenes(), small.single_target_scenes(), strict=True)
+    blurs = [blur_rrmsd(one, finished.lens) - blur_rrmsd(few, finished.lens) for one, few in pairs] if finer else [0.0]
+    times = dict.fromkeys(("first", "search", "rest"), 0.0)
+    for stage in finished.making.stages:
+        part = "search" if stage.name.startswith(SEARCH_STAGES) else "first"
+        times["rest" if stage.name == "loading" or COARSE_ROUND_TEXT in stage.name else part] += stage.seconds
+    transport: Mapping[str, Any] = finished.making.transport or {}
+    steep = Steepness(transport["steep_share"], transport["steepest_deg"])
+    lost = max(map(detail, (goal.picture for goal in scene.goals), sides)) if finer else 0.0
+    lacks = {"detail": lost, "blur": max(0.0, *blurs)}
+    errors = {"rrmsd": rrmsd, "half_ratio": max(ratios, default=1.0)}
+    return Pilot(small, Seconds(**times), **errors, factor=factor, **lacks, steep=steep)
+
+
+def with_quality(scene: Scene, quality: str) -> Scene:
+    """Return the scene in another quality, without limits that end a design early; all other settings remain."""
+    return scene.changed({"tailoring.quality": quality, "tailoring.accuracy": None, "tailoring.max_time": None})
+
+
+def pilot_scene(scene: Scene) -> tuple[Scene, float]:
+    """Return the scene of a pilot, and the ratio of the pixels per side of the full scene to those of the pilot."""
+    net, (pixels, points, tubes) = scene.lens.back.net, PILOT_LIMITS
+    knobs, spans = scene.tailoring.resolved(net), max(as_pair(net)) - 1
+    widest = max(max(target.columns_rows) for target in scene.targets)
+    factor = max(min(max(widest / pixels, spans / (points - 1)), spans / (MIN_PILOT_POINTS - 1)), 1.0)
+    changes: dict[str, Any] = {
+        "tailoring.rays": max(min(round(knobs.rays / factor), tubes), MIN_PILOT_TUBES),
+        "tailoring.transport_grid": int(np.clip(round(knobs.transport_grid / factor), *PILOT_CELLS)),
+    }
+    for key, target in zip(scene.target_keys, scene.targets, strict=True):
+        changes[f"{key}.pixels"] = target.fewer_pixels(factor)
+    return replace_net(scene, coarser(net, round(spans / factor) + 1), changes), factor
+
+
+def replace_net(scene: Scene, net: Sides, changes: Mapping[str, object] = {}) -> Scene:
+    """Return the scene with another net of the back, a freeform front's net in proportion, and `changes` by key."""
+    nets = {"lens.back.control_points": net, "tailoring.levels": None}
+    if scene.lens.front.is_tailored and scene.lens.front.control_points is not None:
+        nets["lens.front.control_points"] = scene.lens.front_net(net)
+    return scene.changed({**nets, **changes})
+
+
+def detail(picture: np.ndarray, pixels: int) -> float:
+    """Return the RMS of a picture's cosines with more than `pixels` half waves on the longer side / RMS of all."""
+    from scipy.fft import dctn
+
+    energy = dctn(picture, norm="ortho") ** 2
+    half_waves = np.hypot(*np.meshgrid(*(np.arange(n) * max(picture.shape) / n for n in picture.shape), indexing="ij"))
+    return float(np.sqrt(energy[half_waves > pixels].sum() / energy.sum()))
+
+
+def blur_rrmsd(scene: Scene, lens: Lens) -> float:
+    """Return the RRMSD of the target convolved with the image of an extended source; 0 without extent or light."""
+    image = blur(scene.channels(), lens, scene.target.screen, scene.target.irradiance())
+    return 0.0 if image is None else image.rrmsd
+
+
+# --- predictions ------------------------------------------------------------------------------------------------------
+
+PILOT_EXPONENT = -0.6  # exponent of Pilot.factor in the ratio of the RRMSD of the full design to that of the pilot
+DETAIL_FACTORS = {"draft": 0.2, "standard": 0.02, "fine": 0.02}  # RRMSD due to detail that a pilot lacks / Pilot.detail
+FINE_RATIO = 0.7  # ratio of the RRMSD in fine to that in standard quality
+REMAINING_BLUR = 0.5  # fraction of the blur by an extended source that remains after stage 3
+
+
+def predict(scene: Scene, pilots: Mapping[str, Pilot], gain: float = 1.0) -> dict[str, dict[str, Interval]]:
+    """Return intervals of INTERVAL_FACTORS, by quality, from pilots of PILOT_QUALITIES.
+
+    rrmsd: on pixels.  rrmsd_half: on half pixels.  memory_gb: of two processes.  The RRMSD does not increase from a
+    quality to the next better quality.  gain: RRMSD with the net of `scene`, divided by the RRMSD with the net of the
+    scene of which the pilots are small versions.
+    """
+    best, intervals = math.inf, {}
+    for quality in QUALITIES:
+        pilot = pilots[quality if quality in PILOT_QUALITIES else PILOT_QUALITIES[-1]]
+        whole = with_quality(scene, quality)
+        best = min(best, gain * predicted_rrmsd(pilot, quality))
+        errors = {"rrmsd": best, "rrmsd_half": pilot.half_ratio * best}
+        likely = {"seconds": predicted_seconds(whole, pilot), **errors, "memory_gb": memory_gb(whole)}
+        wide = [(key, each, INTERVAL_FACTORS[key]) for key, each in likely.items()]
+        intervals[quality] = {key: (each / factor, each, each * factor) for key, each, factor in wide}
+    return intervals
+
+
+def predicted_rrmsd(pilot: Pilot, quality: str) -> float:
+    """Return the RRMSD of a full design: the scaled RRMSD of its pilot plus that of detail and blur it lacks."""
+    by_pilot = (FINE_RATIO if quality == "fine" else 1.0) * pilot.factor**PILOT_EXPONENT * pilot.rrmsd
+    return by_pilot + DETAIL_FACTORS[quality] * pilot.detail + REMAINING_BLUR * pilot.blur
+
+
+def predicted_seconds(scene: Scene, pilot: Pilot) -> float:
+    """Return the time (s) of a design: times of the pilot's stages, scaled by their sizes, and the rest by `pace`."""
+    whole, small, times = typical_seconds(scene), typical_seconds(pilot.scene), pilot.seconds
+    tailored = times.first * whole.first / small.first + times.search * whole.search / small.search
+    return tailored + times.rest + pace() * whole.rest
+
+
+# --- sizes ------------------------------------------------------------------------------------------------------------
+
+# Sizes (per side, or iterations) for which the following times (s) and memory (GB) are stated, on two cores of pace 1.
+UNIT_TUBES, UNIT_POINTS, UNIT_PIXELS, UNIT_GRID, UNIT_ITERATIONS = 1024, 513, 512, 256, 40
+KERNEL_SECONDS = 0.115  # time of an evaluation of cold_run.calibration_kernel; defines pace 1
+ROUND_SECONDS, TRANSPORT_SECONDS, FIT_SECONDS = 0.06, 0.2, 0.6  # stage 1: rest of a round, transport, slope fit
+TWO_FACE_TRANSPORT_SECONDS = 2.4  # time of a transport for two freeform faces, with the trace between them
+TWO_FACE_SECONDS = 3.0  # additional time in stage 1 for two freeform faces of any size
+AIMING_SECONDS = 0.15  # time to find the rays from a point source through UNIT_TUBES² points of a face
+FRONT_SECONDS = 1.7  # time of the search for the free parameters of a front
+EVALUATION_SECONDS, VARIABLE_SECONDS, BLUR_SECONDS = 0.11, 0.046, 0.30  # time of the tubes, net, blur in an evaluation
+CALL_SECONDS = 0.01  # time in an evaluation that is independent of sizes
+IMAGE_SECONDS = 0.7  # time in a round for the images of an extended source
+ADAM_SECONDS = 0.1  # time of a step of Wang et al.'s procedure
+START_SECONDS = 2.8  # time of the imports and of the end of the process
+WRITE_SECONDS, NET_SECONDS, PICTURE_SECONDS = 1.5, 2.4, 1.1  # time to write and verify: constant part, net, pixels
+MOUNT_SECONDS = 2.5  # time of cutting and verifying the mounted part
+RAY_SECONDS, DRAFT_RAY_SECONDS = 1.6, 1.0  # tracing parallel light, per target and spectral line; twice for other light
+WITNESS_SECONDS, DRAFT_WITNESS_SECONDS = 6.0, 2.5  # time to verify a lens of two nets with flux tubes, per target
+LIBRARIES_GB = 1.5  # memory of the libraries in both processes
+TUBES_GB, NET_GB, PIXELS_GB = 0.12, 0.27, 0.02  # memory of tubes, net and pixels
+GOAL_MEMORY_FACTOR = 1.2  # memory of tubes per goal with several goals / memory with one target
+
+
+@cache
+def pace() -> float:
+    """Return the time of the calibration kernel on this machine divided by KERNEL_SECONDS; 0.5: twice as fast."""
+    return min(measure_seconds(calibration_kernel()) for _ in range(KERNEL_REPEATS)) / KERNEL_SECONDS
+
+
+def typical_seconds(scene: Scene) -> Seconds:
+    """Return the times of a design on two cores of pace 1 (see `pace`), estimated from its sizes only."""
+    knobs, point = scene.tailoring.resolved(scene.lens.back.net), not scene.source.parallel
+    rest = START_SECONDS + proof_seconds(scene)
+    sheets, net, pixels = search_rounds(scene), (knobs.side / UNIT_POINTS) ** 2, _pixel_ratio(scene)
+    if knobs.method == "adam":
+        step = ADAM_SECONDS * (knobs.rays / UNIT_TUBES) ** 2
+        return Seconds(step * (knobs.stage1_iterations * len(knobs.levels)), step * knobs.stage2_iterations, rest)
+    halvings, transport = (1, TWO_FACE_TRANSPORT_SECONDS) if scene.lens.front.is_tailored else (2, TRANSPORT_SECONDS)
+    grids = [max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left, halvings)) for left in range(knobs.rounds)]
+    first = ROUND_SECONDS * knobs.rounds + (FRONT_SECONDS if scene.lens.front.free else 0.0)
+    first += TWO_FACE_SECONDS if scene.lens.front.is_tailored else 0.0
+    first += transport * sum((grid / UNIT_GRID) ** 2 for grid in grids) * knobs.transport_iterations / UNIT_ITERATIONS
+    fits = [fitted for level in knobs.levels[-2:] for fitted in scene.lens.nets(level)]
+    first += FIT_SECONDS * sum(math.prod(as_pair(fitted)) for fitted in fits) / UNIT_POINTS**2
+    each, begun = CALL_SECONDS + VARIABLE_SECONDS * net, RRMSD_SECONDS * pixels ** (2 / 3)  # per evaluation, round
+    if scene.source.extent is not None:
+        each, begun = each + BLUR_SECONDS * pixels, begun + IMAGE_SECONDS
+    launched = sum((tubes / UNIT_TUBES) ** 2 for tubes, _ in sheets)
+    tube = len(scene.targets) * EVALUATION_SECONDS  # upper limit: rounds for several pictures may end early
+    search = sum(count * (tube * (tubes / UNIT_TUBES) ** 2 + each) + begun for tubes, count in sheets)
+    if point:
+        sides = [*(SUBCELLS * grid for grid in grids), min(2 * knobs.side, knobs.rays)]
+        first += AIMING_SECONDS * sum((side / UNIT_TUBES) ** 2 for side in sides)
+        search += AIMING_SECONDS * launched
+    return Seconds(first, search + RRMSD_SECONDS * pixels ** (2 / 3), rest)
+
+
+def search_rounds(scene: Scene) -> tuple[tuple[int, int], ...]:
+    """Return (tubes per side, number of evaluations) of each round of stage 2 or 3."""
+    knobs = scene.tailoring.resolved(scene.lens.back.net)
+    if scene.source.extent is not None:
+        columns, rows = zip(*(target.columns_rows for target in scene.targets), strict=True)
+        return tuple(stage3_sheet_sizes(knobs, (max(columns), max(rows))))
+    return tuple(
+        sheet_sizes(knobs, round_shares(Task((), scene.goals, knobs, bounds=scene.lens.bounds, wave=scene.wavefront)))
+    )
+
+
+def memory_gb(scene: Scene) -> float:
+    """Return the peak memory (GB) of the two processes of a design together."""
+    goals = len(scene.targets) + (scene.wavefront is not None)
+    by_goals = GOAL_MEMORY_FACTOR * goals if goals > 1 else 1.0
+    corners = max(tubes for tubes, _ in search_rounds(scene)) ** 2 / UNIT_TUBES**2 * by_goals
+    return LIBRARIES_GB + TUBES_GB * corners + NET_GB * _point_ratio(scene) + PIXELS_GB * _pixel_ratio(scene)
+
+
+def proof_seconds(scene: Scene) -> float:
+    """Return the time (s) of writing, verification and report on two cores of pace 1; `pipeline.reserve` is larger."""
+    wide = not scene.source.parallel or scene.source.extent is not None
+    draft = scene.tailoring.quality == "draft"
+    rays, witness = (DRAFT_RAY_SECONDS, DRAFT_WITNESS_SECONDS) if draft else (RAY_SECONDS, WITNESS_SECONDS)
+    a_target = rays * (2 if wide else 1) * len(scene.source.lines) + witness * (len(scene.lens.nets()) - 1)
+    mounted = MOUNT_SECONDS if scene.mount is not None else 0.0
+    by_size = WRITE_SECONDS + NET_SECONDS * _point_ratio(scene) + PICTURE_SECONDS * _pixel_ratio(scene)
+    return by_size + a_target * len(scene.targets) + mounted
+
+
+def _point_ratio(scene: Scene) -> float:
+    return sum(math.prod(as_pair(net)) for net in scene.lens.nets()) / UNIT_POINTS**2
+
+
+def _pixel_ratio(scene: Scene) -> float:
+    return sum(math.prod(target.columns_rows) for target in scene.targets) / UNIT_PIXELS**2
