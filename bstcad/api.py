@@ -22,10 +22,12 @@ import numpy as np
 import torch
 from PIL import Image
 
-from bstcad import commands, pipeline
-from bstcad import folder as folders
+from bstcad import commands
 from bstcad.commands import OwnCheck, OwnSection, ProofOptions
-from bstcad.folder import Made, same_front
+from bstcad.designs import folder as folders
+from bstcad.designs import pipeline
+from bstcad.designs.course import BY_HAND, DesignCourse
+from bstcad.designs.folder import Made, same_front
 from bstcad.manufacture.measured.compensation import Settings as CompensationSettings
 from bstcad.manufacture.shop.as_built import AsBuilt
 from bstcad.manufacture.shop.rounds import Compensated
@@ -37,7 +39,7 @@ from bstcad.optics.trace.measure import Effort, tubes_picture
 from bstcad.report import record
 from bstcad.report.drawing import png
 from bstcad.report.light_figures import View, irradiance_triptych
-from bstcad.report.record import BY_HAND, DesignCourse, Report, rrmsds
+from bstcad.report.record import Report, rrmsds
 from bstcad.report.units import number, quantity
 from bstcad.runs import files, processes
 from bstcad.runs import progress as progresses

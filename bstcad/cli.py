@@ -286,7 +286,7 @@ def plan(
     with loading():
         wanted = load_scene(scene, settings)
         from bstcad import commands
-        from bstcad import folder as folders
+        from bstcad.designs import folder as folders
         from bstcad.planning.net_choice import with_net
         from bstcad.planning.plan import plan as planned
         from bstcad.planning.plan import reach_drawn

@@ -24,9 +24,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import bstcad
-from bstcad import folder as folders
 from bstcad.cad.tiling import Tiling
-from bstcad.folder import Made
+from bstcad.designs import folder as folders
+from bstcad.designs.as_designed import scene_text
+from bstcad.designs.course import StageRecord
+from bstcad.designs.folder import Made
+from bstcad.designs.pipeline import DesignState, design, purpose
 from bstcad.manufacture.measured import cloud as clouds
 from bstcad.manufacture.measured import made_part
 from bstcad.manufacture.measured.cloud import Cloud
@@ -38,7 +41,6 @@ from bstcad.manufacture.shop.as_built import AsBuilt, Retailored
 from bstcad.manufacture.shop.rounds import Compensated
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.trace.measure import FULL, Effort, Light, SpectralLine
-from bstcad.pipeline import DesignState, design, purpose
 from bstcad.planning.estimates import diagnosis, left_out
 from bstcad.planning.net_choice import with_net
 from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
@@ -51,7 +53,7 @@ from bstcad.report.grid_sag import GridLight
 from bstcad.report.light_figures import View, changed_picture, draw_judges, draw_part
 from bstcad.report.photometric_figures import draw_isolux, far_field_of
 from bstcad.report.prescription import SHEET, Order
-from bstcad.report.record import Contents, Examined, LeftOut, Report, StageRecord, contents_of, with_part
+from bstcad.report.record import Contents, Examined, LeftOut, Report, contents_of, with_part
 from bstcad.report.rendering import LightPath
 from bstcad.report.tolerances import Tolerances
 from bstcad.report.toolpath_files import refuse_hopeless
@@ -476,7 +478,7 @@ def _write_report(
     page = report.html(
         contents,
         pictures,
-        scene=prescription.scene_text(made.scene, made.lens),
+        scene=scene_text(made.scene, made.lens),
         solid=rendering.turnable(as_cut(lens, made.scene.mount)),
         tolerances=studied,
         prescription=prescription.sections(prescribed),

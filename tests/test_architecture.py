@@ -21,12 +21,11 @@ PACKAGE = Path(__file__).parent.parent / "bstcad"
 
 # Parts of the package that are files at its top, and these files; all others are rooms.
 AT_TOP = {
-    "designs": {"pipeline", "folder"},  # how a lens comes about, and its folder
     "commands": {"commands", "api", "cli", "cli_options"},  # for scripts and for the terminal
 }
 ENGINE = {
     "runs", "scene", "optics", "photometry", "step_text", "transport", "tailoring", "tailoring.baselines", "cad",
-    "analysis", "toolpath", "verify", "verify.judges", "manufacture.measured", "report",
+    "analysis", "toolpath", "verify", "verify.judges", "designs", "manufacture.measured", "report",
 }  # fmt: skip
 # A part of the package, and the parts it may import besides itself.  A folder that is no part stands for its parts.
 MAY_IMPORT = {
@@ -59,10 +58,11 @@ MAY_IMPORT = {
         "analysis",
         "verify",
         "verify.judges",
+        "designs",
         "manufacture.measured",
         "toolpath",
     },
-    "designs": {*ENGINE, "bstcad"} - {"verify.judges", "manufacture.measured"},
+    "designs": {*ENGINE, "bstcad"} - {"designs", "verify.judges", "manufacture.measured", "report", "toolpath"},
     # Designs come about in processes of their own; a sweep times and judges with the engine's tools.
     "planning": {"runs", "scene", "optics", "tailoring", "analysis", "verify", "report", "designs", "bstcad"},
     # A picture as made has the scatter of analysis, and the blur by an extended source of tailoring.
@@ -80,7 +80,7 @@ MAY_IMPORT = {
     },
     # Rounds of cutting and measuring write the folders of designs.
     "manufacture.shop": {"runs", "scene", "optics", "manufacture.measured", "report", "tailoring", "designs", "bstcad"},
-    "commands": {*ENGINE, "designs", "planning", "manufacture", "app", "bstcad"},
+    "commands": {*ENGINE, "planning", "manufacture", "app", "bstcad"},
     # The workbench's previews are designs made small, by the steps of tailoring.
     "app": {
         "runs",
@@ -104,7 +104,7 @@ ONLY = {
     "cadquery": {"cad"},
     "matplotlib": {"report", "planning"},  # the latter draws with report's tools, and names its types
     "pyvista": {"report"},
-    "pydantic": {"scene", "report", "planning"},
+    "pydantic": {"scene", "designs", "report", "planning"},
     "typer": {"commands"},
     "starlette": {"app"},
     "uvicorn": {"app"},

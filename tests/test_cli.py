@@ -15,7 +15,7 @@ from rich.console import Console
 
 import bstcad
 from bstcad import cli
-from bstcad import folder as folders
+from bstcad.designs import folder as folders
 from bstcad.report import manual
 from bstcad.runs import progress, signals
 from bstcad.tailoring.run import Hooks

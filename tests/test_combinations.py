@@ -26,9 +26,10 @@ import torch
 from scipy.ndimage import binary_closing, binary_dilation
 
 import bstcad
-from bstcad import commands, pipeline
+from bstcad import commands
 from bstcad.app.preview import PreviewSize, preview
 from bstcad.commands import ProofOptions
+from bstcad.designs import pipeline
 from bstcad.manufacture.shop import as_built
 from bstcad.manufacture.shop.as_built import AsBuilt
 from bstcad.optics.surfaces.charts import HEIGHTS
@@ -554,7 +555,7 @@ def faults(chosen, folder, *, previewed=True, planned=True, retailored=True):
         if not (previewed or planned):
             patch.setattr("bstcad.commands.Pictures", NoPictures)
             patch.setattr("bstcad.commands.left_out", lambda *given: ())
-            patch.setattr("bstcad.pipeline.compare_precisions", lambda *given: NO_DIFFERENCE)
+            patch.setattr("bstcad.designs.pipeline.compare_precisions", lambda *given: NO_DIFFERENCE)
         return _faults(chosen, folder, previewed=previewed, planned=planned, retailored=retailored)
 
 

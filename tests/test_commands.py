@@ -17,8 +17,8 @@ from PIL import Image
 
 import bstcad
 from bstcad import cli, commands
-from bstcad import folder as folders
 from bstcad.commands import ProofOptions
+from bstcad.designs import folder as folders
 from bstcad.optics.surfaces.bspline import knots
 from bstcad.optics.trace.measure import Effort
 from bstcad.report import report
@@ -213,7 +213,7 @@ class TestGenerate:
         assert f"the finished design is kept in {tmp_path / 'out-unwritten'}" in kept and "--resume" in resumed
         assert {path.name for path in tmp_path.iterdir()} == {".out.checkpoint", "out-unwritten"}
         found = commands.read(tmp_path / "out-unwritten").lens.back.control_points()
-        monkeypatch.setattr("bstcad.pipeline.PROCEDURES", {})  # whoever tailored would fail
+        monkeypatch.setattr("bstcad.designs.pipeline.PROCEDURES", {})  # whoever tailored would fail
         commands.generate(scene, tmp_path / "out", device="cpu", resume=True)
         assert [path.name for path in tmp_path.iterdir()] == ["out"]
         assert np.array_equal(commands.read(tmp_path / "out").lens.back.control_points(), found)

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 import tomli_w
 
+from bstcad.designs.pipeline import DesignOptions, design
 from bstcad.optics.trace.measure import Effort, measure
 from bstcad.optics.trace.wavefront_error import wavefront_error
-from bstcad.pipeline import DesignOptions, design
 from bstcad.scene.scene import load
 
 PAGE = Path(__file__).parent.parent / "docs" / "how-to" / "two-faces.md"

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad import pipeline
+from bstcad.designs import pipeline
+from bstcad.designs.pipeline import design
 from bstcad.optics.numerics import ops
 from bstcad.optics.surfaces import bspline
 from bstcad.optics.trace import tubes
-from bstcad.pipeline import design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2

@@ -12,8 +12,9 @@ import pytest
 import torch
 
 import bstcad
-from bstcad import commands, pipeline
+from bstcad import commands
 from bstcad.commands import ProofOptions
+from bstcad.designs import pipeline
 from bstcad.manufacture.tolerance import tolerancing
 from bstcad.manufacture.tolerance.study import StudySettings
 from bstcad.optics.surfaces.radial import RadialSurface

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import bstcad
-from bstcad import pipeline
 from bstcad.cad import mesh, patches
+from bstcad.designs import pipeline
 from bstcad.manufacture.tolerance.perturbations import Setup, kinds
 from bstcad.optics.light.emitters import Emitter, all_alive
 from bstcad.optics.receivers.receivers import Receiver

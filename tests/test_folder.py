@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad import folder as folders
+from bstcad.designs import folder as folders
 from bstcad.optics.surfaces.surfaces import Sphere
 from bstcad.optics.trace.measure import Light
 from bstcad.scene.errors import SceneError

@@ -13,7 +13,7 @@ import bstcad
 from bstcad import commands
 from bstcad.cad import step_reading
 from bstcad.commands import ProofOptions
-from bstcad.folder import read_nominal
+from bstcad.designs.folder import read_nominal
 from bstcad.manufacture.tolerance import perturbations
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.surfaces import Toroid, sag

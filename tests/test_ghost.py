@@ -9,7 +9,7 @@ import bstcad
 from bstcad import commands
 from bstcad.cli import run
 from bstcad.commands import ProofOptions
-from bstcad.folder import read_irradiances
+from bstcad.designs.folder import read_irradiances
 from bstcad.report.figure_jobs import NoPictures
 from tests.conftest import pictures, proofs, quick_effort
 

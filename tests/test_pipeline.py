@@ -6,8 +6,8 @@ import time
 import pytest
 import torch
 
-from bstcad import pipeline
 from bstcad.cad.solid import lens_solid
+from bstcad.designs import pipeline
 from bstcad.optics.receivers.irradiance import Screen, efficiency, rrmsd
 from bstcad.scene import scene
 from bstcad.scene.errors import SceneError

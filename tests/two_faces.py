@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import torch
 
-from bstcad.folder import Made
-from bstcad.report.record import BY_HAND, DesignCourse
+from bstcad.designs.course import BY_HAND, DesignCourse
+from bstcad.designs.folder import Made
 from bstcad.scene.scene import load
 
 DISK = "templates/disk.toml"

@@ -19,9 +19,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bstcad import folder as folders
 from bstcad.app.design_process import JOB, JOBS, LIGHT, PROGRESS, STATE, State
 from bstcad.app.workspace import NAME
+from bstcad.designs import folder as folders
 from bstcad.report.record import of_json
 from bstcad.runs import files
 from bstcad.runs.processes import command_of

@@ -27,7 +27,6 @@ from starlette.routing import Route
 from starlette.staticfiles import StaticFiles
 
 import bstcad
-from bstcad import folder as folders
 from bstcad.app import crop, design_runs, dome_offer, form, preview_json, scene_text, sketch
 from bstcad.app.connections import bound, uvicorn_server
 from bstcad.app.design_process import STUDIES
@@ -37,6 +36,7 @@ from bstcad.app.guard import POLICY, SANDBOX, Guard, TooLarge
 from bstcad.app.preview import Preview
 from bstcad.app.preview_desk import STAGES, PreviewDesk, PreviewRequest
 from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
+from bstcad.designs import folder as folders
 from bstcad.manufacture.tolerance.lit_by import LIGHTS
 from bstcad.report import manual, record
 from bstcad.report.light_figures import View, dark_triptych

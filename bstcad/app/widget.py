@@ -14,10 +14,10 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from bstcad import folder as folders
 from bstcad.app import form, preview_json, scene_text
 from bstcad.app.followers import with_followers
 from bstcad.app.preview import Outdated, Preview, preview
+from bstcad.designs import folder as folders
 from bstcad.runs import files
 from bstcad.runs.files import SentenceError
 from bstcad.scene import scene_file

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 import psutil
 
 import bstcad
-from bstcad import folder as folders
-from bstcad.pipeline import DesignState, purpose
+from bstcad.designs import folder as folders
+from bstcad.designs.pipeline import DesignState, purpose
 from bstcad.planning import cold_run
 from bstcad.planning.cold_run import LocalPool, SceneFiles, StoredRecord, unpack_scene
 from bstcad.planning.net_choice import with_net

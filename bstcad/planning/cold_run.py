@@ -25,7 +25,7 @@ import torch
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
 from typing_extensions import TypedDict
 
-from bstcad.folder import SCENE, read_nominal, scene_files
+from bstcad.designs.folder import SCENE, read_nominal, scene_files
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.collimated import Collimated

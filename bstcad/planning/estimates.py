@@ -18,6 +18,7 @@ import torch
 
 from bstcad.analysis.cost import ending, remaining
 from bstcad.analysis.neglected_effects import Change, Reference, difference
+from bstcad.designs.course import DesignCourse
 from bstcad.optics.lens import media
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
@@ -26,7 +27,7 @@ from bstcad.optics.light.profiles import pair_of
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.surfaces.sides import as_pair
 from bstcad.optics.trace.measure import tubes_picture
-from bstcad.report.record import DesignCourse, LeftOut
+from bstcad.report.record import LeftOut
 from bstcad.scene.effects import Absorption, Effect, Fresnel, Ghost, find_effect, losses, reflection_of
 from bstcad.scene.real_source import DEFAULT_DIAMETER as DEFAULT_DIAMETER
 from bstcad.scene.real_source import DEFAULT_DIVERGENCE as DEFAULT_DIVERGENCE

@@ -13,11 +13,11 @@ import numpy as np
 
 from bstcad.analysis.etendue import FORBIDDEN, etendue
 from bstcad.analysis.light import blur
+from bstcad.designs.pipeline import reachable_part
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.receivers.goal import worst
 from bstcad.optics.surfaces.sides import as_pair, scaled
 from bstcad.optics.trace.reach import unreached
-from bstcad.pipeline import reachable_part
 from bstcad.planning.cold_run import round_numbers
 from bstcad.planning.estimates import coarse_lens, left_out
 from bstcad.planning.net_choice import rrmsd_ratio

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numba.core.event import RecordingListener, install_listener
 
-from bstcad import pipeline
 from bstcad.analysis.light import blur
 from bstcad.analysis.steepness import Steepness
+from bstcad.designs import pipeline
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.sides import Sides, as_pair, coarser
 from bstcad.optics.trace.measure import Effort, measure_goals

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import bstcad
-from bstcad.folder import SCENE, scene_files
+from bstcad.designs.folder import SCENE, scene_files
 from bstcad.optics.surfaces.sides import Sides, as_pair, scaled
 from bstcad.planning import cold_run, results
 from bstcad.planning.cold_run import ColdRun, LocalPool, Settings, StoredRecord, Value, format_value, sorted_settings

@@ -19,6 +19,7 @@ import torch
 from bstcad.analysis.light import bundle, fan, ray_map
 from bstcad.analysis.shape import MAX_RADIUS, Survey, least_squares, survey, survey_front
 from bstcad.cad import mesh as meshes
+from bstcad.designs.course import CurvePoint, StageRecord
 from bstcad.optics.lens import domes
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.emitters import Emitter
@@ -32,7 +33,7 @@ from bstcad.report.data_sheet import DataSheet
 from bstcad.report.dome_figures import ANGLE_LABELS, dome_maps, in_angles
 from bstcad.report.drawing import BLUE, GLASS, GREY, VERMILION, footnote, new_figure, png, round_up, steps, styled
 from bstcad.report.light_figures import View, plain_ticks
-from bstcad.report.record import Contents, CurvePoint, StageRecord
+from bstcad.report.record import Contents
 from bstcad.report.rendering import LightPath
 from bstcad.report.units import number, quantity, tilt_words
 from bstcad.report.wavefront_figure import wavefront_map

@@ -13,6 +13,7 @@ from pydantic import Field
 from bstcad.analysis.cell_errors import is_right, right_down_to
 from bstcad.analysis.etendue import Silhouette
 from bstcad.analysis.top_hat import FLAT_LEVEL, FlatTop
+from bstcad.designs.course import Fraction, Rrmsd, Size
 from bstcad.optics.receivers.goal import Goal, suffix_of, words_of
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.trace.measure import RESOLVED, CellError, Light
@@ -23,9 +24,6 @@ from bstcad.scene.target import drawing
 from bstcad.verify.checks import Proof
 from bstcad.verify.light_limits import PER_LX
 
-Fraction = Annotated[float, Field(ge=-1e-6, le=1 + 1e-6)]  # number from 0 to 1, with the rounding error of a sum
-Size = Annotated[float, Field(ge=0, le=1e12)]  # number from 0 to 1e12
-Rrmsd = Annotated[float, Field(gt=0, le=1e3)]
 CELL_WORDS = {1.0: "pixels", 0.5: "half pixels", 0.25: "quarter pixels"}  # side of a cell (pixels): name of the cells
 
 

@@ -21,11 +21,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.shape import MAX_RADIUS, describe, heights, survey_front, thickness_range
+from bstcad.designs.as_designed import vertex, vertex_key
 from bstcad.optics.lens import domes, passes, quadrature
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.media import density
 from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface
-from bstcad.optics.surfaces.surfaces import Surface, sag
+from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.report.units import Rows, paragraphs, tables
 from bstcad.scene.fronts import FIT_TOLERANCE
 from bstcad.scene.mount import as_cut
@@ -35,7 +36,6 @@ from bstcad.scene.schema import FileContent
 if TYPE_CHECKING:
     from bstcad.cad.solid_properties import WholePart
 
-MIN_NOTED_SHIFT = 1e-3  # smallest shift of the back's vertex that scene.toml mentions, as a fraction of the thickness
 LIGHT_DIRECTIONS = {  # kind of the optic: direction of the light in words
     "lens": "Light travels along +z",
     "mirror": "Light travels to the mirror along -z and leaves it along +z",
@@ -84,7 +84,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "net": _net(lens.back_net),
         **({"front_net": _net(lens.front_net), "front_asked": scene.lens.front.z} if lens.shapes("front") else {}),
         "back_asked": scene.lens.back.z,  # position of the back's vertex in the scene
-        **({"back_key": _vertex_key(scene)} if scene.lens.dome else {}),  # key of this position, if not lens.back.z
+        **({"back_key": vertex_key(scene)} if scene.lens.dome else {}),  # key of this position, if not lens.back.z
         "centre_thickness": shape["centre_thickness"],
         "edge_thickness": (shape["edge_thickness_min"], shape["edge_thickness_max"]),
         "volume": shape["volume"],  # mm³
@@ -129,25 +129,6 @@ def _own_outline(front: Surface) -> dict[str, Any]:
 
 def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in table.items() if value is not None}
-
-
-def vertex(lens: Lens) -> float:
-    """Return the position z of the back on the axis (mm)."""
-    return float(sag(lens.back, 0.0, 0.0))
-
-
-def _vertex_key(scene: Scene) -> str:
-    """Return the key that determines the position of the back's vertex; a dome has no lens.back.z."""
-    return "lens.back.radius" if scene.lens.dome else "lens.back.z"
-
-
-def scene_text(scene: Scene, lens: Lens) -> str:
-    """Return the text of scene.toml in a design's folder, with a note if the back was moved."""
-    drawn = scene.lens.back.z - scene.lens.front.z
-    if not abs(vertex(lens) - scene.lens.back.z) > MIN_NOTED_SHIFT * drawn:
-        return scene.toml()
-    note = f"the vertex of the back is at z = {vertex(lens)!r} mm; it started at {_vertex_key(scene)} below"
-    return f"# as designed, {note}\n{scene.toml()}"
 
 
 def _passes(record: Mapping[str, Any]) -> passes.Passes:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from bstcad.designs.course import Rrmsd, Size
 from bstcad.report import record, tolerances
-from bstcad.report.record import Rrmsd, Size
 from bstcad.report.units import environment
 from bstcad.runs import files
 

@@ -20,13 +20,23 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import ConfigDict, FailFast, Field, TypeAdapter, ValidationError
 from pydantic_core import from_json, to_json, to_jsonable_python
-from typing_extensions import TypedDict
 
 from bstcad.analysis.cost import lifted, unlit
 from bstcad.analysis.etendue import Etendue, etendue
 from bstcad.analysis.light import Blur, FinestDetail, finest_detail
 from bstcad.analysis.steepness import Steepness
 from bstcad.analysis.top_hat import FlatTop
+from bstcad.designs.course import (
+    CurvePoint,
+    DesignCourse,
+    Fraction,
+    PrecisionTest,
+    Rrmsd,
+    Scalar,
+    Seconds,
+    Size,
+    StageRecord,
+)
 from bstcad.manufacture.measured.form_error import MAP_FILES
 from bstcad.manufacture.measured.made_part import MadePart
 from bstcad.optics.receivers.goal import Goal, worst
@@ -35,11 +45,8 @@ from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.trace.reach import unreached
 from bstcad.report.goal_figures import (
     CellFigures,
-    Fraction,
     GoalFigures,
     Photometry,
-    Rrmsd,
-    Size,
     WavefrontFigures,
     figures_of,
     flat_tops,
@@ -59,7 +66,6 @@ from bstcad.verify.verdict import NO_LIMIT, Check, verdict
 if TYPE_CHECKING:
     from bstcad.optics.light.emitters import Emitter
 
-BY_HAND = "by hand"  # DesignCourse.stopped of a lens that was changed after its design, or designed elsewhere
 MAX_REPORT_BYTES = 20_000_000  # size limit of a report (bytes): room for 300 000 points of the curve
 MAX_STRING_LENGTH = 1000  # largest number of characters of a string in a report that is read
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
@@ -85,39 +91,7 @@ WORST_GOAL_KEYS["rrmsd_noise"] = "rrmsd_standard_error"
 # Keys of a report that repeat figures of the worst goal on cells of several sizes; an earlier report has none of them.
 CELL_KEYS = ("rrmsd_by_cell", "right_down_to")
 
-Scalar = str | float | int | bool | None
-Seconds = Annotated[float, Field(ge=0, le=1e9)]
 Record = TypeVar("Record")
-
-
-@dataclass(frozen=True)
-class StageRecord:
-    """One stage of the design."""
-
-    name: str  # name of the stage, such as stage 2
-    seconds: Seconds  # wall time
-    rrmsd: Rrmsd | None = None  # RRMSD after the stage
-    cpu_seconds: Seconds | None = None  # CPU time; None: unknown, or another process took part
-
-
-@dataclass(frozen=True)
-class CurvePoint:
-    """One point of the convergence curve."""
-
-    seconds: Seconds  # time since the start
-    rrmsd: Rrmsd  # RRMSD of the best lens so far, by flux tubes; at the end of a stage, final RRMSD by new rays
-
-
-class PrecisionTest(TypedDict):
-    """Comparison of a short run of tailoring in float32 and in float64; see tailoring.stage2.PrecisionComparison."""
-
-    control_points: int  # number of control points along the longer side
-    merit: Size  # difference of the merits before the first step, relative to the larger one
-    gradient: Size  # norm of the difference of the gradients before the first step, relative to the larger norm
-    evaluations: int  # number of evaluations in each precision
-    rrmsd_float64: Rrmsd  # RRMSD after the evaluations in float64
-    rrmsd_float32: Rrmsd  # RRMSD after the evaluations in float32
-    heights: Size  # largest difference between the heights of a control point after the evaluations (mm)
 
 
 @dataclass(frozen=True)
@@ -127,30 +101,6 @@ class LineFigures:
     wavelength: Size  # vacuum wavelength (nm)
     share: Fraction  # fraction of all light that is in this line
     rrmsd: Rrmsd  # RRMSD of the line's picture against the target
-
-
-@dataclass(frozen=True)
-class DesignCourse:
-    """Course of a design; a field is None if unknown, as when the earlier report of the design is missing."""
-
-    seconds_total: Seconds = 0.0  # time from the command to the verified lens and the pictures of its report
-    stages: tuple[StageRecord, ...] = ()
-    history: tuple[CurvePoint, ...] = ()
-    machine: Mapping[str, Scalar] | None = None
-    versions: Mapping[str, str] | None = None  # versions of the libraries
-    # grid (cells per side), iterations, mass_error and stopped (reason) of the transport; steep_share, steepest_deg
-    transport: Mapping[str, Scalar] | None = None
-    skipped_steps: int | None = None  # number of steps skipped because merit or gradient was not finite
-    stopped: str | None = None  # reason why tailoring ended
-    twins: PrecisionTest | None = None  # comparison of float32 with float64
-
-    def with_stages(self, *last: StageRecord) -> DesignCourse:
-        """Return this record with the stages `last` at its end, instead of earlier stages with their names."""
-        names = [stage.name for stage in last]
-        again = sum(stage.seconds for stage in self.stages if stage.name in names)
-        seconds = self.seconds_total - again + sum(stage.seconds for stage in last)
-        stages = (*(stage for stage in self.stages if stage.name not in names), *last)
-        return replace(self, stages=stages, seconds_total=seconds)
 
 
 @dataclass(frozen=True)

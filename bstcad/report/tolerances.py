@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field
 from typing_extensions import TypedDict
 
-from bstcad.report.record import STRICT, Fraction, Rrmsd, Size, plain, read_as
+from bstcad.designs.course import Fraction, Rrmsd, Size
+from bstcad.report.record import STRICT, plain, read_as
 from bstcad.report.report import BEGIN, END, base64_images
 from bstcad.report.units import about, amount, environment, paragraphs, percent
 from bstcad.runs import files

@@ -12,6 +12,7 @@ from bstcad.app import server
 from bstcad.app.guard import Guard
 from bstcad.app.preview_desk import PreviewDesk
 from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
+from bstcad.designs.course import CurvePoint
 from bstcad.report import record
 from bstcad.report.goal_figures import GoalFigures
 from tests.app.conftest import SMALL
@@ -124,7 +125,7 @@ def contents(name, **more):
     known = {
         "title": "A small disc", "verdict": "passed", "passed": True, "rrmsd": 0.02, "rrmsd_tent": None,
         "rrmsd_noise": 1e-4, "light_on_target": 0.9, "efficiency": 0.95, "flux": {"on target": 0.9},
-        "prescription": {}, "seconds_total": 3.0, "stages": (), "history": (record.CurvePoint(1.0, 0.5),), "checks": (),
+        "prescription": {}, "seconds_total": 3.0, "stages": (), "history": (CurvePoint(1.0, 0.5),), "checks": (),
         "effects": {"simulated": (), "left_out": ()}, "machine": {}, "versions": {}, "seed": 0,
     }  # fmt: skip
     known |= more

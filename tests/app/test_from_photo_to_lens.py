@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bstcad import commands, pipeline
-from bstcad import folder as folders
+from bstcad import commands
 from bstcad.app import design_process
 from bstcad.app.design_runs import Run
+from bstcad.designs import folder as folders
+from bstcad.designs import pipeline
 from bstcad.report import record
 from bstcad.scene import new_scene
 from bstcad.scene.scene import load

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from bstcad import commands
-from bstcad import folder as folders
 from bstcad.app.design_runs import Run
+from bstcad.designs import folder as folders
 from bstcad.scene.scene import load
 from tests.app.conftest import SEEN, SMALL, begin
 

@@ -16,10 +16,10 @@ import pytest
 from PIL import Image
 
 from bstcad import cli, commands
-from bstcad import folder as folders
 from bstcad.app import scene_text
 from bstcad.app.design_process import JOB, PROGRESS, State
 from bstcad.app.design_runs import Run
+from bstcad.designs import folder as folders
 from bstcad.scene.scene import load
 from tests.app.conftest import PATIENCE, SEEN, SMALL, open_scene
 

@@ -31,7 +31,7 @@ import numpy as np
 import psutil
 import torch
 
-from bstcad.folder import read_nominal
+from bstcad.designs.folder import read_nominal
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.trace.measure import measure
 from bstcad.planning.cold_run import REFERENCE_EFFORT, round_numbers

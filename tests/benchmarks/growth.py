@@ -29,13 +29,13 @@ from skimage.data import astronaut
 
 from bstcad.cad import mesh as meshes
 from bstcad.cad import step_reading, step_writing
-from bstcad.folder import Made, write_geometry
+from bstcad.designs.folder import Made, write_geometry
+from bstcad.designs.pipeline import design
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.surfaces.sampling import grid
 from bstcad.optics.trace.measure import Effort
 from bstcad.optics.trace.tubes import launch_tubes
-from bstcad.pipeline import design
 from bstcad.scene.scene import Scene, load
 from bstcad.step_text import part21
 from bstcad.tailoring.merit import Merit, SobolevVariable, local_weight

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from bstcad.folder import read_nominal
+from bstcad.designs.folder import read_nominal
 from tests.benchmarks import independent
 
 HALF = 0.5  # side of half a pixel (pixels)

@@ -20,9 +20,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 from skimage import data
 
+from bstcad.designs.pipeline import design
 from bstcad.optics.surfaces.sides import as_pair, coarser, spread
 from bstcad.optics.trace.measure import Effort, rrmsds_by_rays
-from bstcad.pipeline import design
 from bstcad.scene.scene import Scene, load
 from tests.benchmarks.cold import TEMPLATES
 

@@ -24,7 +24,7 @@ import numpy as np
 from PIL import Image, ImageOps
 from skimage.metrics import structural_similarity
 
-from bstcad.folder import read_nominal
+from bstcad.designs.folder import read_nominal
 from bstcad.planning.cold_run import round_numbers
 from bstcad.report.light_figures import View
 from bstcad.runs import files

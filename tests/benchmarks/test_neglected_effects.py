@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bstcad import pipeline
 from bstcad.analysis.neglected_effects import difference
+from bstcad.designs import pipeline
 from bstcad.optics.lens import media
 from bstcad.optics.light.channels import channels_of
 from bstcad.optics.trace.measure import tubes_picture

@@ -9,7 +9,7 @@ import pytest
 import tomli_w
 import torch
 
-from bstcad import folder as folders
+from bstcad.designs import folder as folders
 from bstcad.optics.light.wavefront import MM_PER_NM
 from bstcad.optics.trace.wavefront_error import optical_path
 from tests.benchmarks.beam_shaper import BeamShaper

@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from bstcad import folder
 from bstcad.cad import patches, step_writing
+from bstcad.designs import folder
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.scene.scene import load
 

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad import pipeline
+from bstcad.designs import pipeline
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.light.channels import Channel

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bstcad import pipeline
+from bstcad.designs import pipeline
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.tailoring.run import Hooks

@@ -25,8 +25,8 @@ import torch
 
 from bstcad import cli, commands
 from bstcad.commands import ProofOptions
+from bstcad.designs.pipeline import DesignState, design
 from bstcad.optics.trace.measure import Effort
-from bstcad.pipeline import DesignState, design
 from bstcad.report import rendering
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load

@@ -14,8 +14,8 @@ import pytest
 
 from bstcad import commands
 from bstcad.commands import ProofOptions
+from bstcad.designs.pipeline import design
 from bstcad.optics.trace.measure import Effort
-from bstcad.pipeline import design
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT

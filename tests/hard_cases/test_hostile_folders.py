@@ -23,11 +23,11 @@ import pytest
 from PIL import Image
 
 from bstcad import commands
-from bstcad import folder as folders
 from bstcad.commands import ProofOptions
+from bstcad.designs import folder as folders
+from bstcad.designs.course import DesignCourse
 from bstcad.optics.trace.measure import Effort
 from bstcad.report import record
-from bstcad.report.record import DesignCourse
 from bstcad.scene.picture import Picture, read_picture
 from bstcad.scene.scene import SceneError, load
 from tests.conftest import DISK, SMALL, draws_nothing, flat_pictures, verify_with

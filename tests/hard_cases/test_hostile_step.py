@@ -21,7 +21,7 @@ import pytest
 from bstcad import commands
 from bstcad.cad import step_reading, step_writing
 from bstcad.cad.solid import lens_solid
-from bstcad.folder import read_nominal
+from bstcad.designs.folder import read_nominal
 from bstcad.optics.trace.measure import Effort
 from bstcad.report import report
 from bstcad.runs import processes

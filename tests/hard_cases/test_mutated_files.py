@@ -22,17 +22,17 @@ import numba
 import numpy as np
 import pytest
 
-from bstcad import folder as folders
 from bstcad.app import server
 from bstcad.app.design_runs import Run, State
 from bstcad.cad import mesh
+from bstcad.designs import folder as folders
+from bstcad.designs.pipeline import DesignState, design
 from bstcad.manufacture.measured import cloud
 from bstcad.manufacture.shop import rounds
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.photometry import eulumdat, ies, intensity_files, ray_files, tm25, zemax_rays
 from bstcad.photometry.intensity import Intensity, Luminaire, PhotometricError
 from bstcad.photometry.ray_set import RaySet
-from bstcad.pipeline import DesignState, design
 from bstcad.planning import batch, tradeoff
 from bstcad.planning.tradeoff import predicted_work
 from bstcad.report import production, record, tolerances

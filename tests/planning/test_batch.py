@@ -12,7 +12,7 @@ import pytest
 
 import bstcad
 from bstcad import cli
-from bstcad.folder import scene_files
+from bstcad.designs.folder import scene_files
 from bstcad.planning import batch
 from bstcad.planning.batch import BatchScene, LocalPool
 from bstcad.runs import environment, processes

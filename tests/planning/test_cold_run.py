@@ -6,8 +6,8 @@ from pathlib import Path
 import distributed
 import pytest
 
-from bstcad import folder as folders
-from bstcad.folder import scene_files
+from bstcad.designs import folder as folders
+from bstcad.designs.folder import scene_files
 from bstcad.optics.trace.measure import Effort
 from bstcad.planning import cold_run, tradeoff
 from bstcad.planning.cold_run import DONE, FAILED, ColdRun, LocalPool, calibration_kernel, judge_run, run_and_judge

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import bstcad
-from bstcad import pipeline
+from bstcad.designs import pipeline
 from bstcad.optics.trace.measure import Effort, measure, tubes_picture
 from bstcad.planning.estimates import coarse_lens, diagnosis, left_out
 from bstcad.report.record import LEFT_OUT

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from bstcad import commands
-from bstcad import folder as folders
+from bstcad.designs import folder as folders
 from bstcad.report import prescription, record, rendering, report
 from bstcad.verify.judges.comparison import Judge
 from tests.app.conftest import launched

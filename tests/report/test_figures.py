@@ -11,6 +11,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from bstcad.analysis.shape import describe, survey
+from bstcad.designs.course import CurvePoint, StageRecord
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.bspline import BSplineSurface
@@ -28,7 +29,6 @@ from bstcad.report.light_figures import (
     primary,
     spectral_lines,
 )
-from bstcad.report.record import CurvePoint, StageRecord
 from bstcad.scene.picture import to_srgb
 
 X, Y = (0.0, 400.0), (-100.0, 200.0)

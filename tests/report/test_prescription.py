@@ -11,9 +11,9 @@ import pytest
 
 from bstcad.analysis.shape import describe
 from bstcad.cad import step_reading, step_writing
-from bstcad.folder import read_nominal
+from bstcad.designs.folder import read_nominal
+from bstcad.designs.pipeline import design, resolved
 from bstcad.optics.surfaces.surfaces import Plane
-from bstcad.pipeline import design, resolved
 from bstcad.report import prescription as prescriptions
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load

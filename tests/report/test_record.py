@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bstcad.designs.course import DesignCourse
 from bstcad.report import record, tolerances
-from bstcad.report.record import KEYS, Contents, DesignCourse, of_json
+from bstcad.report.record import KEYS, Contents, of_json
 from tests.report.test_report import CONTENTS, REPORT
 
 GOLDEN = {  # files as the first version wrote them, with every entry that a report may have

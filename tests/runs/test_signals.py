@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from bstcad.pipeline import DesignState
+from bstcad.designs.pipeline import DesignState
 from bstcad.runs import checkpoint, signals
 from bstcad.scene.scene import load
 from tests.conftest import DISK, SMALL

@@ -12,10 +12,10 @@ import pytest
 
 from bstcad import commands
 from bstcad.analysis.shape import describe
-from bstcad.folder import scene_files
+from bstcad.designs.folder import scene_files
+from bstcad.designs.pipeline import DesignState, purpose
 from bstcad.optics.light.point import Point
 from bstcad.optics.surfaces.key import Key
-from bstcad.pipeline import DesignState, purpose
 from bstcad.report.prescription import prescription
 from bstcad.runs import checkpoint, files
 from bstcad.scene.scene import Scene, load

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bstcad.folder import scene_files
+from bstcad.designs.folder import scene_files
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.scene import schema
 from bstcad.scene.errors import SceneError

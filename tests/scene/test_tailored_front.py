@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad import folder as folders
+from bstcad.designs import folder as folders
+from bstcad.designs.pipeline import purpose, resolved
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.sides import in_proportion
-from bstcad.pipeline import purpose, resolved
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import NetFront, net_extent
 from bstcad.scene.scene import load

@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad import pipeline
+from bstcad.designs import pipeline
+from bstcad.designs.pipeline import DesignOptions, design
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.trace.measure import Effort, measure
-from bstcad.pipeline import DesignOptions, design
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.merit import CoarseVariable

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from bstcad import pipeline
+from bstcad.designs import pipeline
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.tailoring.feasibility import MAX_GENTLE_DEFLECTION, find_demand, is_infeasible

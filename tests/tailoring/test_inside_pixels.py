@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad import pipeline
+from bstcad.designs import pipeline
 from bstcad.optics.numerics import ops
 from bstcad.optics.receivers.irradiance import CellTarget, picture_error
 from bstcad.optics.trace.measure import Effort, measure_goals

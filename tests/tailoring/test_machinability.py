@@ -12,10 +12,10 @@ import torch
 from bstcad import commands
 from bstcad.analysis.shape import describe
 from bstcad.commands import ProofOptions
+from bstcad.designs.pipeline import design
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
-from bstcad.pipeline import design
 from bstcad.report import record
 from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from bstcad import cli
+from bstcad.designs.pipeline import design, reachable_part
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.collimated import Collimated
@@ -15,7 +16,6 @@ from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.optics.trace.reach import largest_deflection
-from bstcad.pipeline import design, reachable_part
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.tailoring.grazing import Grazing

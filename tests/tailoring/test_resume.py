@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad.designs.pipeline import DesignState, design
 from bstcad.optics.trace.measure import Effort
-from bstcad.pipeline import DesignState, design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring.minimise import AdamState, Best, LbfgsState, adam, lbfgs, minimise

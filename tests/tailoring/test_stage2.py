@@ -8,9 +8,9 @@ from collections import Counter
 import pytest
 import torch
 
-from bstcad import pipeline
+from bstcad.designs import pipeline
+from bstcad.designs.pipeline import design
 from bstcad.optics.trace.measure import rrmsd_by_tubes
-from bstcad.pipeline import design
 from bstcad.scene.quality import VERIFICATION_DRAW
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2

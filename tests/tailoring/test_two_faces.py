@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import bstcad
-from bstcad import pipeline
+from bstcad.designs import pipeline
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.collimated import Collimated

@@ -19,7 +19,7 @@ from bstcad import cli
 from bstcad.analysis import shape
 from bstcad.cad import mesh as meshes
 from bstcad.cad import step_reading, step_writing
-from bstcad.folder import read_nominal
+from bstcad.designs.folder import read_nominal
 from bstcad.optics.trace import measure
 from bstcad.optics.trace.measure import CellError, Effort, Light
 from bstcad.scene.accept import Accept

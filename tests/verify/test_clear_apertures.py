@@ -16,6 +16,7 @@ from bstcad.analysis.light import mount_losses
 from bstcad.analysis.shape import describe
 from bstcad.cad import mounting
 from bstcad.commands import ProofOptions
+from bstcad.designs.pipeline import design as design_of
 from bstcad.optics.lens.interfaces import cross
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
@@ -24,7 +25,6 @@ from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
 from bstcad.optics.trace.measure import Effort, measure
-from bstcad.pipeline import design as design_of
 from bstcad.scene.mount import Mount
 from bstcad.scene.scene import load
 from bstcad.verify import step_checks

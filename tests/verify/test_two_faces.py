@@ -11,9 +11,9 @@ import pytest
 
 import bstcad
 from bstcad import commands
-from bstcad import folder as folders
 from bstcad.analysis.shape import describe, survey, survey_front
 from bstcad.commands import ProofOptions
+from bstcad.designs import folder as folders
 from bstcad.report import prescription, report
 from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks, text_checks

@@ -10,8 +10,8 @@ import pytest
 from rich.console import Console
 
 from bstcad import commands
-from bstcad import folder as folders
 from bstcad.commands import ProofOptions
+from bstcad.designs import folder as folders
 from bstcad.optics.light.wavefront import ZernikeWave
 from bstcad.optics.trace.wavefront_error import wavefront_error
 from bstcad.report import record, report

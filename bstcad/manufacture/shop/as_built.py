@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from bstcad.folder import Made
+from bstcad.designs.folder import Made
+from bstcad.designs.pipeline import DesignOptions, Earlier, design
 from bstcad.manufacture.measured.cloud import load as load_cloud
 from bstcad.manufacture.measured.compensation import measured_form
 from bstcad.optics.lens.lens import Lens
@@ -23,7 +24,6 @@ from bstcad.optics.lens.passes import Face
 from bstcad.optics.surfaces.bspline import BSplineSurface, interpolating_net, is_net
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.optics.surfaces.surfaces import Plane, sag
-from bstcad.pipeline import DesignOptions, Earlier, design
 from bstcad.scene.blank import INDEX_OFFSETS
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import FIT_SIZES, FileNet, NetFront, fit_net, net_extent

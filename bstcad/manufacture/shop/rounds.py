@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from bstcad import folder as folders
-from bstcad.folder import Made
+from bstcad.designs import folder as folders
+from bstcad.designs.folder import Made
 from bstcad.manufacture.measured import compensation
 from bstcad.manufacture.measured.cloud import Cloud
 from bstcad.manufacture.measured.cloud import load as load_cloud

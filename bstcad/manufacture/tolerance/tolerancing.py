@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 import bstcad
-from bstcad import folder as folders
 from bstcad.cad import step_writing
-from bstcad.folder import read_nominal
+from bstcad.designs import folder as folders
+from bstcad.designs.folder import read_nominal
 from bstcad.manufacture.tolerance import study as studies
 from bstcad.manufacture.tolerance.grades import GRADES, base_grade, graded_table, perturbations
 from bstcad.manufacture.tolerance.perturbations import Kind, Setup, perturb, trials

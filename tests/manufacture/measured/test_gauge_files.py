@@ -13,7 +13,7 @@ import pytest
 import x3pio
 from scipy.spatial import cKDTree
 
-from bstcad import folder as folders
+from bstcad.designs import folder as folders
 from bstcad.manufacture.measured import cloud as clouds
 from bstcad.manufacture.measured import grid_process, hdf5_structure, made_part, point_grid
 from bstcad.manufacture.measured.alignment import BackFace

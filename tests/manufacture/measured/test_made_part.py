@@ -11,8 +11,8 @@ import torch
 
 import bstcad
 from bstcad import cli, commands
-from bstcad import folder as folders
 from bstcad.commands import ProofOptions
+from bstcad.designs import folder as folders
 from bstcad.manufacture.measured import cloud as clouds
 from bstcad.manufacture.measured import made_part
 from bstcad.manufacture.measured.alignment import BackFace, align, first_pose

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bstcad import folder as folders
+from bstcad.designs import folder as folders
 from bstcad.manufacture.measured import cloud as clouds
 from bstcad.manufacture.measured import made_part
 from bstcad.manufacture.measured.alignment import BackFace, align, first_pose

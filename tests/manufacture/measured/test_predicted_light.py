@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bstcad import folder as folders
+from bstcad.designs import folder as folders
 from bstcad.manufacture.measured import made_part
 from bstcad.manufacture.measured.alignment import BackFace, align, identity_pose
 from bstcad.manufacture.measured.form_error import fit_form_error

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 import bstcad
 from bstcad import cli, commands
-from bstcad import folder as folders
 from bstcad.app import design_process
+from bstcad.designs import folder as folders
 from bstcad.manufacture.measured import alignment, compensation
 from bstcad.manufacture.measured.alignment import BackFace
 from bstcad.manufacture.measured.cloud import Cloud

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from bstcad import commands
-from bstcad import folder as folders
+from bstcad.designs import folder as folders
 from bstcad.manufacture.measured import compensation
 from bstcad.manufacture.measured.compensation import Settings
 from bstcad.manufacture.shop import by_light

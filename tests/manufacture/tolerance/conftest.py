@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 
-from bstcad.folder import read_nominal
+from bstcad.designs.folder import read_nominal
 from bstcad.manufacture.tolerance import tolerancing
 from bstcad.manufacture.tolerance.perturbations import Setup
 from bstcad.manufacture.tolerance.study import Wavefronts

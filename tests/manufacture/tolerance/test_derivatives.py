@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad.folder import read_nominal
+from bstcad.designs.folder import read_nominal
 from bstcad.manufacture.tolerance.perturbations import THERMAL_COEFFICIENTS, Setup, kinds
 from bstcad.optics.lens.interfaces import cross
 from bstcad.optics.lens.lens import Lens

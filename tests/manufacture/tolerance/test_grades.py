@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bstcad.cad import step_reading
-from bstcad.folder import read_nominal
+from bstcad.designs.folder import read_nominal
 from bstcad.manufacture.tolerance import tolerancing
 from bstcad.manufacture.tolerance.grades import FORM_MODES, base_grade, graded_table, perturbations
 from bstcad.manufacture.tolerance.perturbations import as_net, form_error, kinds

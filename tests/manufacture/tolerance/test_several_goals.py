@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bstcad import cli
-from bstcad.folder import read_nominal, scene_files
+from bstcad.designs.folder import read_nominal, scene_files
 from bstcad.manufacture.tolerance import tolerancing
 from bstcad.manufacture.tolerance.study import StudySettings
 from bstcad.report import tolerances

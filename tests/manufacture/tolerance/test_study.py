@@ -19,7 +19,7 @@ import bstcad
 from bstcad import cli, commands
 from bstcad.cad import step_reading
 from bstcad.commands import ProofOptions
-from bstcad.folder import read_nominal
+from bstcad.designs.folder import read_nominal
 from bstcad.manufacture.tolerance import study, tolerancing
 from bstcad.manufacture.tolerance.grades import graded_table, perturbations
 from bstcad.manufacture.tolerance.perturbations import trials

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bstcad import pipeline
+from bstcad.designs import pipeline
 from bstcad.optics.lens.interfaces import Reflect, Refract
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.collimated import Collimated

@@ -19,12 +19,12 @@ import torch
 import bstcad
 from bstcad.analysis.shape import thickness_range
 from bstcad.analysis.steepness import Steepness, needed_steepness
-from bstcad.folder import Made
+from bstcad.designs.course import CurvePoint, DesignCourse, PrecisionTest, StageRecord
+from bstcad.designs.folder import Made
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.surfaces.sides import as_pair
 from bstcad.optics.trace.reach import MAX_EXIT_ANGLE, grazing_of, spread_at, unreached
-from bstcad.report.record import CurvePoint, DesignCourse, PrecisionTest, StageRecord
 from bstcad.runs import processes
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import ResolvedTailoring

@@ -27,6 +27,8 @@ import numpy as np
 
 from bstcad.cad import mesh as meshes
 from bstcad.cad.mesh import MIRROR_RGBA, Label
+from bstcad.designs.as_designed import scene_text
+from bstcad.designs.course import DesignCourse
 from bstcad.optics.lens import quadrature
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface, is_net, knots
@@ -34,8 +36,6 @@ from bstcad.optics.surfaces.radial import RadialSurface
 from bstcad.optics.surfaces.sides import Sides, as_pair, scaled
 from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.optics.trace.measure import Light
-from bstcad.report.prescription import scene_text
-from bstcad.report.record import DesignCourse
 from bstcad.runs import files
 from bstcad.runs.files import MachineError, SceneError
 from bstcad.runs.processes import Submit, is_alive, run_here
