@@ -522,7 +522,7 @@ def predict_as_made(
     layer_height: height of the layers of a print (mm); None: that of the grade.  png: file of the pictures to write,
     one per target (FILE, FILE_2, …).
     """
-    from bstcad.app.preview import REFINED, preview  # loaded late, since the other commands do not need it
+    from bstcad.planning.preview import REFINED, preview  # loaded late, since the other commands do not need it
 
     found = preview(scene, REFINED)
     made = found.as_made(grade, layer_height)
@@ -536,8 +536,8 @@ def predict_lit_by(scene: Scene, light: str, distance: float | None = None, png:
 
     distance: from the light to the lens (mm); None: that of the light.  png: as for `predict_as_made`.
     """
-    from bstcad.app.preview import REFINED, preview  # loaded late, as in predict_as_made
     from bstcad.manufacture.tolerance.lit_by import scene_lit_by
+    from bstcad.planning.preview import REFINED, preview  # loaded late, as in predict_as_made
 
     scene_lit_by(scene, light, distance)  # an unknown light is refused before the preview
     found = preview(scene, REFINED)

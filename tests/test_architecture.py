@@ -64,7 +64,18 @@ MAY_IMPORT = {
     },
     "designs": {*ENGINE, "bstcad"} - {"designs", "verify.judges", "manufacture.measured", "report", "toolpath"},
     # Designs come about in processes of their own; a sweep times and judges with the engine's tools.
-    "planning": {"runs", "scene", "optics", "tailoring", "analysis", "verify", "report", "designs", "bstcad"},
+    "planning": {
+        "runs",
+        "scene",
+        "optics",
+        "tailoring",
+        "analysis",
+        "verify",
+        "report",
+        "designs",
+        "manufacture.tolerance",
+        "bstcad",
+    },
     # A picture as made has the scatter of analysis, and the blur by an extended source of tailoring.
     "manufacture.tolerance": {
         "runs",

@@ -45,7 +45,7 @@ MOST = 1 << 30  # bytes beyond the libraries; an image without an end took 21 GB
 PLANS = """
 import json, resource, sys
 from pathlib import Path
-import bstcad.app.preview
+import bstcad.planning.preview
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.planning.plan import plan

@@ -27,7 +27,6 @@ from scipy.ndimage import binary_closing, binary_dilation
 
 import bstcad
 from bstcad import commands
-from bstcad.app.preview import PreviewSize, preview
 from bstcad.commands import ProofOptions
 from bstcad.designs import pipeline
 from bstcad.manufacture.shop import as_built
@@ -45,6 +44,7 @@ from bstcad.photometry.intensity import Luminaire
 from bstcad.photometry.ray_set import RaySet
 from bstcad.planning.plan import plan
 from bstcad.planning.prediction import run_pilot
+from bstcad.planning.preview import PreviewSize, preview
 from bstcad.report.figure_jobs import NoPictures
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import as_front, net_extent
@@ -489,7 +489,7 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
     "analysis.light.blur": {"__defaults__": (12,)},
     "analysis.neglected_effects": {"FACE_POINTS": 24, "GHOST_RAYS_PER_SIDE": 16},
     "analysis.shape": {"GRID_POINTS": 129},
-    "app.preview": {"IMAGE_POINTS": 6, "TRANSPORT_CELLS": 16, "LEDGER_RAYS": 16, "SHAPE_POINTS": 33},
+    "planning.preview": {"IMAGE_POINTS": 6, "TRANSPORT_CELLS": 16, "LEDGER_RAYS": 16, "SHAPE_POINTS": 33},
     "planning.estimates": {
         "COARSE_POINTS": 17,
         "COARSE_CELLS": 16,

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 
 from bstcad.app.kinds import are_numbers, extent, is_mirror, lamp_z, table_at, value_at
-from bstcad.app.preview import Preview
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.light.sphere_light import SphereLight
 from bstcad.optics.surfaces.charts import SphereChart
 from bstcad.optics.trace.reach import largest_deflection
+from bstcad.planning.preview import Preview
 from bstcad.runs.files import SentenceError
 from bstcad.scene.blank import stated_index
 from bstcad.scene.dome_back import DOME_HALF_ANGLE, MIN_DOME_POINTS

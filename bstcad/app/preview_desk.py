@@ -17,9 +17,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bstcad.app.preview import QUICK, REFINED, Outdated, Preview, preview
 from bstcad.planning.net_choice import with_net
 from bstcad.planning.plan import plan
+from bstcad.planning.preview import QUICK, REFINED, Outdated, Preview, preview
 from bstcad.runs import processes
 from bstcad.scene.new_scene import Plate
 from bstcad.scene.scene import Scene, of_text

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from bstcad.app.preview import Preview
 from bstcad.manufacture.tolerance.as_made import AsMade
 from bstcad.manufacture.tolerance.lit_by import LitBy
 from bstcad.planning.prediction import Interval
+from bstcad.planning.preview import Preview
 from bstcad.report.figure_jobs import light_path_of
 from bstcad.report.light_figures import View
 from bstcad.report.record import LEFT_OUT, LeftOut, changes

@@ -33,11 +33,11 @@ from bstcad.app.design_process import STUDIES
 from bstcad.app.design_runs import SCENE_TEXT, Run
 from bstcad.app.followers import impossible_choices, take_change
 from bstcad.app.guard import POLICY, SANDBOX, Guard, TooLarge
-from bstcad.app.preview import Preview
 from bstcad.app.preview_desk import STAGES, PreviewDesk, PreviewRequest
 from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
 from bstcad.designs import folder as folders
 from bstcad.manufacture.tolerance.lit_by import LIGHTS
+from bstcad.planning.preview import Preview
 from bstcad.report import manual, record
 from bstcad.report.light_figures import View, dark_triptych
 from bstcad.report.report import VIEWER, cell_sentences, counts, doubts, first_figures

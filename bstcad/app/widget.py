@@ -16,8 +16,8 @@ from typing import Any
 
 from bstcad.app import form, preview_json, scene_text
 from bstcad.app.followers import with_followers
-from bstcad.app.preview import Outdated, Preview, preview
 from bstcad.designs import folder as folders
+from bstcad.planning.preview import Outdated, Preview, preview
 from bstcad.runs import files
 from bstcad.runs.files import SentenceError
 from bstcad.scene import scene_file

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 import bstcad
-from bstcad.app.preview import QUICK, preview
 from bstcad.photometry import ies
+from bstcad.planning.preview import QUICK, preview
 from bstcad.scene.scene import load
 from bstcad.scene.schema import _SHARED
 from tests.benchmarks.cold import TEMPLATES

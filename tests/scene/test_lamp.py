@@ -12,12 +12,12 @@ import pytest
 import torch
 
 import bstcad
-from bstcad.app.preview import PreviewSize, preview
 from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.photometry import eulumdat, ies, tm25
 from bstcad.photometry.intensity import Luminaire, checked
 from bstcad.photometry.ray_set import RaySet
+from bstcad.planning.preview import PreviewSize, preview
 from bstcad.scene import lamp
 from bstcad.scene.errors import SceneError
 

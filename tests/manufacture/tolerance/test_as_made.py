@@ -10,10 +10,10 @@ import pytest
 
 import bstcad
 from bstcad import cli
-from bstcad.app.preview import PreviewSize, preview
 from bstcad.manufacture.tolerance.as_made import FORM_ERROR, LAYERS, MARKS, ROUGHNESS, as_made, contrast
 from bstcad.manufacture.tolerance.grades import GRADES, finish_of, graded_table, perturbations
 from bstcad.optics.trace.finish import Finish
+from bstcad.planning.preview import PreviewSize, preview
 from bstcad.scene.quality import GRADE_NAMES, Tolerance, tolerance_complaints
 from bstcad.scene.scene import load
 from tests.planning.conftest import typical_pilot
@@ -99,7 +99,7 @@ def test_finer_layers_make_a_better_picture(plate):
 
 
 def test_plan_predicts_the_part_as_made(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("bstcad.app.preview.REFINED", FEW)
+    monkeypatch.setattr("bstcad.planning.preview.REFINED", FEW)
     monkeypatch.setattr("bstcad.planning.plan.run_pilot", typical_pilot)
     png = tmp_path / "made.png"
     given = ["plan", SUN, "--made", "resin-printed", "--layer", "0.1", "--made-png", str(png)]

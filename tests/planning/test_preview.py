@@ -10,11 +10,11 @@ import pytest
 
 from bstcad.analysis.shape import describe
 from bstcad.app import preview_json
-from bstcad.app.preview import Outdated, PreviewSize, preview
 from bstcad.app.preview_desk import STAGES, PreviewDesk, PreviewRequest
 from bstcad.app.preview_json import DARK_SHAPE_ERROR, MIN_LIT_FRACTION, SHAPE_ERROR, figures
 from bstcad.designs import pipeline
 from bstcad.optics.trace.measure import tubes_picture
+from bstcad.planning.preview import Outdated, PreviewSize, preview
 from bstcad.report.units import quantity
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
