@@ -17,7 +17,8 @@ ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "reference"
 RECORDS = {  # JSON file: (module, names of its records), with the record of the file first
     "report.json": [
-        ("report/record.py", ["Contents", "StageRecord", "CurvePoint", "PrecisionTest", "LineFigures", "LeftOut"]),
+        ("report/record.py", ["Contents", "LineFigures", "LeftOut"]),
+        ("designs/course.py", ["StageRecord", "CurvePoint", "PrecisionTest"]),
         ("report/goal_figures.py", ["GoalFigures", "CellFigures", "WavefrontFigures", "Photometry"]),
         ("analysis/top_hat.py", ["FlatTop"]),
         ("analysis/cost.py", ["ConvergenceEnd"]),
