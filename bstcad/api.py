@@ -28,6 +28,8 @@ from bstcad.designs import folder as folders
 from bstcad.designs import pipeline
 from bstcad.designs.course import BY_HAND, DesignCourse
 from bstcad.designs.folder import Made, same_front
+from bstcad.figures.drawing import png
+from bstcad.figures.light_figures import View, irradiance_triptych
 from bstcad.manufacture.measured.compensation import Settings as CompensationSettings
 from bstcad.manufacture.shop.as_built import AsBuilt
 from bstcad.manufacture.shop.rounds import Compensated
@@ -37,8 +39,6 @@ from bstcad.optics.surfaces.sides import as_pair, simplified, size_text
 from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.optics.trace.measure import Effort, tubes_picture
 from bstcad.report import record
-from bstcad.report.drawing import png
-from bstcad.report.light_figures import View, irradiance_triptych
 from bstcad.report.record import Report, rrmsds
 from bstcad.report.units import number, quantity
 from bstcad.runs import files, processes

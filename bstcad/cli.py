@@ -434,7 +434,7 @@ def tolerance(
     commands = load_commands()
     from bstcad.manufacture.tolerance import tolerancing
     from bstcad.manufacture.tolerance.study import StudySettings
-    from bstcad.report.tolerances import summary
+    from bstcad.manufacture.tolerance.tolerances import summary
 
     settings = StudySettings(grade, None if wanted is None else wanted / 100, seed)
     if trial is not None:

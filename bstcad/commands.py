@@ -30,6 +30,17 @@ from bstcad.designs.as_designed import scene_text
 from bstcad.designs.course import StageRecord
 from bstcad.designs.folder import Made
 from bstcad.designs.pipeline import DesignState, design, purpose
+from bstcad.exports import data_sheet, exports
+from bstcad.exports.data_sheet import DataSheet
+from bstcad.exports.exports import Exported
+from bstcad.exports.grid_sag import GridLight
+from bstcad.exports.toolpath_files import refuse_hopeless
+from bstcad.figures import rendering
+from bstcad.figures.drawing import png as rendered
+from bstcad.figures.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, draw_wavefront, light_path_of
+from bstcad.figures.light_figures import View, changed_picture, draw_judges, draw_part
+from bstcad.figures.photometric_figures import draw_isolux, far_field_of
+from bstcad.figures.rendering import LightPath
 from bstcad.manufacture.measured import cloud as clouds
 from bstcad.manufacture.measured import made_part
 from bstcad.manufacture.measured.cloud import Cloud
@@ -39,24 +50,16 @@ from bstcad.manufacture.measured.form_error import map_files
 from bstcad.manufacture.shop import as_built, rounds
 from bstcad.manufacture.shop.as_built import AsBuilt, Retailored
 from bstcad.manufacture.shop.rounds import Compensated
+from bstcad.manufacture.tolerance import tolerances
+from bstcad.manufacture.tolerance.tolerances import Tolerances
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.trace.measure import FULL, Effort, Light, SpectralLine
 from bstcad.planning.estimates import diagnosis, left_out
 from bstcad.planning.net_choice import with_net
-from bstcad.report import data_sheet, exports, prescription, record, rendering, report, tolerances
-from bstcad.report.data_sheet import DataSheet
-from bstcad.report.drawing import png as rendered
-from bstcad.report.exports import Exported
-from bstcad.report.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, draw_wavefront, light_path_of
+from bstcad.report import prescription, record, report
 from bstcad.report.goal_figures import GoalFigures, figures_of, photometry
-from bstcad.report.grid_sag import GridLight
-from bstcad.report.light_figures import View, changed_picture, draw_judges, draw_part
-from bstcad.report.photometric_figures import draw_isolux, far_field_of
 from bstcad.report.prescription import SHEET, Order
 from bstcad.report.record import Contents, Examined, LeftOut, Report, contents_of, with_part
-from bstcad.report.rendering import LightPath
-from bstcad.report.tolerances import Tolerances
-from bstcad.report.toolpath_files import refuse_hopeless
 from bstcad.report.units import prepare
 from bstcad.runs import cluster, files, processes, signals
 from bstcad.runs.checkpoint import Keeper
@@ -182,7 +185,9 @@ def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), prog
         folders.write_design(made, proof.lights, building)
         exported = _export_of_scene(made, building)
         order = _order(made, proof.shape, building)
-        drawn.sheet(_sheet(made, proof, figures_of(made.goals, proof.lights), irradiances[0], order=order))
+        drawn.sheet(
+            data_sheet.draw, _sheet(made, proof, figures_of(made.goals, proof.lights), irradiances[0], order=order)
+        )
         progress("report", 0, 1, "")
         estimates = _left_out(made, proof)  # while the second process draws the pictures
         drawn.result()
@@ -336,7 +341,7 @@ def verify(
             contents = _contents(made, proof, _left_out(made, proof))
             contents = replace(contents, order=order, judges=tuple(each.judge for each in judged))
             if place is None:
-                drawn.sheet(_sheet(made, proof, contents.goals, proof.lights[0].picture, order=order))
+                drawn.sheet(data_sheet.draw, _sheet(made, proof, contents.goals, proof.lights[0].picture, order=order))
             drawn.begin(draw_convergence, contents)
             studied = tolerances.of_folder(path, made.scene.optic)
             write = partial(_write_report, made, proof.lens, drawn=drawn, options=options, studied=studied)
@@ -557,7 +562,7 @@ def export(
     folder: Path, kinds: Sequence[str], points: int | None = None, cutting: Mapping[str, Any] = MappingProxyType({}),
     *, tiles: str | tuple[int, int] | None = None, place: Path | None = None,
 ) -> Exported:  # fmt: skip
-    """Write files for a shop from the design in `folder`; kinds and points as in bstcad.report.exports.export.
+    """Write files for a shop from the design in `folder`; kinds and points as in bstcad.exports.exports.export.
 
     cutting: settings of tool paths, by the names of the fields of bstcad.toolpath.cutting.Cutting.
     tiles: numbers of tiles along x and along y, such as "2x3" or (2, 3); None: 2x2.  Older tiles are removed.

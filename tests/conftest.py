@@ -127,7 +127,7 @@ def small_design(small_scene, tmp_path_factory):
 
 def pictures(*kinds):
     """Let `drawing` draw these kinds of a report's pictures alone, by the names of the methods of Pictures."""
-    from bstcad.report.figure_jobs import Pictures
+    from bstcad.figures.figure_jobs import Pictures
 
     every = ("solid", "lens", "light", "numbers", "sheet", "judges", "part")
     return type("Some", (Pictures,), {kind: lambda self, *given: None for kind in every if kind not in kinds})
@@ -140,7 +140,7 @@ def flat_pictures():
 
 def draws_nothing(patch):
     """Commands that are not told what to draw draw nothing: three of nine seconds of a small design."""
-    from bstcad.report.figure_jobs import NoPictures
+    from bstcad.figures.figure_jobs import NoPictures
 
     patch.setattr("bstcad.commands.Pictures", NoPictures)
 

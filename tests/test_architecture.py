@@ -25,7 +25,8 @@ AT_TOP = {
 }
 ENGINE = {
     "runs", "scene", "optics", "photometry", "step_text", "transport", "tailoring", "tailoring.baselines", "cad",
-    "analysis", "toolpath", "verify", "verify.judges", "designs", "manufacture.measured", "report",
+    "analysis", "toolpath", "verify", "verify.judges", "designs", "manufacture.measured", "report", "figures",
+    "exports",
 }  # fmt: skip
 # A part of the package, and the parts it may import besides itself.  A folder that is no part stands for its parts.
 MAY_IMPORT = {
@@ -53,29 +54,51 @@ MAY_IMPORT = {
         "runs",
         "scene",
         "optics",
-        "photometry",
         "cad",
         "analysis",
         "verify",
         "verify.judges",
         "designs",
         "manufacture.measured",
-        "toolpath",
-    },
-    "designs": {*ENGINE, "bstcad"} - {"designs", "verify.judges", "manufacture.measured", "report", "toolpath"},
-    # Designs come about in processes of their own; a sweep times and judges with the engine's tools.
-    "planning": {
+    },  # fmt: skip
+    "figures": {
         "runs",
         "scene",
         "optics",
-        "tailoring",
+        "photometry",
+        "cad",
         "analysis",
         "verify",
-        "report",
+        "verify.judges",
         "designs",
-        "manufacture.tolerance",
+        "report",
+        "manufacture.measured",
+    },  # fmt: skip
+    "exports": {
+        "runs",
+        "scene",
+        "optics",
+        "photometry",
+        "cad",
+        "analysis",
+        "toolpath",
+        "report",
+        "figures",
+    },  # fmt: skip
+    "designs": {
+        "runs",
+        "scene",
+        "optics",
+        "photometry",
+        "step_text",
+        "transport",
+        "tailoring",
+        "tailoring.baselines",
+        "cad",
+        "analysis",
+        "verify",
         "bstcad",
-    },
+    },  # fmt: skip
     # A picture as made has the scatter of analysis, and the blur by an extended source of tailoring.
     "manufacture.tolerance": {
         "runs",
@@ -86,20 +109,45 @@ MAY_IMPORT = {
         "analysis",
         "verify",
         "report",
+        "figures",
         "designs",
         "bstcad",
-    },
+    },  # fmt: skip
     # Rounds of cutting and measuring write the folders of designs.
-    "manufacture.shop": {"runs", "scene", "optics", "manufacture.measured", "report", "tailoring", "designs", "bstcad"},
+    "manufacture.shop": {
+        "runs",
+        "scene",
+        "optics",
+        "tailoring",
+        "report",
+        "figures",
+        "designs",
+        "manufacture.measured",
+        "manufacture.tolerance",
+        "bstcad",
+    },  # fmt: skip
+    # Designs come about in processes of their own; a sweep times and judges with the engine's tools.
+    "planning": {
+        "runs",
+        "scene",
+        "optics",
+        "tailoring",
+        "analysis",
+        "verify",
+        "report",
+        "figures",
+        "designs",
+        "manufacture.tolerance",
+        "bstcad",
+    },  # fmt: skip
     "commands": {*ENGINE, "planning", "manufacture", "app", "bstcad"},
     # The workbench's previews are designs made small, by the steps of tailoring.
     "app": {
         "runs",
         "scene",
         "optics",
-        "tailoring",
-        "analysis",
         "report",
+        "figures",
         "designs",
         "planning",
         "manufacture.tolerance",
@@ -113,15 +161,15 @@ MAY_IMPORT = {
 ONLY = {
     "OCP": {"cad"},
     "cadquery": {"cad"},
-    "matplotlib": {"report", "planning"},  # the latter draws with report's tools, and names its types
-    "pyvista": {"report"},
-    "pydantic": {"scene", "designs", "report", "planning"},
+    "matplotlib": {"figures", "exports", "planning", "manufacture.shop", "manufacture.tolerance"},  # tools of figures
+    "pyvista": {"figures"},
+    "pydantic": {"scene", "designs", "report", "planning", "manufacture.tolerance"},
     "typer": {"commands"},
     "starlette": {"app"},
     "uvicorn": {"app"},
     "tomlkit": {"app"},
     "ipywidgets": {"app"},
-    "ezdxf": {"report"},
+    "ezdxf": {"exports"},
     "loky": {"runs"},
     "filelock": {"runs"},
     "psutil": {"planning", "runs"},

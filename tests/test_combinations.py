@@ -29,6 +29,7 @@ import bstcad
 from bstcad import commands
 from bstcad.commands import ProofOptions
 from bstcad.designs import pipeline
+from bstcad.figures.figure_jobs import NoPictures
 from bstcad.manufacture.shop import as_built
 from bstcad.manufacture.shop.as_built import AsBuilt
 from bstcad.optics.surfaces.charts import HEIGHTS
@@ -45,7 +46,6 @@ from bstcad.photometry.ray_set import RaySet
 from bstcad.planning.plan import plan
 from bstcad.planning.prediction import run_pilot
 from bstcad.planning.preview import PreviewSize, preview
-from bstcad.report.figure_jobs import NoPictures
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import as_front, net_extent
 from bstcad.scene.lamp import IntensityFile, RayFile

@@ -226,7 +226,7 @@ class TestGenerate:
         assert {path.name for path in tmp_path.iterdir()} == {".out.checkpoint", "out-unwritten"}
 
     def test_a_second_process_that_dies_over_the_pictures_takes_only_them(self, proved, monkeypatch):
-        dies = dying("bstcad.report.figure_jobs", "bstcad.runs.processes.peak_memory")
+        dies = dying("bstcad.figures.figure_jobs", "bstcad.runs.processes.peak_memory")
         monkeypatch.setattr(commands.processes, "submit", dies)
         again = commands.verify(proved, options=ProofOptions(drawing=flat_pictures())).facts
         assert again["passed"] and "peak_memory_gb" in again["machine"]

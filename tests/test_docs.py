@@ -114,7 +114,7 @@ def workplace(prepared, tmp_path, monkeypatch, request):
     place = shutil.copytree(prepared, tmp_path / "work")
     monkeypatch.chdir(place)
     draws_nothing(monkeypatch)
-    monkeypatch.setattr("bstcad.report.rendering.draw", lambda path, picture: bool(picture.write_bytes(b"drawn")))
+    monkeypatch.setattr("bstcad.figures.rendering.draw", lambda path, picture: bool(picture.write_bytes(b"drawn")))
     verify_with(monkeypatch, quick_effort())
     monkeypatch.setattr(commands, "FULL", quick_effort())  # of a scene with a limit of time
     sweep = sweeping.tradeoff

@@ -15,11 +15,11 @@ import bstcad
 from bstcad import commands
 from bstcad.commands import ProofOptions
 from bstcad.designs import pipeline
+from bstcad.figures.photometric_figures import far_field_of
 from bstcad.manufacture.tolerance import tolerancing
 from bstcad.manufacture.tolerance.study import StudySettings
 from bstcad.optics.surfaces.radial import RadialSurface
 from bstcad.optics.trace.measure import Effort
-from bstcad.report.photometric_figures import far_field_of
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from tests import domes

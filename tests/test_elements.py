@@ -11,6 +11,8 @@ import torch
 import bstcad
 from bstcad import commands
 from bstcad.commands import ProofOptions
+from bstcad.figures.figure_jobs import side_view
+from bstcad.figures.light_figures import View
 from bstcad.manufacture.tolerance.perturbations import Setup
 from bstcad.optics.lens.interfaces import Interface, Refract
 from bstcad.optics.lens.media import refractive_index
@@ -21,8 +23,6 @@ from bstcad.optics.surfaces.surfaces import Plane, Sphere
 from bstcad.optics.surfaces.tilted import TiltedSurface
 from bstcad.optics.trace.trace import across
 from bstcad.optics.trace.unfolding import image, image_screen
-from bstcad.report.figure_jobs import side_view
-from bstcad.report.light_figures import View
 from bstcad.scene.elements import Mirror, Window, interfaces
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import slope_map

@@ -11,6 +11,9 @@ import torch
 import bstcad
 from bstcad.cad import mesh, patches
 from bstcad.designs import pipeline
+from bstcad.exports.data_sheet import DataSheet
+from bstcad.figures.figure_jobs import light_path_of
+from bstcad.figures.light_figures import View
 from bstcad.manufacture.tolerance.perturbations import Setup, kinds
 from bstcad.optics.light.emitters import Emitter, all_alive
 from bstcad.optics.receivers.receivers import Receiver
@@ -19,9 +22,6 @@ from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.optics.surfaces.rays import Rays, Status
 from bstcad.optics.surfaces.surfaces import sag
 from bstcad.report import record
-from bstcad.report.data_sheet import DataSheet
-from bstcad.report.figure_jobs import light_path_of
-from bstcad.report.light_figures import View
 from bstcad.report.units import about
 from bstcad.scene.errors import SceneError
 from bstcad.scene.target import Target

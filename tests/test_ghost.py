@@ -10,7 +10,7 @@ from bstcad import commands
 from bstcad.cli import run
 from bstcad.commands import ProofOptions
 from bstcad.designs.folder import read_irradiances
-from bstcad.report.figure_jobs import NoPictures
+from bstcad.figures.figure_jobs import NoPictures
 from tests.conftest import pictures, proofs, quick_effort
 
 

@@ -12,7 +12,7 @@ import pytest
 import bstcad
 from bstcad import commands
 from bstcad.commands import ProofOptions
-from bstcad.report.figure_jobs import NoPictures
+from bstcad.figures.figure_jobs import NoPictures
 from tests.conftest import quick_effort
 
 BEFORE = Path(__file__).parent / "data" / "before_goals.zip"  # "one" target and "two", of 17 x 17 control points

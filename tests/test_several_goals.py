@@ -11,8 +11,8 @@ import pytest
 import bstcad
 from bstcad import commands
 from bstcad.commands import ProofOptions
+from bstcad.figures.figure_jobs import NoPictures
 from bstcad.optics.surfaces.surfaces import sag
-from bstcad.report.figure_jobs import NoPictures
 from bstcad.verify.judges import comparison
 from bstcad.verify.judges.faces import FaceError, Traced
 from tests.conftest import flat_pictures, quick_effort

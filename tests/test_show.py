@@ -5,9 +5,9 @@ import pytest
 from PIL import Image
 
 from bstcad import cli, commands
+from bstcad.figures import rendering
+from bstcad.figures.figure_jobs import MILLIONTHS, corners
 from bstcad.optics.receivers.irradiance import Screen
-from bstcad.report import rendering
-from bstcad.report.figure_jobs import MILLIONTHS, corners
 
 
 @pytest.fixture(scope="module")

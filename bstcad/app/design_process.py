@@ -88,8 +88,8 @@ class LightSnapshot:
     def _draw(self, lens: Any) -> None:
         from PIL import Image
 
+        from bstcad.figures.light_figures import View
         from bstcad.optics.trace.measure import side_factor, tubes_picture
-        from bstcad.report.light_figures import View
 
         scene, target = self._scene, self._scene.target
         channels = scene.channels(SOURCE_POINTS) if scene.source.extent else scene.channels()

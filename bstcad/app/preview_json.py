@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from bstcad.figures.figure_jobs import light_path_of
+from bstcad.figures.light_figures import View
+from bstcad.figures.rendering import data_url, turnable
 from bstcad.manufacture.tolerance.as_made import AsMade
 from bstcad.manufacture.tolerance.lit_by import LitBy
 from bstcad.planning.prediction import Interval
 from bstcad.planning.preview import Preview
-from bstcad.report.figure_jobs import light_path_of
-from bstcad.report.light_figures import View
 from bstcad.report.record import LEFT_OUT, LeftOut, changes
-from bstcad.report.rendering import data_url, turnable
 from bstcad.report.report import lit_sentences, made_sentences
 from bstcad.report.units import Rows, duration, number, quantity, tables
 

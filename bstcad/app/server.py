@@ -36,10 +36,10 @@ from bstcad.app.guard import POLICY, SANDBOX, Guard, TooLarge
 from bstcad.app.preview_desk import STAGES, PreviewDesk, PreviewRequest
 from bstcad.app.workspace import LARGEST_UPLOAD, Workspace
 from bstcad.designs import folder as folders
+from bstcad.figures.light_figures import View, dark_triptych
 from bstcad.manufacture.tolerance.lit_by import LIGHTS
 from bstcad.planning.preview import Preview
 from bstcad.report import manual, record
-from bstcad.report.light_figures import View, dark_triptych
 from bstcad.report.report import VIEWER, cell_sentences, counts, doubts, first_figures
 from bstcad.runs import files
 from bstcad.runs.files import SentenceError

@@ -132,8 +132,8 @@ def _goal_effects(scene: Scene, lens: Lens, key: str) -> dict[str, Any]:
 
 def reach_drawn(scene: Scene) -> tuple[bytes, ...]:
     """Return a PNG per target, which shows the part that light can reach; raise SceneError for a tailored front."""
-    from bstcad.report.drawing import png
-    from bstcad.report.light_figures import View, reach_picture
+    from bstcad.figures.drawing import png
+    from bstcad.figures.light_figures import View, reach_picture
 
     if scene.lens.front.is_tailored:
         raise SceneError(

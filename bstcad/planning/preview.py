@@ -23,11 +23,11 @@ from bstcad.manufacture.tolerance.as_made import AsMade, as_made
 from bstcad.manufacture.tolerance.lit_by import LitBy, lit_by
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import rrmsd_of_pictures
 from bstcad.optics.surfaces.sides import as_pair, coarser
 from bstcad.optics.trace.measure import side_factor, simulated, tubes_picture
 from bstcad.optics.trace.source_images import landing_pixels
 from bstcad.optics.trace.tubes import corners, middle
-from bstcad.report.light_figures import rrmsd
 from bstcad.scene.dome_back import MIN_DOME_POINTS
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.merit import Merit
@@ -83,7 +83,7 @@ class Preview:
     @property
     def rrmsds(self) -> tuple[float, ...]:
         """RRMSD on each target, on the pixels of the preview."""
-        return tuple(rrmsd(target, picture) for target, picture in self.pictures)
+        return tuple(rrmsd_of_pictures(target, picture) for target, picture in self.pictures)
 
     def as_made(self, grade: str | None = None, layer_height: float | None = None) -> AsMade:
         """Return the pictures of the lens as made by a grade (None: that of the scene); see tolerance.as_made."""
@@ -152,8 +152,8 @@ def _evaluate(scene: Scene, made: Made) -> Preview:
     """Return the preview of a lens: figures, and its light by flux tubes that its design did not use."""
     pictures, channels, lens = [], scene.channels(), made.lens
     for goal in made.goals:
-        light = _picture(scene, lens, goal)
-        pictures.append((goal.picture, light * (goal.picture.sum() / max(light.sum(), 1e-300))))
+        found = _picture(scene, lens, goal)
+        pictures.append((goal.picture, found * (goal.picture.sum() / max(found.sum(), 1e-300))))
     rays = max(round(side_factor(channels) * LEDGER_RAYS), 8)
     [light] = simulated(lens, channels, [scene.target.screen], n=rays, seed=SEED)
     images = [blur(channels, lens, target.screen, target.irradiance(), n=IMAGE_POINTS) for target in scene.targets]
@@ -175,7 +175,9 @@ def _lit_fraction(scene: Scene, lens: Lens) -> float:
 @torch.no_grad()
 def _picture(scene: Scene, lens: Lens, goal: Goal) -> np.ndarray:
     n = round(TUBES_PER_PIXEL * max(goal.receiver.shape))
-    if scene.source.extent is None:  # a point source; otherwise the picture is blurred with images of the source
+    if (
+        scene.source.extent is None or scene.draw is None
+    ):  # a point source; otherwise the picture is blurred with images of the source
         return tubes_picture(lens, scene.channels(), goal.receiver, n).numpy()
     source = ExtendedSource(scene.light, scene.with_source_scaled(0.0).channels(), scene.draw)
     merit = Merit.of(source.centre, lens, n, [goal], overshoot=0.0).with_blur(source, lens)

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bstcad.figures.drawing import BLUE, GREY, VERMILION, new_figure, png, styled
+from bstcad.figures.light_figures import plain_ticks
 from bstcad.planning.cold_run import (
     FAILED,
     NOT_RUN,
@@ -25,8 +27,6 @@ from bstcad.planning.cold_run import (
     round_numbers,
     write_csv,
 )
-from bstcad.report.drawing import BLUE, GREY, VERMILION, new_figure, png, styled
-from bstcad.report.light_figures import plain_ticks
 from bstcad.report.report import base64_images, machine
 from bstcad.report.units import about, duration, environment, number
 from bstcad.runs import files

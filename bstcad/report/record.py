@@ -40,7 +40,7 @@ from bstcad.designs.course import (
 from bstcad.manufacture.measured.form_error import MAP_FILES
 from bstcad.manufacture.measured.made_part import MadePart
 from bstcad.optics.receivers.goal import Goal, worst
-from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.irradiance import Screen, rrmsd_of_pictures
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.trace.reach import unreached
 from bstcad.report.goal_figures import (
@@ -52,7 +52,6 @@ from bstcad.report.goal_figures import (
     flat_tops,
     photometry,
 )
-from bstcad.report.light_figures import rrmsd
 from bstcad.report.prescription import Order, prescription
 from bstcad.report.units import DIGITS, Remark, Rows, number, paragraphs, percent, tables
 from bstcad.report.units import remarks as written
@@ -302,7 +301,9 @@ def contents_of(
         blur=proof.blur,
         finest_detail=_finest_detail(scene, proof, goal.receiver, estimates, least=stated.right_down_to or 0.0),
         picture=scene.picture_remarks(),
-        lines=tuple(LineFigures(k.wavelength, k.share, rrmsd(goal.picture, k.picture)) for k in proof.lines),
+        lines=tuple(
+            LineFigures(k.wavelength, k.share, rrmsd_of_pictures(goal.picture, k.picture)) for k in proof.lines
+        ),
         estimates=estimates,
         flat_tops=tuple(flat_tops(scene, proof)),
         wavefront=proof.wavefront and WavefrontFigures.of(proof.wavefront),

@@ -126,8 +126,8 @@ def html(
 
     figures: PNG bytes by name; None or absent: the picture is omitted (a sentence replaces the 3-D picture).  scene:
     TOML text of the scene with all defaults.  prescription: rows by heading, from bstcad.report.prescription.sections.
-    solid: JSON from bstcad.report.rendering.turnable; "": a page without a script.  tolerances: HTML from
-    bstcad.report.tolerances.  sections: (heading, HTML) of each section that a script of the user adds.
+    solid: JSON from bstcad.figures.rendering.turnable; "": a page without a script.  tolerances: HTML from
+    bstcad.manufacture.tolerance.tolerances.  sections: (heading, HTML) of each section that a script of the user adds.
     """
     from markupsafe import Markup
 

@@ -69,7 +69,7 @@ IDLE_TIMEOUT = 300.0  # time (s) without work after which the second process end
 PRELOADED = (  # modules that the second process loads at its start
     "bstcad.cad.step_writing",
     "bstcad.verify.step_checks",
-    "bstcad.report.figure_jobs",
+    "bstcad.figures.figure_jobs",
     "matplotlib.backends.backend_agg",
     "matplotlib.backends.backend_pdf",
 )

@@ -30,7 +30,7 @@ RECORDS = {  # JSON file: (module, names of its records), with the record of the
     ],
     "tolerance.json": [
         (
-            "report/tolerances.py",
+            "manufacture/tolerance/tolerances.py",
             ["Tolerances", "Grade", "Sensitivity", "Trial", "Inverse", "TargetStudy", "WavefrontStudy"],
         )
     ],

@@ -21,8 +21,8 @@ from tests.hard_cases.test_mutated_files import LAMP, intensity
 WITHOUT_BOUND = {  # caches without a bound, and the reason why no request makes them grow
     **dict.fromkeys(
         (
-            "app.form._kind_meanings", "app.form.environment", "report.light_figures.srgb_grey", "report.manual.pages",
-            "report.manual.sections", "report.part_views._letters", "report.units._plain_text",
+            "app.form._kind_meanings", "app.form.environment", "figures.light_figures.srgb_grey", "report.manual.pages",
+            "report.manual.sections", "exports.part_views._letters", "report.units._plain_text",
             "report.units.environment", "runs.environment.version", "scene.schema.schema", "planning.prediction.pace",
         ),
         "the function has no argument",

@@ -32,12 +32,12 @@ import psutil
 import torch
 
 from bstcad.designs.folder import read_nominal
+from bstcad.figures.drawing import new_figure, png, styled
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.trace.measure import measure
 from bstcad.planning.cold_run import REFERENCE_EFFORT, round_numbers
 from bstcad.planning.prediction import pace
 from bstcad.planning.results import draw_legend, draw_runs
-from bstcad.report.drawing import new_figure, png, styled
 from bstcad.runs import environment, files
 from bstcad.scene.scene import load
 from tests import markdown

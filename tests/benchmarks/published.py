@@ -25,8 +25,8 @@ from PIL import Image, ImageOps
 from skimage.metrics import structural_similarity
 
 from bstcad.designs.folder import read_nominal
+from bstcad.figures.light_figures import View
 from bstcad.planning.cold_run import round_numbers
-from bstcad.report.light_figures import View
 from bstcad.runs import files
 from tests import markdown
 from tests.benchmarks import accuracy

@@ -15,7 +15,7 @@ from PIL import Image
 
 from bstcad import commands
 from bstcad.commands import ProofOptions
-from bstcad.report.figure_jobs import NoPictures
+from bstcad.figures.figure_jobs import NoPictures
 from bstcad.scene.scene import Scene, load
 from tests.benchmarks.cold import TEMPLATES, generate
 from tests.benchmarks.independent import POINTS, judge

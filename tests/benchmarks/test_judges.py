@@ -21,20 +21,20 @@ from scipy.ndimage import binary_dilation
 from bstcad.cad import step_reading, step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.designs.pipeline import design
+from bstcad.exports.grid_sag import GridSag
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.losses import FresnelLoss, Losses
 from bstcad.optics.lens.quadrature import of_lens
 from bstcad.optics.surfaces.bspline import DEGREE, knots
 from bstcad.optics.trace.measure import tubes_picture
 from bstcad.optics.trace.trace import ghost_light, to_first_net, trace_ghost
-from bstcad.report.grid_sag import GridSag
 from bstcad.scene.new_scene import templates
 from bstcad.scene.scene import Scene, load
 from bstcad.verify.judges import comparison, mitsuba
 from tests.benchmarks.cold import TEMPLATES
 from tests.cad.test_dome import CASES
 from tests.cad.test_trimming import plate
-from tests.report.test_exports import read_zemax
+from tests.exports.test_exports import read_zemax
 from tests.tracing import launch
 from tests.verify.judges.paths import paths_apart
 

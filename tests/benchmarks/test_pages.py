@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from bstcad.report.drawing import MAX_PNG_BYTES
+from bstcad.figures.drawing import MAX_PNG_BYTES
 from bstcad.scene.scene import load
 from tests.benchmarks import accuracy, published
 from tests.benchmarks.independent import judge

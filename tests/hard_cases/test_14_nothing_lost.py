@@ -26,8 +26,8 @@ import torch
 from bstcad import cli, commands
 from bstcad.commands import ProofOptions
 from bstcad.designs.pipeline import DesignState, design
+from bstcad.figures import rendering
 from bstcad.optics.trace.measure import Effort
-from bstcad.report import rendering
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2

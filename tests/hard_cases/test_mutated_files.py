@@ -28,14 +28,15 @@ from bstcad.cad import mesh
 from bstcad.designs import folder as folders
 from bstcad.designs.pipeline import DesignState, design
 from bstcad.manufacture.measured import cloud
-from bstcad.manufacture.shop import rounds
+from bstcad.manufacture.shop import production, rounds
+from bstcad.manufacture.tolerance import tolerances
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.photometry import eulumdat, ies, intensity_files, ray_files, tm25, zemax_rays
 from bstcad.photometry.intensity import Intensity, Luminaire, PhotometricError
 from bstcad.photometry.ray_set import RaySet
 from bstcad.planning import batch, tradeoff
 from bstcad.planning.tradeoff import predicted_work
-from bstcad.report import production, record, tolerances
+from bstcad.report import record
 from bstcad.runs import checkpoint, environment
 from bstcad.runs.files import MachineError, SceneError
 from bstcad.scene.beam import table

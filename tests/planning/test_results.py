@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 from PIL import Image
 
+from bstcad.figures.drawing import png
 from bstcad.planning import results
 from bstcad.planning.cold_run import DONE, FAILED, ColdRun
 from bstcad.planning.results import halving_factor, pareto_front
 from bstcad.planning.tradeoff import Knob, knob_points, other_seed, tradeoff
-from bstcad.report.drawing import png
 from bstcad.report.units import number
 from tests.planning.conftest import FAR, Synthetic
 

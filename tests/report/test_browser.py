@@ -15,7 +15,8 @@ from PIL import Image
 
 from bstcad import commands
 from bstcad.designs import folder as folders
-from bstcad.report import prescription, record, rendering, report
+from bstcad.figures import rendering
+from bstcad.report import prescription, record, report
 from bstcad.verify.judges.comparison import Judge
 from tests.app.conftest import launched
 

@@ -17,7 +17,7 @@ from bstcad.report.record import of_json
 from bstcad.report.report import first_figures, html
 from bstcad.scene.scene import load
 from tests.conftest import DISK
-from tests.report.test_data_sheet import lens_of, scene_of, sheet
+from tests.exports.test_data_sheet import lens_of, scene_of, sheet
 from tests.report.test_report import CONTENTS
 
 STATED = {

@@ -11,13 +11,13 @@ import pytest
 from lxml import etree
 from rich.console import Console
 
+from bstcad.figures.light_figures import View
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.optics.trace.measure import Light
 from bstcad.report import report as reports
 from bstcad.report.goal_figures import photometry
-from bstcad.report.light_figures import View
 from bstcad.report.record import of_json, plain, simulated
 from bstcad.scene.scene import load
 from bstcad.verify.light_limits import LightValue

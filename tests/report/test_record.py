@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from bstcad.designs.course import DesignCourse
-from bstcad.report import record, tolerances
+from bstcad.manufacture.tolerance import tolerances
+from bstcad.report import record
 from bstcad.report.record import KEYS, Contents, of_json
 from tests.report.test_report import CONTENTS, REPORT
 

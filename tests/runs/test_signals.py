@@ -23,7 +23,7 @@ ROOT = Path(__file__).parent.parent.parent
 FEW_RAYS = """
 from bstcad import commands
 from bstcad.optics.trace.measure import Effort
-from bstcad.report.figure_jobs import NoPictures
+from bstcad.figures.figure_jobs import NoPictures
 from bstcad.verify import checks
 checks.FULL = Effort(256)
 commands.Pictures = NoPictures

@@ -11,10 +11,10 @@ from PIL import Image
 
 import bstcad
 from bstcad import cli
+from bstcad.exports.heightmap import HeightMap
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import sag
-from bstcad.report.heightmap import HeightMap
 from bstcad.scene.errors import SceneError
 
 

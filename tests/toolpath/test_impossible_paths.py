@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 
 from bstcad import commands
+from bstcad.exports.exports import export
+from bstcad.exports.toolpath_files import refuse_hopeless
+from bstcad.figures.figure_jobs import NoPictures
 from bstcad.optics.surfaces.outlines import Rectangle
-from bstcad.report.exports import export
-from bstcad.report.figure_jobs import NoPictures
-from bstcad.report.toolpath_files import refuse_hopeless
 from bstcad.runs.files import SceneError
 from bstcad.scene.scene import load
 from bstcad.toolpath.cutting import DEFAULTS, Cutting

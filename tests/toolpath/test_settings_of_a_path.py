@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from bstcad.cad.tiling import Tiling
+from bstcad.exports.heightmap import HeightMap
+from bstcad.exports.toolpath_files import toolpath_files
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Sphere
-from bstcad.report.heightmap import HeightMap
-from bstcad.report.toolpath_files import toolpath_files
 from bstcad.toolpath import chords
 from bstcad.toolpath.cutting import Cutting
 from bstcad.toolpath.raster import SAFE_HEIGHT

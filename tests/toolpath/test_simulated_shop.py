@@ -15,11 +15,11 @@ from PIL import Image
 from scipy.interpolate import BSpline
 from scipy.spatial import cKDTree
 
+from bstcad.exports.toolpath_files import toolpath_files
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import BSplineSurface, interpolating_net, knots
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Plane
-from bstcad.report.toolpath_files import toolpath_files
 from bstcad.toolpath.cutting import Cutting
 
 NUMBERED = re.compile(r"([GMFXYZ])(-?\d*\.?\d+)")

@@ -17,16 +17,16 @@ import torch
 
 from bstcad.designs import folder as folders
 from bstcad.designs.folder import Made
+from bstcad.figures.shop_figures import correction_figure
 from bstcad.manufacture.measured import compensation
 from bstcad.manufacture.measured.cloud import Cloud
 from bstcad.manufacture.measured.cloud import load as load_cloud
 from bstcad.manufacture.measured.compensation import Round, Settings, Statistics
 from bstcad.manufacture.shop import by_light
+from bstcad.manufacture.shop.production import FIGURES, ROUND_REMEDY, ROUNDS, read_round, write_production_page
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.trace.measure import FULL, Effort
-from bstcad.report.production import FIGURES, ROUND_REMEDY, ROUNDS, read_round, write_production_page
-from bstcad.report.shop_figures import correction_figure
 from bstcad.report.units import quantity
 from bstcad.runs import files
 from bstcad.runs.files import SceneError

@@ -23,9 +23,9 @@ from bstcad.manufacture.tolerance.perturbations import Setup, form_error
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel, weighted_sum
 from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import rrmsd_of_pictures
 from bstcad.optics.trace.finish import Finish, finished_pictures
 from bstcad.optics.trace.unfolding import per_radian
-from bstcad.report.light_figures import rrmsd
 from bstcad.scene.quality import FORM, NONE, Tolerance, settings_of
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.source_image import BlurOperator, ExtendedSource, blurred, blurs, with_border
@@ -54,7 +54,7 @@ class GoalAsMade:
     @property
     def rrmsds(self) -> tuple[float, float]:
         """RRMSD as designed and as made."""
-        return rrmsd(self.target, self.designed), rrmsd(self.target, self.made)
+        return rrmsd_of_pictures(self.target, self.designed), rrmsd_of_pictures(self.target, self.made)
 
     @property
     def contrasts(self) -> tuple[float | None, float | None]:

@@ -15,8 +15,8 @@ import numpy as np
 from bstcad.manufacture.tolerance.as_made import Light, scaled
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.receivers.goal import Goal
+from bstcad.optics.receivers.irradiance import rrmsd_of_pictures
 from bstcad.optics.trace.finish import Finish
-from bstcad.report.light_figures import rrmsd
 from bstcad.scene.errors import SceneError, nearest
 from bstcad.scene.scene import Scene
 
@@ -50,7 +50,9 @@ class GoalLit:
     @property
     def rrmsds(self) -> tuple[float, float]:
         """RRMSD in the light of the design and in the other light."""
-        return rrmsd(self.target, self.designed), rrmsd(self.target, self.lit) if self.lit.any() else 1.0
+        return rrmsd_of_pictures(self.target, self.designed), rrmsd_of_pictures(
+            self.target, self.lit
+        ) if self.lit.any() else 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,12 +37,12 @@ from threadpoolctl import threadpool_limits
 
 from bstcad.manufacture.tolerance.grades import DEFAULT_GRADE, GRADES, grade_limit
 from bstcad.manufacture.tolerance.perturbations import MOTIONS, Perturbation, Setup, draws, kinds, perturb, trials
+from bstcad.manufacture.tolerance.tolerances import WIDEST, Sensitivity
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.light.wavefront import Wave
 from bstcad.optics.numerics.reductions import dot
 from bstcad.optics.trace.wavefront_error import exit_pupil, move_pupil, residual, wavefront_error
-from bstcad.report.tolerances import WIDEST, Sensitivity
 
 Progress = Callable[[str, int, int, str], None]  # called with stage, units done, units in total, text
 # Executor: calls work(shared, item) for each item, in this process or others, and yields the results in order.

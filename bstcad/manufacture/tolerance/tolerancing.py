@@ -14,7 +14,10 @@ import bstcad
 from bstcad.cad import step_writing
 from bstcad.designs import folder as folders
 from bstcad.designs.folder import read_nominal
+from bstcad.figures.drawing import png
+from bstcad.figures.light_figures import MAX_WORST_TRIALS, View, histogram, worst_trials
 from bstcad.manufacture.tolerance import study as studies
+from bstcad.manufacture.tolerance import tolerances
 from bstcad.manufacture.tolerance.grades import GRADES, base_grade, graded_table, perturbations
 from bstcad.manufacture.tolerance.perturbations import Kind, Setup, perturb, trials
 from bstcad.manufacture.tolerance.study import (
@@ -26,11 +29,8 @@ from bstcad.manufacture.tolerance.study import (
     Yield,
     estimate_yield,
 )
+from bstcad.manufacture.tolerance.tolerances import Grade, Inverse, TargetStudy, Tolerances, Trial, WavefrontStudy
 from bstcad.optics.trace.measure import Effort, measure
-from bstcad.report import tolerances
-from bstcad.report.drawing import png
-from bstcad.report.light_figures import MAX_WORST_TRIALS, View, histogram, worst_trials
-from bstcad.report.tolerances import Grade, Inverse, TargetStudy, Tolerances, Trial, WavefrontStudy
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene

@@ -301,3 +301,8 @@ def efficiency(flux: dict[str, float]) -> float:
     """Return the flux on the target divided by the flux that leaves the last surface; flux: the ledger."""
     whole = leaving(flux)
     return (flux["on target"] + flux.get("ghost on target", 0.0)) / whole if whole > 0 else 0.0
+
+
+def rrmsd_of_pictures(target: np.ndarray, irradiance: np.ndarray) -> float:
+    """Return the RRMSD of Wang et al. 2023, sqrt(Σ (E_s - E)² / Σ E²), where E_s is simulated and E the target."""
+    return float(np.sqrt(np.sum((irradiance - target) ** 2) / np.sum(target**2)))

@@ -13,6 +13,7 @@ import bstcad
 from bstcad import cli, commands
 from bstcad.commands import ProofOptions
 from bstcad.designs import folder as folders
+from bstcad.figures.figure_jobs import NoPictures
 from bstcad.manufacture.measured import cloud as clouds
 from bstcad.manufacture.measured import made_part
 from bstcad.manufacture.measured.alignment import BackFace, align, first_pose
@@ -22,7 +23,6 @@ from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.optics.trace.measure import measure
-from bstcad.report.figure_jobs import NoPictures
 from bstcad.verify import checks
 from tests.conftest import pictures, quick_effort
 from tests.lenses import net

@@ -11,9 +11,8 @@ import pytest
 
 from bstcad import cli
 from bstcad.designs.folder import read_nominal, scene_files
-from bstcad.manufacture.tolerance import tolerancing
+from bstcad.manufacture.tolerance import tolerances, tolerancing
 from bstcad.manufacture.tolerance.study import StudySettings
-from bstcad.report import tolerances
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import Tolerance
 from bstcad.scene.target import numbered

@@ -20,11 +20,10 @@ from bstcad import cli, commands
 from bstcad.cad import step_reading
 from bstcad.commands import ProofOptions
 from bstcad.designs.folder import read_nominal
-from bstcad.manufacture.tolerance import study, tolerancing
+from bstcad.manufacture.tolerance import study, tolerances, tolerancing
 from bstcad.manufacture.tolerance.grades import graded_table, perturbations
 from bstcad.manufacture.tolerance.perturbations import trials
 from bstcad.manufacture.tolerance.study import StudySettings, TargetPictures, gram, principal_axes, product, run_locally
-from bstcad.report import tolerances
 from bstcad.report.record import of_json
 from bstcad.report.report import BEGIN, END
 from bstcad.runs.cluster import Cluster
@@ -206,7 +205,7 @@ def test_the_report_has_a_section_on_it_which_a_new_proof_keeps(small_design, st
     assert all(f'<th scope="row">{worst["number"]}</th>' in page for worst in facts_of(folder)["worst"])
     section = page.partition(f"{BEGIN}\n")[2].partition(END)[0]
     assert page.replace(section, "") == before  # and nothing else has changed
-    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+    monkeypatch.setattr("bstcad.figures.rendering.lens_picture", lambda mesh: None)
     commands.verify(folder, ProofOptions(quick_effort()))
     assert section in (folder / "report.html").read_text()
     assert tolerances.put_into(folder / "report.html", section) == (folder / "report.html").read_bytes()

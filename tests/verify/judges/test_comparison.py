@@ -174,7 +174,7 @@ def test_a_step_file_by_itself_has_no_light(small_design, tmp_path):
 
 @with_others
 def test_the_report_holds_the_judge(small_design, tmp_path, monkeypatch):
-    monkeypatch.setattr("bstcad.report.rendering.lens_picture", lambda mesh: None)
+    monkeypatch.setattr("bstcad.figures.rendering.lens_picture", lambda mesh: None)
     monkeypatch.setattr(comparison, "JUDGE_RAYS", 1 << 18)
     folder = shutil.copytree(small_design.folder, tmp_path / "small")
     report = commands.verify(folder, against=("batoid",), options=ProofOptions(quick_effort())).facts

@@ -15,10 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.cell_errors import MAX_GROWTH, SMALL_RRMSD
-from bstcad.optics.receivers.irradiance import Screen
-from bstcad.optics.receivers.receivers import LevelPlane, Receiver
-from bstcad.optics.trace.measure import CellError, SpectralLine
-from bstcad.report.drawing import (
+from bstcad.figures.drawing import (
     BLUE,
     DARK_GROUND,
     GREEN,
@@ -32,6 +29,9 @@ from bstcad.report.drawing import (
     steps,
     styled,
 )
+from bstcad.optics.receivers.irradiance import Screen, rrmsd_of_pictures
+from bstcad.optics.receivers.receivers import LevelPlane, Receiver
+from bstcad.optics.trace.measure import CellError, SpectralLine
 from bstcad.report.units import number, quantity, tilt_words
 from bstcad.scene.picture import to_srgb
 from bstcad.scene.target import numbered
@@ -160,11 +160,6 @@ class View:
 def lit_mean(target: np.ndarray) -> float:
     """Return the mean of the target over its lit pixels, those above LIT times its maximum."""
     return float(target[target > LIT * target.max()].mean())
-
-
-def rrmsd(target: np.ndarray, irradiance: np.ndarray) -> float:
-    """Return the RRMSD of Wang et al. 2023, sqrt(Σ (E_s - E)² / Σ E²), where E_s is simulated and E the target."""
-    return float(np.sqrt(np.sum((irradiance - target) ** 2) / np.sum(target**2)))
 
 
 def brightest(target: np.ndarray, irradiance: np.ndarray) -> float:
@@ -450,7 +445,7 @@ def spectral_lines(target: np.ndarray, irradiance: np.ndarray, lines: Sequence[S
     draw_picture(panels[0], to_srgb(np.clip(colours / unit / top, 0.0, 1.0)), view)
     panels[0].set_title("All lines")
     for axes, line, picture in zip(panels[1:], lines, alone, strict=False):
-        title = f"{line.wavelength:g} nm (RRMSD {rrmsd(target, line.picture):.3g})"
+        title = f"{line.wavelength:g} nm (RRMSD {rrmsd_of_pictures(target, line.picture):.3g})"
         _grey(axes, picture / unit, view, top=top, title=title)
     for axes in panels[1 + len(lines) :]:
         axes.set_visible(False)
@@ -502,7 +497,7 @@ def judged_picture(compared: Comparison, view: View) -> Figure:
     """Draw the target, bstcad's picture, the other program's picture, and the difference of the two pictures."""
     name = compared.judge.name
     pictures = {"Target": compared.target} | {
-        f"By {by} (RRMSD {rrmsd(compared.target, picture):.3g})": picture
+        f"By {by} (RRMSD {rrmsd_of_pictures(compared.target, picture):.3g})": picture
         for by, picture in (("bstcad", compared.ours), (name, compared.theirs))
     }
     height = 0.7 + 2.2 * view.proportion

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.far_field import RAYS, FarField, grid_of
+from bstcad.figures.drawing import BLUE, GREEN, GREY, VERMILION, footnote, new_figure, png, steps, styled
+from bstcad.figures.light_figures import View, draw_picture
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.receivers.directions import Directions
 from bstcad.optics.trace.measure import Light
 from bstcad.photometry.intensity import Intensity
-from bstcad.report.drawing import BLUE, GREEN, GREY, VERMILION, footnote, new_figure, png, steps, styled
-from bstcad.report.light_figures import View, draw_picture
 from bstcad.report.units import number, quantity
 from bstcad.scene.target import AngularTarget, numbered
 

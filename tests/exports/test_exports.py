@@ -15,12 +15,12 @@ import torch
 import bstcad
 from bstcad import cli
 from bstcad.cad.mesh import Label
+from bstcad.exports import exports
+from bstcad.exports.grid_sag import GridSag
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Sphere, sag
-from bstcad.report import exports
-from bstcad.report.grid_sag import GridSag
 from bstcad.runs import files
 from bstcad.scene.mount import Box, Flange, Mount, Round, Screws
 

@@ -14,15 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.light import needed_apertures
-from bstcad.optics.lens import domes
-from bstcad.optics.lens.lens import Lens
-from bstcad.optics.surfaces.outlines import Outline
-from bstcad.report import part_views
-from bstcad.report.drawing import GREY, styled
-from bstcad.report.exports import across
-from bstcad.report.goal_figures import GoalFigures, Photometry
-from bstcad.report.light_figures import View, brightest, srgb_grey
-from bstcad.report.part_views import (
+from bstcad.exports import part_views
+from bstcad.exports.exports import across
+from bstcad.exports.part_views import (
     LINE_PITCH,
     NOTES,
     PRINTED,
@@ -35,6 +29,12 @@ from bstcad.report.part_views import (
     kinds_of_holes,
     wall_words,
 )
+from bstcad.figures.drawing import GREY, styled
+from bstcad.figures.light_figures import View, brightest, srgb_grey
+from bstcad.optics.lens import domes
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.outlines import Outline
+from bstcad.report.goal_figures import GoalFigures, Photometry
 from bstcad.report.prescription import PART, Order, prescription
 from bstcad.report.units import Rows, mm, rounded_up, tables
 from bstcad.scene.mount import Mount, as_cut

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bstcad.report.drawing import footnote, new_figure, png, round_up, steps, styled
-from bstcad.report.light_figures import FORM_UNITS
+from bstcad.figures.drawing import footnote, new_figure, png, round_up, steps, styled
+from bstcad.figures.light_figures import FORM_UNITS
 from bstcad.report.units import quantity
 
 TITLES = "Measured − designed", "Correction", "Expected to remain"

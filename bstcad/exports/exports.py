@@ -23,6 +23,10 @@ import torch
 from bstcad.analysis.far_field import NOMINAL_LUMENS, FarField
 from bstcad.cad.mesh import DEFAULT_LABEL, Label, preview_files
 from bstcad.cad.tiling import Cell, Tiling
+from bstcad.exports.grid_sag import MAX_POINTS, MIN_POINTS, GridLight, GridSag, axes, table_note
+from bstcad.exports.heightmap import HeightMap, default_pixels
+from bstcad.exports.tile_files import joints, tile_files
+from bstcad.exports.toolpath_files import toolpath_files
 from bstcad.optics.lens import domes
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import is_net
@@ -30,10 +34,6 @@ from bstcad.optics.surfaces.outlines import Circle, Outline
 from bstcad.optics.surfaces.surfaces import Surface, sag
 from bstcad.photometry import eulumdat, ies, intensity_files, tm25
 from bstcad.photometry.intensity import Intensity, Luminaire
-from bstcad.report.grid_sag import MAX_POINTS, MIN_POINTS, GridLight, GridSag, axes, table_note
-from bstcad.report.heightmap import HeightMap, default_pixels
-from bstcad.report.tile_files import joints, tile_files
-from bstcad.report.toolpath_files import toolpath_files
 from bstcad.report.units import environment, paragraphs
 from bstcad.runs import files
 from bstcad.scene.blank import export_complaints

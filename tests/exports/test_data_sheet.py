@@ -26,14 +26,15 @@ from pypdf import PdfReader
 from bstcad.analysis.light import needed_apertures
 from bstcad.analysis.shape import describe
 from bstcad.cad import mounting
+from bstcad.exports import data_sheet, part_views
+from bstcad.exports.data_sheet import DataSheet
+from bstcad.exports.part_views import Views
+from bstcad.figures.drawing import GLASS
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.trace.measure import Light
-from bstcad.report import data_sheet, part_views, prescription
-from bstcad.report.data_sheet import DataSheet
-from bstcad.report.drawing import GLASS
+from bstcad.report import prescription
 from bstcad.report.goal_figures import figures_of
-from bstcad.report.part_views import Views
 from bstcad.report.prescription import measured, order_of
 from bstcad.report.units import mm
 from bstcad.scene.mount import Box, Flange, Mount, Round, Screws

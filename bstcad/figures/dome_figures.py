@@ -17,9 +17,9 @@ import numpy as np
 import torch
 
 from bstcad.analysis.shape import MAX_RADIUS, Survey
+from bstcad.figures.drawing import footnote, new_figure, round_up, steps, styled
 from bstcad.optics.lens import domes
 from bstcad.optics.lens.lens import Lens
-from bstcad.report.drawing import footnote, new_figure, round_up, steps, styled
 from bstcad.report.units import quantity
 
 if TYPE_CHECKING:

@@ -7,6 +7,8 @@ import pytest
 import torch
 from scipy.interpolate import CubicHermiteSpline
 
+from bstcad.exports import grid_sag
+from bstcad.exports.grid_sag import MAX_SHIFT, GridLight, GridSag, shift_by_patches, table_note
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.collimated import Collimated
 from bstcad.optics.light.point import Point
@@ -14,9 +16,7 @@ from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Plane, sag
-from bstcad.report import grid_sag
-from bstcad.report.grid_sag import MAX_SHIFT, GridLight, GridSag, shift_by_patches, table_note
-from tests.report.test_exports import read_zemax
+from tests.exports.test_exports import read_zemax
 
 OUTLINE, THROW = Rectangle(8.0, 6.0), 200.0  # mm
 BEAM = GridLight(Collimated(OUTLINE), (Screen(4.0 + THROW, (-20.0, 20.0), (-15.0, 15.0), (160, 120)),))

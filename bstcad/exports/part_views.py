@@ -20,12 +20,12 @@ import numpy as np
 import shapely
 from scipy.optimize import brentq
 
+from bstcad.exports.exports import across, pitch_radius
+from bstcad.figures.drawing import BLUE, GLASS, GREY, STYLE, VERMILION, round_up
 from bstcad.optics.lens import domes
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle, Outline
 from bstcad.optics.surfaces.surfaces import Surface, sag
-from bstcad.report.drawing import BLUE, GLASS, GREY, STYLE, VERMILION, round_up
-from bstcad.report.exports import across, pitch_radius
 from bstcad.report.units import mm, number
 from bstcad.scene.mount import Flange, Mount
 

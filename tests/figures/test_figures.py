@@ -12,15 +12,9 @@ from PIL import Image
 
 from bstcad.analysis.shape import describe, survey
 from bstcad.designs.course import CurvePoint, StageRecord
-from bstcad.optics.lens.lens import Lens
-from bstcad.optics.receivers.irradiance import Screen
-from bstcad.optics.surfaces.bspline import BSplineSurface
-from bstcad.optics.surfaces.outlines import Circle, Rectangle
-from bstcad.optics.surfaces.surfaces import Plane, Sphere
-from bstcad.optics.trace.measure import CellError, SpectralLine
-from bstcad.report import drawing, figure_jobs, light_figures
-from bstcad.report.drawing import png
-from bstcad.report.light_figures import (
+from bstcad.figures import drawing, figure_jobs, light_figures
+from bstcad.figures.drawing import png
+from bstcad.figures.light_figures import (
     View,
     balanced,
     cross_section,
@@ -29,6 +23,12 @@ from bstcad.report.light_figures import (
     primary,
     spectral_lines,
 )
+from bstcad.optics.lens.lens import Lens
+from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.surfaces.bspline import BSplineSurface
+from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.surfaces import Plane, Sphere
+from bstcad.optics.trace.measure import CellError, SpectralLine
 from bstcad.scene.picture import to_srgb
 
 X, Y = (0.0, 400.0), (-100.0, 200.0)

@@ -20,11 +20,11 @@ from PIL import Image
 
 from bstcad import Circle, Lens, Plane, Rectangle, Sphere, commands
 from bstcad.cad.mesh import Mesh
+from bstcad.figures import rendering
+from bstcad.figures.figure_jobs import Pictures
 from bstcad.optics.lens import quadrature
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.surfaces import Recess
-from bstcad.report import rendering
-from bstcad.report.figure_jobs import Pictures
 
 CUBE = trimesh.creation.box((24.0, 24.0, 10.0))
 OUTLINES = (Rectangle(8.0, 6.0), Circle(4.0))

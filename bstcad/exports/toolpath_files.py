@@ -14,9 +14,9 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from bstcad.cad.tiling import Cell, Span
+from bstcad.figures.shop_figures import left_figure
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import require_net
-from bstcad.report.shop_figures import left_figure
 from bstcad.report.units import quantity
 from bstcad.toolpath import gcode
 from bstcad.toolpath import raster as rasters

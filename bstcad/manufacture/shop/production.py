@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from bstcad.designs.course import Rrmsd, Size
-from bstcad.report import record, tolerances
+from bstcad.manufacture.tolerance import tolerances
+from bstcad.report import record
 from bstcad.report.units import environment
 from bstcad.runs import files
 

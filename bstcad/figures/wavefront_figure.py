@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bstcad.report.drawing import BLUE, GREY, VERMILION, footnote, new_figure, round_up, steps, styled
+from bstcad.figures.drawing import BLUE, GREY, VERMILION, footnote, new_figure, round_up, steps, styled
 from bstcad.report.units import number
 
 if TYPE_CHECKING:

@@ -9,8 +9,10 @@ import pytest
 import torch
 
 from bstcad.cad import dome_mesh, mesh
+from bstcad.exports import exports
+from bstcad.figures import dome_figures, rendering
 from bstcad.optics.lens import domes
-from bstcad.report import dome_figures, exports, prescription, rendering
+from bstcad.report import prescription
 from tests.cad.test_dome import CASES, dome, offset_sphere
 
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import bstcad
+from bstcad.figures import photometric_figures as figures
+from bstcad.figures.light_figures import View
 from bstcad.optics.receivers.directions import Directions
 from bstcad.optics.trace.measure import Light
 from bstcad.photometry.intensity import Intensity
-from bstcad.report import photometric_figures as figures
-from bstcad.report.light_figures import View
 
 AROUND, ALONG = np.arange(0.0, 360.0, 5.0), np.arange(0.0, 91.0, 1.0)
 C, GAMMA = np.radians(AROUND)[:, None], np.radians(ALONG)[None]

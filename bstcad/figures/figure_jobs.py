@@ -20,6 +20,12 @@ from bstcad.analysis.light import bundle, fan, ray_map
 from bstcad.analysis.shape import MAX_RADIUS, Survey, least_squares, survey, survey_front
 from bstcad.cad import mesh as meshes
 from bstcad.designs.course import CurvePoint, StageRecord
+from bstcad.figures import light_figures, photometric_figures, rendering
+from bstcad.figures.dome_figures import ANGLE_LABELS, dome_maps, in_angles
+from bstcad.figures.drawing import BLUE, GLASS, GREY, VERMILION, footnote, new_figure, png, round_up, steps, styled
+from bstcad.figures.light_figures import View, plain_ticks
+from bstcad.figures.rendering import LightPath
+from bstcad.figures.wavefront_figure import wavefront_map
 from bstcad.optics.lens import domes
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.emitters import Emitter
@@ -28,15 +34,8 @@ from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.surfaces import Surface, sag
 from bstcad.optics.trace.measure import Light, SpectralLine
 from bstcad.optics.trace.wavefront_error import WavefrontError
-from bstcad.report import data_sheet, light_figures, photometric_figures, rendering
-from bstcad.report.data_sheet import DataSheet
-from bstcad.report.dome_figures import ANGLE_LABELS, dome_maps, in_angles
-from bstcad.report.drawing import BLUE, GLASS, GREY, VERMILION, footnote, new_figure, png, round_up, steps, styled
-from bstcad.report.light_figures import View, plain_ticks
 from bstcad.report.record import Contents
-from bstcad.report.rendering import LightPath
 from bstcad.report.units import number, quantity, tilt_words
-from bstcad.report.wavefront_figure import wavefront_map
 from bstcad.runs.processes import Submit
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import numbered
@@ -89,9 +88,9 @@ class Pictures:
         if photometric_figures.has_far_field(self._scene):
             self.begin(photometric_figures.draw_far_field, photometric_figures.far_field_of(self._scene), lens)
 
-    def sheet(self, sheet: DataSheet) -> None:
+    def sheet(self, draw: Callable[..., bytes], sheet: Any) -> None:
         """Start the job that draws the data sheet."""
-        self._sheet = self._submit(data_sheet.draw, sheet)
+        self._sheet = self._submit(draw, sheet)
 
     def result(self) -> dict[str, bytes | None]:
         """Return PNG bytes by name; None for the 3-D picture if the machine cannot draw it.
@@ -120,7 +119,7 @@ class NoPictures(Pictures):
     def solid(self, lens: Lens) -> None:
         """Draw nothing."""
 
-    def sheet(self, sheet: DataSheet) -> None:
+    def sheet(self, draw: Callable[..., bytes], sheet: Any) -> None:
         """Draw nothing."""
 
 

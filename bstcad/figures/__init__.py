@@ -1,0 +1,1 @@
+"""Pictures of the light, the faces and the rays of a lens, and the jobs that draw them."""
