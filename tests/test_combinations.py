@@ -512,7 +512,7 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
 class Words(NoPictures):
     """The words of the data sheet, and no pictures."""
 
-    def sheet(self, sheet):
+    def sheet(self, draw, sheet):
         assert all(sheet.tables.values())
 
 
