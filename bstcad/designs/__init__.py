@@ -1,1 +1,1 @@
-"""How a lens comes about, its course, and the folder that is written whole and read back."""
+"""Stages by which a lens comes about, their course, and the folder that is written whole and read back."""

@@ -1,1 +1,1 @@
-"""What becomes of a design in a shop: measured parts, what to cut next, and errors of making."""
+"""Manufacture of a design: measured parts, what to cut next, and errors of making."""

@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-from tests.report.test_figures import pixel_at
 
 from bstcad.figures.drawing import png
 from bstcad.figures.wavefront_figure import wavefront_map
 from bstcad.optics.trace.wavefront_error import OpdSize, WavefrontError
+from tests.figures.test_figures import pixel_at
 
 X, Y = np.linspace(-8.0, 8.0, 65), np.linspace(-4.0, 12.0, 65)
 INSIDE = np.hypot(X, Y[:, None] - 4.0) < 7.5

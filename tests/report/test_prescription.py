@@ -11,6 +11,7 @@ import pytest
 
 from bstcad.analysis.shape import describe
 from bstcad.cad import step_reading, step_writing
+from bstcad.designs.as_designed import scene_text
 from bstcad.designs.folder import read_nominal
 from bstcad.designs.pipeline import design, resolved
 from bstcad.optics.surfaces.surfaces import Plane
@@ -73,7 +74,7 @@ def test_a_radius_that_was_found_agrees_with_the_step_file(free, tmp_path):
 
 def test_the_resolved_scene_makes_the_same_lens_to_the_last_bit(free, tmp_path):
     path = tmp_path / "scene.toml"
-    path.write_text(prescriptions.scene_text(free.scene, free.lens), encoding="utf-8")
+    path.write_text(scene_text(free.scene, free.lens), encoding="utf-8")
     scene = load(path)
     assert scene.lens.front.curvature == free.lens.front.curvature and scene.lens.front.optimise is False
     again = design(scene, device="cpu")
@@ -91,13 +92,13 @@ def test_the_papers_scene_stays_as_it_is(free):
 def test_a_back_that_moved_says_where_it_stands(free, tmp_path):
     scene = free.scene.changed({"lens.back.z": 24.0})
     z = prescriptions.vertex(free.lens)
-    text = prescriptions.scene_text(scene, free.lens)
+    text = scene_text(scene, free.lens)
     assert text.startswith("# as designed, the vertex of the back is at z = ") and repr(z) in text.splitlines()[0]
     (tmp_path / "scene.toml").write_text(text, encoding="utf-8")
     assert load(tmp_path / "scene.toml").lens.back.z == 24.0
     said = prescriptions.text(prescriptions.prescription(scene, free.lens, SHAPE))
     assert "z of the scene (lens.back.z)  24 mm" in said and repr(z) in said
-    assert prescriptions.scene_text(free.scene, free.lens) == free.scene.toml()  # which it did not
+    assert scene_text(free.scene, free.lens) == free.scene.toml()  # which it did not
 
 
 def test_a_plane_has_no_radius_and_an_index_no_mass(small_design):

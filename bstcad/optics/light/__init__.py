@@ -1,1 +1,1 @@
-"""Where light comes from: emitters, their profiles, rays from files, wavefronts, and channels of a spectrum."""
+"""Sources of light: emitters, their profiles, rays from files, wavefronts, and channels of a spectrum."""

@@ -1,1 +1,1 @@
-"""Where light is collected: planes and directions, their pixels, and the goals on them."""
+"""Receivers of light: planes and directions, their pixels, and the goals on them."""

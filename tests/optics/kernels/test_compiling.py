@@ -24,10 +24,13 @@ from tests.tracing import simulated
 
 @pytest.fixture
 def files(tmp_path, monkeypatch):
-    monkeypatch.setattr(compiling, "FOLDER", tmp_path)
-    (tmp_path / "a.py").write_text("one")
-    (tmp_path / "b.py").write_text("two")
-    yield tmp_path
+    numerics, kernels = tmp_path / "numerics", tmp_path / "kernels"
+    for folder, text in ((numerics, "one"), (kernels, "two")):
+        folder.mkdir()
+        (folder / "a.py").write_text(text)
+    monkeypatch.setattr(compiling, "FOLDER", numerics)
+    monkeypatch.setattr(compiling, "SOURCES", (numerics, kernels))
+    yield numerics
     compiling._caches.cache_clear()
 
 
@@ -40,7 +43,7 @@ def test_the_place_of_the_caches_follows_every_file(files):
     before = caches()
     assert before.parent == files / "__pycache__" and caches() == before
     before.mkdir(parents=True)
-    (files / "b.py").write_text("another two")
+    (files.with_name("kernels") / "a.py").write_text("another two")
     after = caches()
     assert after != before and not before.exists()  # nobody will ask for those again
 
