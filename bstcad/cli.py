@@ -623,7 +623,7 @@ def docs(topic: Topic = None) -> int:
     if page is None:
         from bstcad.scene.errors import nearest
 
-        known = nearest(topic, [*topics, *manual.pages()], "known are")
+        known = nearest(topic, [*topics, *sorted(manual.names())], "known are")
         raise SceneError(f"{topic}: no page, check or remark has this name; {known}")
     site = manual.site()
     if topic in topics:

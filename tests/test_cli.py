@@ -316,6 +316,23 @@ def test_docs_explains_a_check_and_names_its_page(capsys, monkeypatch, tmp_path)
     assert capsys.readouterr().err.strip().endswith("did you mean 'check-rrmsd'?")
 
 
+def test_docs_of_a_wheel_knows_its_built_pages(capsys, monkeypatch, tmp_path):
+    """An installed wheel has no Markdown but checks and remarks: the command's own example was refused there."""
+    (tmp_path / "tutorials").mkdir()
+    for name in ("index", "tutorials/first-lens"):
+        (tmp_path / f"{name}.html").write_text("built")
+    monkeypatch.setattr(manual, "SITES", (tmp_path,))
+    monkeypatch.setattr(manual, "PLACES", (tmp_path / "none",))
+    manual.pages.cache_clear()
+    try:
+        for name in ("first-lens", "tutorials/first-lens"):
+            assert cli.run(["docs", name]) == 0
+            assert capsys.readouterr().out == f"Documentation: {tmp_path / 'tutorials/first-lens.html'}\n"
+        assert cli.run(["docs", "first-lense"]) == 2
+    finally:
+        manual.pages.cache_clear()
+
+
 def test_docs_without_built_pages_shows_their_text(capsys, monkeypatch, tmp_path):
     """The text comes from the sources; a copy without them has the pages of checks and remarks."""
     monkeypatch.setattr(manual, "SITES", (tmp_path,))

@@ -1,0 +1,1 @@
+"""Physics of light and lenses in differentiable torch, without scenes and files, in seven rooms."""

@@ -40,11 +40,18 @@ def pages() -> dict[str, Path]:
     return found | {f"reference/{page}": Path(__file__).with_name(f"{page}.md") for page in PAGES}
 
 
+def names() -> frozenset[str]:
+    """Return the names of all pages: an installed wheel has the built pages alone."""
+    built = site()
+    files = [] if built is None else [path.relative_to(built) for path in built.rglob("*.html")]
+    return frozenset(pages()) | {path.with_suffix("").as_posix() for path in files if path.as_posix()[0] != "_"}
+
+
 def name_of(topic: str) -> str | None:
     """Return the full name of the page whose name is `topic` or ends in /`topic`; None: no such page, or several."""
-    name = topic.removesuffix(".md")
-    ending = [each for each in pages() if each.endswith(f"/{name}")]
-    return name if name in pages() else ending[0] if len(ending) == 1 else None
+    name, known = topic.removesuffix(".md"), names()
+    ending = [each for each in known if each.endswith(f"/{name}")]
+    return name if name in known else ending[0] if len(ending) == 1 else None
 
 
 def page(name: str) -> str:

@@ -1,0 +1,1 @@
+"""Runs without lenses: files, processes, signals, checkpoints, progress and machines."""

@@ -1,0 +1,1 @@
+"""Tolerances: errors of making, mounting and lighting, their trials, yield and pictures."""

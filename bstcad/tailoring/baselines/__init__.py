@@ -1,0 +1,1 @@
+"""Baselines of tailoring: the paper's own procedure, and integration of the map."""
