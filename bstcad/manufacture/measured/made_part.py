@@ -56,7 +56,7 @@ class Prediction:
         every = [value for value in (self.light.rrmsd, *self.turned) if math.isfinite(value)]
         if len(every) < 2:
             return ""
-        if max(every) - min(every) <= 2 * math.sqrt(2) * self.uncertainty:  # of a difference of two figures
+        if max(every) - min(every) <= 2 * math.sqrt(2) * self.uncertainty:  # two σ of a difference of two figures
             return f"the RRMSD is the same there within its uncertainty, {min(every):.3g} to {max(every):.3g}"
         return f"the RRMSD depends on it, {min(every):.3g} to {max(every):.3g}: mark the orientation and measure again"
 
