@@ -27,7 +27,6 @@ from bstcad.optics.surfaces.sides import as_pair
 from bstcad.optics.trace.reach import MAX_EXIT_ANGLE, grazing_of, spread_at, unreached
 from bstcad.runs import processes
 from bstcad.scene.errors import SceneError
-from bstcad.scene.quality import ResolvedTailoring
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import slope_map, stage1, stage2, two_faces
 from bstcad.tailoring.baselines import integration, paper
@@ -53,6 +52,7 @@ from bstcad.tailoring.run import (
     Steps,
     Task,
 )
+from bstcad.tailoring.settings import Settings
 from bstcad.tailoring.source_image import ExtendedSource
 from bstcad.tailoring.stage2 import PrecisionComparison, compare_precisions
 from bstcad.transport.mapping import Mapping, TransportMap
@@ -145,21 +145,21 @@ def design(
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
     goals, edge = within_reach(scene, hooks.progress)
-    knobs = scene.tailoring.resolved(scene.lens.back.net)
-    later = options.compare_later and knobs.max_time is None
-    task = replace(task_of(scene, goals, knobs, edge), progress=hooks.progress, merit=merit, preview=options.preview)
+    settings = scene.tailoring.resolved(scene.lens.back.net)
+    later = options.compare_later and settings.max_time is None
+    task = replace(task_of(scene, goals, settings, edge), progress=hooks.progress, merit=merit, preview=options.preview)
     if options.earlier is not None:
-        if PROCEDURES[knobs.method][2] is not stage2.steps:
-            raise SceneError(f"tailoring.method: {knobs.method!r} refines no earlier lens; remove this key")
+        if PROCEDURES[settings.method][2] is not stage2.steps:
+            raise SceneError(f"tailoring.method: {settings.method!r} refines no earlier lens; remove this key")
         task = replace(task, refines=True)
     if not task.preview:  # a preview is so small that the return of its memory takes longer than it helps
         task = replace(task, tidy=processes.return_freed)
     task = with_solution(scene, task)
     fresh, start = start is None, start or DesignState(DesignRecord())
-    limit, reserved = math.inf if knobs.max_time is None else knobs.max_time, reserve(scene) + RRMSD_SECONDS
+    limit, reserved = math.inf if settings.max_time is None else settings.max_time, reserve(scene) + RRMSD_SECONDS
     driver = Driver(hooks, began, limit=limit, reserve=reserved, record=start.record)
-    precision = getattr(torch, knobs.precision)
-    lens = scene.flat_lens(knobs.levels[0], as_wide_as=knobs.levels[-1]).to(precision, device)
+    precision = getattr(torch, settings.precision)
+    lens = scene.flat_lens(settings.levels[0], as_wide_as=settings.levels[-1]).to(precision, device)
     if not scene.lens.back.optimise:  # no stage refines a back that stays flat
         lens = lens.with_back(lens.back_net.refined(scene.lens.back.net))
     if fresh:
@@ -205,17 +205,18 @@ def within_reach(scene: Scene, progress: Progress) -> tuple[tuple[Goal, ...], Ed
     return tuple(goals), edge
 
 
-def task_of(scene: Scene, goals: Sequence[Goal], knobs: ResolvedTailoring, edge: Edge | None) -> Task:
-    """Return the task of a scene; goals, edge: results of `within_reach`; knobs: [tailoring] with all defaults."""
+def task_of(scene: Scene, goals: Sequence[Goal], settings: Settings, edge: Edge | None) -> Task:
+    """Return the task of a scene; goals, edge: results of `within_reach`; settings: [tailoring] with all defaults."""
     light = scene.with_source_scaled(0.0).channels()
-    sizes = stage2.SOURCE_SIZES if scene.source.extent and knobs.method != "integration" else ()
+    sizes = stage2.SOURCE_SIZES if scene.source.extent and settings.method != "integration" else ()
     scaled = [scene.with_source_scaled(share) for share, _ in sizes]
     sources = tuple(ExtendedSource(each.light, light, each.draw) for each in scaled if each.draw)
     return Task(
-        light, tuple(goals), knobs, min_thickness=scene.lens.min_thickness, bounds=scene.lens.bounds,
+        light, tuple(goals), settings, min_thickness=scene.lens.min_thickness, bounds=scene.lens.bounds,
         free=scene.lens.front.free, rim_sags=scene.rim_sags, front_sides=scene.lens.front_net,
         sampled_sources=tuple(each.channels() for each in scaled), extended_sources=sources,
-        edge=edge, wave=scene.wavefront, solution=None if knobs.solution is None else SOLUTION_SIGNS[knobs.solution],
+        edge=edge, wave=scene.wavefront,
+        solution=None if settings.solution is None else SOLUTION_SIGNS[settings.solution],
     )  # fmt: skip
 
 
@@ -239,10 +240,10 @@ def with_solution(scene: Scene, task: Task) -> Task:
 
 def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tuple[str, Steps]:
     """Return (name, steps) of the stage after stage 1, from `state` on: stage 2, or 3 for a source of finite size."""
-    *_, stage = PROCEDURES[task.knobs.method]
+    *_, stage = PROCEDURES[task.settings.method]
     if not task.sampled_sources:
         return "stage 2", stage(task, lens, state)
-    before = stage if task.knobs.method == "adam" else None  # the paper's procedure is for point sources
+    before = stage if task.settings.method == "adam" else None  # the paper's procedure is for point sources
     return "stage 3", stage2.with_stage3(before, task, lens, state)
 
 
@@ -378,7 +379,7 @@ def _stage1(
     """Run stage 1 from the blank or from a state; if `compare`, then compare the precisions."""
     if driver.reason_to_interrupt and state is None:
         raise KeyboardInterrupt  # there is no lens yet
-    name, stage, _ = PROCEDURES[task.knobs.method]
+    name, stage, _ = PROCEDURES[task.settings.method]
     like = lens.like
     if scene.lens.front.is_tailored:  # stage 1 of two faces runs in numpy, on the CPU
         stage, lens = two_faces.steps, lens.to(like.dtype, "cpu")
@@ -431,7 +432,7 @@ def _stage2(
 
     last = driver.run(steps, full, design_state, lambda: driver.reason_to_end, best=best or first)
     lens = _final_lens(full, driver, last, [each for each in (driver.best, first) if each is not None])
-    total = task.knobs.stage2_iterations
+    total = task.settings.stage2_iterations
     driver.hooks.progress(name, total, total, driver.stopped)
     if driver.stopped != "interrupt":
         final = Parameters.of(lens)
@@ -452,7 +453,7 @@ def _final_lens(task: Task, driver: Driver, last: StageStep, before: Sequence[Ra
         driver.end(BOUNDS_STAGE, value := task.rrmsd(corrected))
     elif value is not None and (_is_changed(lens, corrected) or not last.at_full_size):
         value = task.rrmsd(corrected)
-    if value is None or task.knobs.method == "adam":
+    if value is None or task.settings.method == "adam":
         return corrected
     latest = task.rated(corrected, value)
     for known in before:

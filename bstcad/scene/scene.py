@@ -12,7 +12,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -48,13 +48,13 @@ from bstcad.scene.picture import Picture
 from bstcad.scene.quality import VERIFICATION_DRAW, VERIFICATION_POINTS, Tailoring, Tolerance
 from bstcad.scene.schema import FILE, FileContent, Record, contents, of_model
 from bstcad.scene.target import FAR_Z, AngularTarget, Target, Targets, coplanar_complaints
+from bstcad.tailoring.settings import SEARCH_RANGE
 
 if TYPE_CHECKING:
     from bstcad.optics.trace.measure import GhostTracer
 
 MESH_TOLERANCE = 1e-3  # mm; default maximum distance of mesh facets from a lens up to 100 mm wide
 IMAGE_KEY = re.compile(r"target(\[\d+\])?\.image|source\.profile\.image")  # dotted keys of images
-SEARCH_RANGE = 0.999  # fraction of the possible range of a front's sag at the rim that tailoring searches
 FLOAT32_ROUNDING = 2.0**-24  # largest relative rounding error of a coordinate in float32
 FINEST_MESH = 4 * FLOAT32_ROUNDING  # smallest tolerance of a mesh, as a fraction of the largest coordinate
 
@@ -439,12 +439,12 @@ class Scene(Record):
 
     def toml(self) -> str:
         """Return the text of a file from which an equal scene is loaded; images have the file names of their copies."""
-        unused = set() if self.source.extent else {"source_points"}
+        unused = {"seed"} if self.source.extent else {"seed", "source_points"}
         optic = f"refractive index {self.index:.6g}" if self.lens.passes.enters else f"a {self.optic}"
         comment = f"# {optic}; quality {self.tailoring.quality}"
         if self.lens.back.control_points is not None:  # the settings depend on them
-            knobs = self.tailoring.resolved(self.lens.back.net).model_dump(exclude={"quality", "seed"} | unused)
-            comment += ": " + ", ".join(f"{key} {value}" for key, value in knobs.items())
+            settings = asdict(self.tailoring.resolved(self.lens.back.net))
+            comment += ": " + ", ".join(f"{key} {value}" for key, value in settings.items() if key not in unused)
         return f"{comment}\n" + tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
 
 

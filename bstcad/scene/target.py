@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 import numpy as np
 import torch
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag
-from scipy.sparse import csr_array
 
 from bstcad.optics.receivers.directions import Angles, Directions
 from bstcad.optics.receivers.goal import interpolated
-from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.irradiance import Screen, overlap
 from bstcad.optics.receivers.receivers import PlaneReceiver
 from bstcad.optics.surfaces.key import Key
 from bstcad.optics.surfaces.outlines import Circle, Outline
@@ -626,19 +625,6 @@ def average(light: Callable[[PixelBox], np.ndarray], size: Pixels, window: Windo
     down = overlap(bottom - top, pixels[1], window[1] - top, window[3] - top)
     parts = (light(box) for box in strips((left, top, right, bottom)))
     return down @ np.concatenate([(across @ part.T).T for part in parts])
-
-
-def overlap(size: int, pixels: int, start: float = 0.0, stop: float | None = None) -> csr_array:
-    """Return the matrix (pixels, size) that averages `size` inputs of width 1 over equal pixels from start to stop."""
-    stop = size if stop is None else stop
-    edges = start + np.arange(pixels + 1) * (stop - start) / pixels
-    edges[-1] = stop
-    cuts = np.union1d(np.arange(size + 1), np.clip(edges, 0, size))
-    cuts = cuts[(cuts >= start) & (cuts <= stop)]
-    middle = (cuts[1:] + cuts[:-1]) / 2
-    to = np.clip(((middle - start) * pixels / (stop - start)).astype(int), 0, pixels - 1)
-    of = np.clip(middle.astype(int), 0, size - 1)
-    return csr_array((np.diff(cuts) * pixels / (stop - start), (to, of)), shape=(pixels, size))
 
 
 def inside(outline: Outline, pixels: Pixels, size: Size) -> np.ndarray:

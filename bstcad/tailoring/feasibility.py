@@ -109,8 +109,8 @@ def find_demand(task: Task, lens: Lens) -> Demand:
 
 def _demand(task: Task, solution: float, lens: Lens) -> tuple[Demand, LightBehind]:
     """Return the demand of a solution on coarse grids (deflection: NaN), and rays behind the lens that do not cross."""
-    knobs = task.knobs.model_copy(update={"transport_grid": TRIAL_CELLS, "transport_iterations": TRIAL_ITERATIONS})
-    task = replace(with_pixels(task, TRIAL_PIXELS), knobs=knobs, solution=solution, progress=no_progress)
+    settings = replace(task.settings, transport_grid=TRIAL_CELLS, transport_iterations=TRIAL_ITERATIONS)
+    task = replace(with_pixels(task, TRIAL_PIXELS), settings=settings, solution=solution, progress=no_progress)
     light = light_behind.light_for_task(task)
     if task.wave is not None:  # the picture, resampled by means, has a sum below 1
         light = replace(light, picture=light.picture / light.picture.sum())

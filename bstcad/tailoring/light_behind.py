@@ -40,7 +40,7 @@ from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import Receiver
 from bstcad.optics.surfaces.rays import Vector
 from bstcad.optics.surfaces.surfaces import Surface
-from bstcad.scene.errors import SceneError
+from bstcad.runs.files import SceneError
 from bstcad.tailoring.run import Task
 from bstcad.tailoring.slope_map import centroid, pixel_corners, resample_picture
 from bstcad.transport.bfm import TransportStep
@@ -146,17 +146,17 @@ def light_for_task(task: Task) -> LightBehind:
     near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.receiver.plane.throw(0.0))
     if any(goal.receiver.plane.frame is None for goal in (near, far)):
         raise SceneError("target: several targets, or a wavefront, need plane targets; make each target a plane")
-    n = task.knobs.transport_grid
+    n = task.settings.transport_grid
     if task.wave is not None:
         parts = max(1, round(n / max(near.receiver.shape)))
         wavelength = task.heaviest.source.main_wavelength
         return light_of_wave(near.receiver, near.picture, task.wave, wavelength=wavelength, parts=parts)
 
     def progress(s: TransportStep) -> None:
-        task.progress("stage 1", 0, task.knobs.rounds, f"between the targets, {s.grid}² cells")
+        task.progress("stage 1", 0, task.settings.rounds, f"between the targets, {s.grid}² cells")
 
     lifted = far.receiver, np.maximum(far.picture, task.floor * far.picture.mean())
-    solver = replace(TARGETS_SOLVER, iterations=task.knobs.transport_iterations, progress=progress)
+    solver = replace(TARGETS_SOLVER, iterations=task.settings.transport_iterations, progress=progress)
     return between_targets((near.receiver, near.picture), lifted, n, sign=task.solution or 1.0, solver=solver)
 
 

@@ -28,11 +28,11 @@ from bstcad.optics.surfaces.bspline import BSplineSurface, Jet, Spans
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.optics.surfaces.radial import RadialSurface
 from bstcad.optics.surfaces.sampling import sample_rim
-from bstcad.scene.blank import Bounds
-from bstcad.scene.errors import SceneError
+from bstcad.runs.files import SceneError
 from bstcad.tailoring.clearance import PENALTY_MARGIN, QUARTER_RIM_POINTS, clearance
 from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.minimise import lbfgs, minimise
+from bstcad.tailoring.settings import Bounds
 
 THICKNESS_POINTS = 513  # points per side at which the thickness is computed
 RELIEF_RESERVE = 0.02  # additional thickness for the changes of stage 2, relative to the sag range (PV) of the back

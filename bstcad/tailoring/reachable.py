@@ -21,12 +21,11 @@ from bstcad.optics.lens.interfaces import Law
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.receivers.goal import Goal
-from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.irradiance import Screen, averaged
 from bstcad.optics.receivers.receivers import Receiver
 from bstcad.optics.surfaces.charts import HEIGHTS
 from bstcad.optics.trace.reach import MAX_EXIT_ANGLE, reach_margin
 from bstcad.optics.trace.unfolding import image_from_last_net
-from bstcad.scene.target import average
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.slope_map import FaceGrid
 from bstcad.transport.mapping import Points
@@ -74,8 +73,7 @@ def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
     screen, picture = goal.receiver, goal.picture
     shrunk = max(1.0, max(screen.shape) / pixels)
     rows, columns = (max(round(n / shrunk), 1) for n in screen.shape)
-    size = screen.columns, screen.rows
-    small = average(lambda b: picture[b[1] : b[3], b[0] : b[2]], size, (0.0, 0.0, *size), (columns, rows))
+    small = averaged(picture, columns, rows)
     return replace(
         goal, receiver=replace(screen, pixels=(columns, rows)), picture=small, reachable=None, whole=None, draw=None
     )

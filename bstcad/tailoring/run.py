@@ -22,9 +22,8 @@ from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.surfaces.sides import Sides
 from bstcad.optics.trace.measure import Effort, measure_goal, rrmsds_by_rays
 from bstcad.optics.trace.unfolding import image_screen
-from bstcad.scene.blank import Bounds
-from bstcad.scene.quality import ResolvedTailoring
 from bstcad.tailoring.merit import Merit
+from bstcad.tailoring.settings import Bounds, Settings
 from bstcad.tailoring.source_image import ExtendedSource
 from bstcad.transport.mapping import Mapping
 
@@ -118,7 +117,7 @@ class Task:
 
     channels: tuple[Channel, ...]  # light of the source, or of the centre of a source of finite size
     goals: tuple[Goal, ...]  # targets; stage 1 with one freeform face uses only the first
-    knobs: ResolvedTailoring  # settings of the scene's [tailoring]
+    settings: Settings  # settings of the scene's [tailoring]
     min_thickness: float = 0.0  # minimum thickness of the glass everywhere (mm)
     free: tuple[str, ...] = ()  # names of the parameters of the front that stage 1 optimises
     rim_sags: tuple[float, float] = (-math.inf, math.inf)  # range of the front's sag at the rim (mm)
@@ -176,7 +175,7 @@ class Task:
         """
         if effort is None and self.preview:  # only the light on the target counts
             effort = FLUX_EFFORT
-        if effort is None and (self.knobs.accuracy is not None or self.bounds is not None):
+        if effort is None and (self.settings.accuracy is not None or self.bounds is not None):
             effort = FINE_EFFORT
         effort = effort or self.stage_effort()
         sources = () if self.sampled_sources else self.extended_sources  # centre alone before stage 3

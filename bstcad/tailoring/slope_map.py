@@ -47,7 +47,7 @@ from bstcad.optics.trace.reach import MAX_EXIT_ANGLE, limit_refraction, reach_ma
 from bstcad.optics.trace.trace import across, behind, clear_window, is_transmitted
 from bstcad.optics.trace.tubes import rays_to
 from bstcad.optics.trace.unfolding import image_screen
-from bstcad.scene.errors import SceneError
+from bstcad.runs.files import SceneError
 from bstcad.tailoring.slope_fit import Fit, blocks, fit_slopes, monomials, with_polynomial
 from bstcad.transport.density import Density, resample_flux
 from bstcad.transport.mapping import Frame, Mapping, Points, TransportMap, nodes, solve

@@ -30,14 +30,12 @@ from bstcad.optics.surfaces.rays import Rays
 from bstcad.optics.surfaces.sides import as_pair, coarser
 from bstcad.optics.trace.reach import MAX_EXIT_ANGLE
 from bstcad.optics.trace.trace import clear_window, trace
-from bstcad.scene.fronts import CONIC_CONSTANTS
-from bstcad.scene.quality import COARSEST_GRID
-from bstcad.scene.scene import SEARCH_RANGE
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.merit import mean_square_miss
 from bstcad.tailoring.reachable import resample
 from bstcad.tailoring.run import Parameters, StageStep, Steps, Task
+from bstcad.tailoring.settings import COARSEST_GRID, CONIC_CONSTANTS, SEARCH_RANGE
 from bstcad.tailoring.slope_fit import Fit, tailor_to_aim
 from bstcad.tailoring.slope_map import SlopeMap
 from bstcad.transport.bfm import TransportStep
@@ -93,7 +91,7 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
     """
     lens = task.heaviest.through(lens)
     if state is None and task.free:
-        net, effort = task.knobs.levels[0], FrontSearch(iterations=task.knobs.transport_iterations)
+        net, effort = task.settings.levels[0], FrontSearch(iterations=task.settings.transport_iterations)
         if task.preview:
             net, effort = coarser(lens.back_net.shape, PREVIEW_NET), PREVIEW_SEARCH
         source, blank = task.heaviest.source, lens.refined(net)
@@ -120,7 +118,7 @@ def is_poor_result(task: Task, lens: Lens, by_rays: float, state: SlopeRound) ->
     by_rays: RRMSD of the lens; if large, it is computed again without detail that the net cannot resolve.
     """
     goal = task.goals[0]
-    few = resample(goal, pixels=max(as_pair(task.knobs.levels[-1])))
+    few = resample(goal, pixels=max(as_pair(task.settings.levels[-1])))
     if by_rays > RETRY_RRMSD and few.receiver.shape != goal.receiver.shape:
         by_rays = replace(task, goals=(few,)).rrmsd(lens)
     return not by_rays <= RETRY_RRMSD or state.slopes.moved > RETRY_CHANGE  # NaN: no light on the target
@@ -132,16 +130,16 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> St
     All rounds except the last FINE_ROUNDS use coarse grids and nets, which are fast.  Once the map has settled, the
     remaining coarse rounds are skipped.
     """
-    knobs, z = task.knobs, lens.back.z  # z: plane of the back in the blank (mm)
+    settings, z = task.settings, lens.back.z  # z: plane of the back in the blank (mm)
     slopes, done = (None, 0) if state is None else (state.slopes, state.round)
     lens = lens if state is None else state.lens.apply_to(lens)
-    number = min(done, knobs.rounds - 1)
-    while number < knobs.rounds:
+    number = min(done, settings.rounds - 1)
+    while number < settings.rounds:
         if slopes is None or number >= done:
             lens, slopes = _round(task, lens, slopes, number)
             lens = place_back(lens, z, task.min_thickness, task.bounds)  # the next round starts from the shifted back
             task.tidy()
-        number = next_round(number, knobs.rounds, fine=FINE_ROUNDS, settled=slopes.moved <= SETTLED_CHANGE)
+        number = next_round(number, settings.rounds, fine=FINE_ROUNDS, settled=slopes.moved <= SETTLED_CHANGE)
         yield round_step(task, lens, SlopeRound(number, Parameters.of(lens), slopes), slopes.face_points)
 
 
@@ -152,25 +150,26 @@ def next_round(number: int, rounds: int, fine: int, settled: bool) -> int:
 
 def round_step(task: Task, lens: Lens, state: SlopeRound, face_points: Points) -> StageStep:
     """Return the step after a round; face_points: points (mm) of the last tailored face for the pixel corners."""
-    make, progress = partial(task.refined, lens, task.knobs.levels[-1]), ("stage 1", state.round, task.knobs.rounds, "")
+    make = partial(task.refined, lens, task.settings.levels[-1])
+    progress = "stage 1", state.round, task.settings.rounds, ""
     return StageStep(make, state, mapping=state.slopes.mapping, face_points=face_points, progress=progress)
 
 
 def _round(task: Task, lens: Lens, previous: SlopeMap | None, number: int) -> tuple[Lens, SlopeMap]:
     """Run the round of this number (from 0); return the lens and the map to which it is fitted."""
-    knobs, source, goal, left = task.knobs, task.heaviest.source, task.goals[0], task.knobs.rounds - number
-    cells = max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left - 1, 2))
-    m = knobs.levels[max(-left, -len(knobs.levels))] if left <= FINE_ROUNDS else knobs.levels[0]
+    settings, source, goal, left = task.settings, task.heaviest.source, task.goals[0], task.settings.rounds - number
+    cells = max(COARSEST_GRID, settings.transport_grid // 2 ** min(left - 1, 2))
+    m = settings.levels[max(-left, -len(settings.levels))] if left <= FINE_ROUNDS else settings.levels[0]
 
     def progress(s: TransportStep) -> None:
-        task.progress("stage 1", number, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
+        task.progress("stage 1", number, settings.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
 
     lens = task.refined(lens, m)
     window = slope_map.lit_window(source, lens)
     grid = slope_map.square_grid(source, lens, window, cells)
-    solver = Solver(knobs.transport_iterations, progress=progress)
+    solver = Solver(settings.transport_iterations, progress=progress)
     slopes = slope_map.slope_map(lens, grid, goal, previous, solver=solver, preview=task.preview)
-    sides = [min(2 * points, knobs.rays) for points in as_pair(m)]
+    sides = [min(2 * points, settings.rays) for points in as_pair(m)]
     parts = math.ceil(max(sides) / MAX_RAY_CELLS)
     grid = slope_map.face_grid(source, lens, window, (math.ceil(sides[0] / parts), math.ceil(sides[1] / parts)))
     grazing = MAX_EXIT_ANGLE if task.edge is None else task.edge.angle
@@ -185,12 +184,14 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     slope fits converge even if the slopes needed at fixed points of the back depend strongly on the sag: in strong
     lenses near the source, and in glass of low index.  The part of these slopes that is not a gradient is lost.
     """
-    knobs, goal, z = task.knobs, task.goals[0], lens.back.z
+    settings, goal, z = task.settings, task.goals[0], lens.back.z
     for number in range(AIM_ROUNDS):
-        n, m = (COARSEST_GRID, knobs.levels[0]) if number < AIM_ROUNDS - 1 else (knobs.transport_grid, knobs.levels[-1])
+        last = number == AIM_ROUNDS - 1
+        n, m = (settings.transport_grid, settings.levels[-1]) if last else (COARSEST_GRID, settings.levels[0])
         lens = task.refined(lens, m)
-        side = min(3 * max(as_pair(m)), max(2 * max(as_pair(m)), knobs.rays))  # many rays may leave through the sides
-        counts = {"n": n, "side": side, "iterations": knobs.transport_iterations}
+        points = max(as_pair(m))
+        side = min(3 * points, max(2 * points, settings.rays))  # many rays may leave through the sides
+        counts = {"n": n, "side": side, "iterations": settings.transport_iterations}
         rays, aims, mapping = aimed_rays(task.heaviest.source, lens, goal, **counts)
         lens = place_back(tailor_to_aim(lens, rays, aims, goal.receiver.plane), z, task.min_thickness, task.bounds)
     return lens, mapping

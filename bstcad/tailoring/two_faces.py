@@ -30,11 +30,11 @@ from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.optics.surfaces.rays import Rays
 from bstcad.optics.trace.reach import limit_refraction, slopes_towards
-from bstcad.scene.quality import COARSEST_GRID
 from bstcad.tailoring import slope_map, stage1
 from bstcad.tailoring.light_behind import LightBehind, light_for_task, without_crossings
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.run import Parameters, Steps, Task
+from bstcad.tailoring.settings import COARSEST_GRID
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.tailoring.slope_map import FaceGrid, SlopeMap, Slopes
 from bstcad.transport.bfm import TransportStep
@@ -66,7 +66,7 @@ def steps(task: Task, lens: Lens, state: stage1.SlopeRound | None = None) -> Ste
     """
     lens = task.heaviest.through(lens)
     if not (lens.shapes_two_faces and task.several):
-        alone = replace(task.refined(lens, task.knobs.levels[-1]), shaped=lens.freeform[-1:])
+        alone = replace(task.refined(lens, task.settings.levels[-1]), shaped=lens.freeform[-1:])
         yield from stage1.steps(task, alone, state)
         return
     for last in follow_rays(task, lens, state if isinstance(state, FrontRound) else None):
@@ -78,19 +78,19 @@ def steps(task: Task, lens: Lens, state: stage1.SlopeRound | None = None) -> Ste
 def follow_rays(task: Task, lens: Lens, state: FrontRound | None) -> Steps:
     """Yield a step per round: coarse rounds until the map has settled, then FINE_PAIR_ROUNDS fine ones."""
     task = task.with_imaged_receivers(lens)
-    knobs, z = task.knobs, lens.back.z
+    settings, z = task.settings, lens.back.z
     near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
-    light = without_crossings(light_for_task(task), near.receiver, lens.back, knobs.transport_grid)
+    light = without_crossings(light_for_task(task), near.receiver, lens.back, settings.transport_grid)
     slopes, b, done = (None, None, 0) if state is None else (state.slopes, state.back, state.round)
     lens = lens if state is None else state.lens.apply_to(lens)
-    number = min(done, knobs.rounds - 1)
-    while number < knobs.rounds:
+    number = min(done, settings.rounds - 1)
+    while number < settings.rounds:
         if slopes is None or b is None or number >= done:
-            left = knobs.rounds - number
+            left = settings.rounds - number
             fine = left <= FINE_PAIR_ROUNDS
             halvings = 0 if left == 1 else 1 if fine else 2
-            cells = max(COARSEST_GRID, knobs.transport_grid // 2**halvings)
-            level = knobs.levels[max(-1 - halvings, -len(knobs.levels))] if fine else knobs.levels[0]
+            cells = max(COARSEST_GRID, settings.transport_grid // 2**halvings)
+            level = settings.levels[max(-1 - halvings, -len(settings.levels))] if fine else settings.levels[0]
             lens = task.refined(lens, level)
             fit = stage1.FINE_FACE_FIT if fine else stage1.COARSE_FACE_FIT
             q = None if slopes is None else slopes.face_points
@@ -98,7 +98,7 @@ def follow_rays(task: Task, lens: Lens, state: FrontRound | None) -> Steps:
             lens = place_back(lens, z, task.min_thickness, task.bounds)
             task.tidy()
         settled = slopes.moved <= SETTLED_FRONT
-        number = stage1.next_round(number, knobs.rounds, fine=FINE_PAIR_ROUNDS, settled=settled)
+        number = stage1.next_round(number, settings.rounds, fine=FINE_PAIR_ROUNDS, settled=settled)
         yield stage1.round_step(task, lens, FrontRound(number, Parameters.of(lens), slopes, b), b)
 
 
@@ -111,12 +111,12 @@ def _round(
     b_x, b_y = light.sampled_at(task.goals[0].receiver, met[:2])
 
     def progress(s: TransportStep) -> None:
-        task.progress("stage 1", number, task.knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
+        task.progress("stage 1", number, task.settings.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
 
     grid = slope_map.square_grid(source, front, window, cells)
-    solver = Solver(task.knobs.transport_iterations, progress=progress)
+    solver = Solver(task.settings.transport_iterations, progress=progress)
     slopes = front_map(front, grid, window, light.picture, b=met, q=q, solver=solver)
-    front_side, back_side = (min(2 * max(net.shape), task.knobs.rays) for net in lens.nets)
+    front_side, back_side = (min(2 * max(net.shape), task.settings.rays) for net in lens.nets)
     grid = slope_map.face_grid(source, front, window, front_side)
     lens = lens.with_front(slope_map.fit_to_map(front, slopes, grid, fit).front)
     window = slope_map.lit_window(source, lens)

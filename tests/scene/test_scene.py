@@ -1,6 +1,7 @@
 """Scenes: what a file or a script says is what the engine gets, and a scene goes through its file unchanged."""
 
 import math
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -410,14 +411,14 @@ def test_a_ghost_brings_the_reflections_of_its_faces_by_the_coating_that_is_name
 
 @pytest.mark.parametrize("quality", PRESETS)
 def test_every_knob_gets_a_value(quality):
-    knobs = Tailoring(quality=quality).resolved(513)
-    assert {key for key, value in knobs.model_dump().items() if value is None} == {"accuracy", "max_time", "solution"}
-    assert knobs.levels == (33, 129, 513)
+    settings = Tailoring(quality=quality).resolved(513)
+    assert {key for key, value in asdict(settings).items() if value is None} == {"accuracy", "max_time", "solution"}
+    assert settings.levels == (33, 129, 513)
     each_way = 2**0.5 if quality == "draft" else 2  # rays a control cell: at least two
-    assert knobs.rays >= each_way * 513 and knobs.stage2_iterations > 0
+    assert settings.rays >= each_way * 513 and settings.stage2_iterations > 0
     assert Tailoring(quality=quality, method="integration").resolved(65).stage2_iterations == 0
-    knobs = Tailoring(quality=quality, rays=300, levels=(9, 65), rounds=2).resolved(65)  # the scene goes before
-    assert (knobs.rays, knobs.levels, knobs.rounds) == (300, (9, 65), 2)
+    settings = Tailoring(quality=quality, rays=300, levels=(9, 65), rounds=2).resolved(65)  # the scene goes before
+    assert (settings.rays, settings.levels, settings.rounds) == (300, (9, 65), 2)
 
 
 @pytest.mark.parametrize(("quality", "m", "cells"), [

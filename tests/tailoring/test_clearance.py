@@ -18,11 +18,11 @@ from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.bspline import QUARTERS, BSplineSurface
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Sphere
-from bstcad.scene.blank import Bounds
 from bstcad.tailoring import machinability
 from bstcad.tailoring.clearance import PENALTY_MARGIN, CellGrid, clearance, unit
 from bstcad.tailoring.machinability import active_bounds, enforce_bounds, excess
 from bstcad.tailoring.merit import Merit
+from bstcad.tailoring.settings import Bounds
 from bstcad.tailoring.stage2 import Problem
 from tests.lenses import half_over, net
 

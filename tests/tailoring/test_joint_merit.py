@@ -11,9 +11,9 @@ from bstcad.optics.light.point import Point
 from bstcad.optics.numerics import ops
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen
-from bstcad.scene.blank import Bounds
 from bstcad.tailoring.machinability import excess
 from bstcad.tailoring.merit import Merit
+from bstcad.tailoring.settings import Bounds
 from bstcad.tailoring.stage2 import Problem
 from tests.tailoring.test_two_faces import BEAM, WAVES, N, bumpy, goals_of, merit_of, picture
 

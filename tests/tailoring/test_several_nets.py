@@ -81,8 +81,8 @@ MOVED = {Collimated: {"tilt": (1.0, 0.0)}, Point: {"position": (1.5, 0.0, -600.0
 
 def problem_of(name):
     lens, source = FRONTS[name]
-    knobs = Tailoring(rays=96, levels=(M,), stage2_iterations=EVALUATIONS, overshoot=0.03).resolved(M)
-    task = Task((Channel(source, N),), (Goal("target", SCREEN, picture()),), knobs)
+    settings = Tailoring(rays=96, levels=(M,), stage2_iterations=EVALUATIONS, overshoot=0.03).resolved(M)
+    task = Task((Channel(source, N),), (Goal("target", SCREEN, picture()),), settings)
     merit = Merit.of(task.channels, lens, 96, task.goals, 0.03)
     return task, lens, Problem(lens, merit)
 
@@ -124,9 +124,9 @@ def test_stage_2_shapes_a_front_and_goes_on_from_where_it_was_left():
 @pytest.mark.parametrize("name", BODIES)
 def test_stage_2_alone_shapes_two_nets_of_a_body_with_mirrors(name):
     lens, screen = BODIES[name]
-    knobs = Tailoring(rays=96, levels=(M,), stage2_iterations=2 * EVALUATIONS, overshoot=0.03).resolved(M)
+    settings = Tailoring(rays=96, levels=(M,), stage2_iterations=2 * EVALUATIONS, overshoot=0.03).resolved(M)
     source = ABOVE if lens.passes.sense < 0 else BEAM
-    task = Task((Channel(source, lens.index),), (Goal("target", screen, picture()),), knobs)
+    task = Task((Channel(source, lens.index),), (Goal("target", screen, picture()),), settings)
     begun, (*_, last) = task.rrmsd(lens), steps(task, lens)
     assert task.rrmsd(last.lens) < begun / 2
     one, two = (found.heights for found in last.lens.nets)
@@ -137,7 +137,7 @@ def test_stage_2_alone_shapes_two_nets_of_a_body_with_mirrors(name):
 def test_stage_2_keeps_the_least_thickness_and_finds_the_picture():
     """The faces come within 0.542 mm of each other if they may."""
     task, lens, _ = problem_of("both")
-    task = replace(task, knobs=task.knobs.model_copy(update={"stage2_iterations": 80}))
+    task = replace(task, settings=replace(task.settings, stage2_iterations=80))
     near = replace(lens, back=lens.back.moved(0.6))
     (*_, free), (*_, bound) = (steps(replace(task, min_thickness=least), near) for least in (0.01, 0.55))
     assert thickness_range(free.lens)[0] < 0.545 and task.rrmsd(free.lens) < 0.05

@@ -177,7 +177,7 @@ def test_a_rectangle_of_light_casts_a_rectangle():
 def test_a_few_points_tell_how_wide_the_image_is(name):
     """The pull on light beyond the border falls with the width of the image, by all 64 points or by a few."""
     source = SOURCES[name]
-    light, knobs = channels_of(source, lambda nm: INDEX, 64), Tailoring(overshoot=0.03).resolved(65)
-    task = Task(light, GOALS, knobs, extended_sources=(extended(source),))
+    light, settings = channels_of(source, lambda nm: INDEX, 64), Tailoring(overshoot=0.03).resolved(65)
+    task = Task(light, GOALS, settings, extended_sources=(extended(source),))
     by_all = _overshoot_weight(replace(task, extended_sources=()), lens())
     assert _overshoot_weight(task, lens()) == pytest.approx(by_all, rel=0.02) and by_all < 0.02

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 import torch
@@ -42,8 +43,8 @@ WIDE = TINY | {"source.diameter": 1.2}  # 80 mm before the back, 475 mm behind i
 )
 def test_only_rounds_that_resolve_the_net_are_short_and_move_its_short_waves(changes, shares, level):
     scene = load(DISK, SMALL | {"tailoring.stage2_iterations": 60} | changes)
-    knobs = scene.tailoring.resolved(scene.lens.back.net)
-    task = pipeline.task_of(scene, scene.goals, knobs, edge=None)
+    settings = scene.tailoring.resolved(scene.lens.back.net)
+    task = pipeline.task_of(scene, scene.goals, settings, edge=None)
     assert stage2.round_shares(task) == shares
     first = stage2.TubeRound(task, 48, 30, resolved=stage2.resolves_net(task))
     assert first.level == pytest.approx(level, rel=1e-12)
@@ -55,9 +56,9 @@ def test_only_rounds_that_resolve_the_net_are_short_and_move_its_short_waves(cha
 )
 def test_the_last_round_of_a_large_net_has_more_tubes_unless_memory_forbids_it(points, tubes):
     scene = load("templates/portrait.toml", {"lens.back.control_points": points})
-    knobs = scene.tailoring.resolved(scene.lens.back.net)
-    shares = stage2.round_shares(pipeline.task_of(scene, scene.goals, knobs, edge=None))
-    found = list(stage2.sheet_sizes(knobs, shares))
+    settings = scene.tailoring.resolved(scene.lens.back.net)
+    shares = stage2.round_shares(pipeline.task_of(scene, scene.goals, settings, edge=None))
+    found = list(stage2.sheet_sizes(settings, shares))
     assert [each for each, _ in found] == tubes
     assert [count for _, count in found] == [round(part * 98) for part in ROUNDS_OF[points]]
 
@@ -70,8 +71,8 @@ def test_a_round_for_several_pictures_ends_once_it_fits_its_tubes_alone(monkeypa
     """No RRMSD by tubes is below 0 times that by rays, and each is below ∞ times it, at the first comparison."""
     monkeypatch.setattr(stage2, "DISTORTION_RATIO", ratio)
     scene = load(DISK, two_faces.SMALL)
-    knobs = scene.tailoring.resolved(scene.lens.back.net).model_copy(update={"stage2_iterations": 60})
-    task, lens = pipeline.task_of(scene, scene.goals, knobs, edge=None), scene.flat_lens(scene.lens.back.net)
+    settings = replace(scene.tailoring.resolved(scene.lens.back.net), stage2_iterations=60)
+    task, lens = pipeline.task_of(scene, scene.goals, settings, edge=None), scene.flat_lens(scene.lens.back.net)
     counts = Counter(step.part for step in stage2.steps(task, scene.as_mounted(lens)) if step.rrmsd is not None)
     assert list(counts.values()) == evaluations
 
@@ -121,11 +122,11 @@ def test_the_source_grows_to_its_size():
 
 def task_of(scene):
     """The task of a scene as `pipeline.design` has it."""
-    knobs = scene.tailoring.resolved(33)
+    settings = scene.tailoring.resolved(33)
     light = scene.with_source_scaled(0.0).channels()
     scaled = [scene.with_source_scaled(share) for share, _ in stage2.SOURCE_SIZES]
     return pipeline.Task(
-        light, scene.goals, knobs, sampled_sources=tuple(each.channels() for each in scaled),
+        light, scene.goals, settings, sampled_sources=tuple(each.channels() for each in scaled),
         extended_sources=tuple(ExtendedSource(each.source, light, each.draw) for each in scaled),
     )  # fmt: skip
 

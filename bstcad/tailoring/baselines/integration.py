@@ -34,7 +34,7 @@ from bstcad.optics.surfaces.sides import Sides, as_pair
 from bstcad.optics.trace.reach import wanted_slopes
 from bstcad.optics.trace.trace import clear_window, to_first_net
 from bstcad.optics.trace.unfolding import image_from_last_net
-from bstcad.scene.errors import SceneError
+from bstcad.runs.files import SceneError
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.baselines.paper import transport
 from bstcad.tailoring.machinability import place_back
@@ -77,9 +77,9 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
     The initial point lies on the ray through the centre of the first surface, in the plane of the back.  If the back
     would come too near to the front, the integration is repeated from a point further along +z.  first: as in `march`.
     """
-    knobs, screen = task.knobs, task.goals[0].receiver
+    settings, screen = task.settings, task.goals[0].receiver
     source, exact, z = task.heaviest.source, lens.plain(), lens.back.z
-    area, n = clear_window(source, exact), knobs.rays // 2 * 2 + 1  # odd: one ray through the centre
+    area, n = clear_window(source, exact), settings.rays // 2 * 2 + 1  # odd: one ray through the centre
     x, y = sampling.grid(area, n)
     coming = to_first_net(source.rays_through(x, y, exact.entrance.z, area.area / n**2), exact)
     aim, plane = slope_map.aim_points(mapping, exact, screen, x=x, y=y), image_from_last_net(exact, screen.plane)
@@ -87,7 +87,7 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
         start = exact.back.z
         points = march(coming, aim, plane, law=exact.last_freeform.law, z=start, first=first)
         lit = points.reached & (coming.flux > 0) & exact.apertures[1].contains(*points.position[:2])
-        back = fit_net(exact.back_net, points, lit, knobs.levels)
+        back = fit_net(exact.back_net, points, lit, settings.levels)
         exact = place_back(exact.with_back(back), z, task.min_thickness)
         if exact.back.z == start:
             break

@@ -25,10 +25,9 @@ import numpy as np
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.receivers.goal import Goal
-from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.irradiance import Screen, overlap
 from bstcad.optics.trace.measure import Effort, measure
 from bstcad.scene.errors import MachineError, SceneError, nearest
-from bstcad.scene.target import overlap
 from bstcad.verify.verdict import Check
 
 JUDGES = {"batoid": "bstcad.verify.judges.batoid", "mitsuba": "bstcad.verify.judges.mitsuba"}

@@ -147,9 +147,9 @@ def small(name, **more):
     """(task, blank lens) of a template at toy size."""
     front = {"lens.front.optimise": "false"} if name == "portrait" else {}
     wanted = scene.load(f"templates/{name}.toml", SMALL | front | more)
-    knobs = wanted.tailoring.resolved(wanted.lens.back.control_points)
-    task = Task(wanted.channels(), wanted.goals, knobs, wanted.lens.min_thickness)
-    return task, wanted.flat_lens(knobs.levels[0])
+    settings = wanted.tailoring.resolved(wanted.lens.back.control_points)
+    task = Task(wanted.channels(), wanted.goals, settings, wanted.lens.min_thickness)
+    return task, wanted.flat_lens(settings.levels[0])
 
 
 def followed(task, lens, steps):
