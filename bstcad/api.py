@@ -27,7 +27,7 @@ from bstcad.commands import OwnCheck, OwnSection, ProofOptions
 from bstcad.designs import folder as folders
 from bstcad.designs import pipeline
 from bstcad.designs.course import BY_HAND, DesignCourse
-from bstcad.designs.folder import Made, same_front
+from bstcad.designs.made import Made, same_front
 from bstcad.figures.drawing import png
 from bstcad.figures.light_figures import View, irradiance_triptych
 from bstcad.manufacture.measured.compensation import Settings as CompensationSettings

@@ -28,7 +28,7 @@ from bstcad.cad.tiling import Tiling
 from bstcad.designs import folder as folders
 from bstcad.designs.as_designed import scene_text
 from bstcad.designs.course import StageRecord
-from bstcad.designs.folder import Made
+from bstcad.designs.made import Made
 from bstcad.designs.pipeline import DesignState, design, purpose
 from bstcad.exports import data_sheet, exports
 from bstcad.exports.data_sheet import DataSheet

@@ -18,7 +18,6 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ import numpy as np
 from bstcad.cad import mesh as meshes
 from bstcad.cad.mesh import MIRROR_RGBA, Label
 from bstcad.designs.as_designed import scene_text
-from bstcad.designs.course import DesignCourse
+from bstcad.designs.made import Made
 from bstcad.optics.lens import quadrature
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface, is_net, knots
@@ -44,7 +43,7 @@ from bstcad.scene.fronts import NET_FILE
 from bstcad.scene.target import numbered
 from bstcad.transport.mapping import TransportMap, nodes
 from bstcad.verify import jobs
-from bstcad.verify.checks import Nominal
+from bstcad.verify.nominal import Nominal
 
 SCENE, DESIGN, PART = "scene.toml", "design.npz", "part.step"  # names of files in a design's folder
 FRONT_KNOTS = ("front_knots_x", "front_knots_y")  # names in design.npz of the knots of a tailored front
@@ -52,40 +51,6 @@ PROVEN = (SCENE, DESIGN, "lens.step", "lens.stl", PART, NET_FILE)  # files that 
 ERROR = "irradiance_error"  # name in design.npz of the error of the irradiance
 DISTANCES = "relative_distances"  # name in design.npz of a dome's distances
 REMEDY = "generate the design again"
-
-
-@dataclass(frozen=True)
-class Made(Nominal):
-    """Designed lens as a folder stores it: on the CPU, with goals restricted to the pixels that light can reach."""
-
-    making: DesignCourse = DesignCourse()  # stages, history and machine, for the report
-    device: str = "cpu"  # device on which the lens was designed: "cpu" or "cuda"
-    transport: TransportMap | None = None  # transport map of stage 1; None: the user's own lens, or not stored
-    # Function that returns `making` with the comparison of float32 and float64 for the report; None: nothing to add.
-    precision_comparison: Callable[[], DesignCourse] | None = None
-
-    def with_report_data(self) -> Made:
-        """Return this design with the comparison of float32 and float64 that the report prints."""
-        compare = self.precision_comparison
-        return self if compare is None else replace(self, making=compare(), precision_comparison=None)
-
-    def is_lens_of(self, other: Nominal) -> bool:
-        """Return True if lens (to the last bit), source and targets are equal to those of another design."""
-        return (
-            same_front(self.lens.front, other.lens.front)
-            and np.array_equal(self.lens.back_net.control_points(), other.lens.back_net.control_points())
-            and self.scene.source == other.scene.source
-            and self.scene.targets == other.scene.targets
-        )
-
-
-def same_front(one: Surface, other: Surface) -> bool:
-    """Return True if two fronts are equal to the last bit."""
-    if is_net(one) and is_net(other):  # independent of their planes z
-        return np.array_equal(one.control_points(), other.control_points())
-    both = [{"z": front.z, **front.parameters()} for front in (one.plain(), other.plain())]
-    same = (one.kind, one.outline) == (other.kind, other.outline) and both[0].keys() == both[1].keys()
-    return same and all(np.array_equal(both[0][key], both[1][key]) for key in both[0])
 
 
 # --- estimates of file sizes ------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ import bstcad
 from bstcad.analysis.shape import thickness_range
 from bstcad.analysis.steepness import Steepness, needed_steepness
 from bstcad.designs.course import CurvePoint, DesignCourse, PrecisionTest, StageRecord
-from bstcad.designs.folder import Made
+from bstcad.designs.made import Made
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.surfaces.sides import as_pair

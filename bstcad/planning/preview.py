@@ -18,7 +18,7 @@ import torch
 from bstcad.analysis.light import Blur, blur
 from bstcad.analysis.shape import describe
 from bstcad.designs import pipeline
-from bstcad.designs.folder import Made
+from bstcad.designs.made import Made
 from bstcad.manufacture.tolerance.as_made import AsMade, as_made
 from bstcad.manufacture.tolerance.lit_by import LitBy, lit_by
 from bstcad.optics.lens.lens import Lens

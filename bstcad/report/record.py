@@ -57,9 +57,10 @@ from bstcad.report.units import DIGITS, Remark, Rows, number, paragraphs, percen
 from bstcad.report.units import remarks as written
 from bstcad.runs import files
 from bstcad.scene.scene import Scene
-from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Nominal, Proof
+from bstcad.verify.checks import Proof
 from bstcad.verify.judges.comparison import Judge
 from bstcad.verify.light_limits import LightValue
+from bstcad.verify.nominal import DEFAULT_RRMSD_LIMIT, Nominal
 from bstcad.verify.verdict import NO_LIMIT, Check, verdict
 
 if TYPE_CHECKING:

@@ -10,8 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -24,16 +23,13 @@ from bstcad.cad import mesh as meshes
 from bstcad.optics.lens import domes, quadrature
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.passes import Face
-from bstcad.optics.light.channels import Channel
 from bstcad.optics.receivers.goal import Goal, worst
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.optics.trace.measure import (
-    FULL,
     RESOLVED,
     Effort,
     Light,
     SpectralLine,
-    measure_goals,
     spectral_lines,
     squared_distance,
     tubes_of,
@@ -44,12 +40,11 @@ from bstcad.scene.accept import Accept
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.errors import SceneError
 from bstcad.scene.mount import Part, as_cut
-from bstcad.scene.real_source import image_diameters, real_size
-from bstcad.scene.scene import Scene
 from bstcad.step_text import part21
 from bstcad.step_text.part21 import StepText
 from bstcad.verify import jobs, text_checks
 from bstcad.verify.light_limits import LightValue, light_values
+from bstcad.verify.nominal import Nominal
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
@@ -61,13 +56,11 @@ VERIFY_SEED = 1_000_003  # offset of the seed, for rays that tailoring has not u
 # RMS difference relative to its RMS, for the rounding of another processor.
 STORED_NOISE, STORED_TOLERANCE = 3.0, 2e-3
 TARGET_TOLERANCE = 1e-3  # largest change of the target since design.npz / brightest pixel: picture libraries change
-DEFAULT_RRMSD_LIMIT = 0.25  # limit of the RRMSD in remarks, plans and tolerance studies if accept.rrmsd is not set
 LINE_TUBES = 1031  # smallest number of tubes per side for the picture of one line of a spectrum
 CLEAR_APERTURE_TOLERANCE = 1e-3  # largest distance (mm) between the rims of measured and designed apertures
 MIN_MOUNT_LOSS = 1e-3  # smallest fraction of light cut away by a mount that a failed check states as its reason
 MAX_FLANGE_LIGHT = 1e-3  # largest fraction of the light through the clear apertures that may meet the flange
 WAVEFRONT = "wavefront error, RMS in waves, piston and tilt removed"
-DRAFT_ACCURACY = 0.01  # relative standard error of the RRMSD at which ray tracing ends, for draft quality
 MAX_FLOOR = 0.1  # largest rounding error of the wavefront error / accept.wavefront that leaves the verdict certain
 TIME_LIMIT, TIME_LIMIT_PER_MB = 120.0, 3.0  # timeout of OCC (s) and its increase per MB, 100 times the usual time
 
@@ -75,54 +68,6 @@ R = TypeVar("R")
 Lines = tuple[SpectralLine, ...]  # pictures of the lines of a spectrum on one target
 OnLight = Callable[[Light, Lines, int], None]  # function of the light on a target, its Lines, and its index
 FINE_GRID = ", on a grid four times finer than the net"  # suffix of the names of checks on such a grid
-
-
-@dataclass(frozen=True)
-class Nominal:
-    """The design against which the files are checked."""
-
-    scene: Scene
-    lens: Lens  # designed lens, float64
-    goals: tuple[Goal, ...]  # goals with the pictures of the scene
-    # pictures of the goals in design.npz, (rows, columns); None: those of `goals`
-    stored: tuple[np.ndarray, ...] | None = field(default=None, kw_only=True)
-    # for each goal, the irradiance (rows, columns) in design.npz, None if it has none, and its error, NaN if not
-    # stated; (): no design.npz was read
-    lit: tuple[tuple[np.ndarray | None, float], ...] = field(default=(), kw_only=True)
-
-    @cached_property
-    def channels(self) -> tuple[Channel, ...]:
-        """Channels of the scene's light; their points on an extended source are not the points used in tailoring."""
-        return self.scene.verification_channels()
-
-    @property
-    def heaviest(self) -> Channel:
-        """Channel with the largest weight, whose wavelength is the unit of wavefront errors."""
-        return max(self.channels, key=lambda channel: channel.weight)
-
-    def effort(self, given: Effort | None = None) -> Effort:
-        """Return the effort of measuring this design, smaller for a draft; given: upper limit (None: FULL)."""
-        given, tailoring = given or FULL, self.scene.tailoring
-        accuracy = DRAFT_ACCURACY if tailoring.quality == "draft" else FULL.accuracy
-        return replace(given, seed=tailoring.seed, accuracy=max(given.accuracy, accuracy))
-
-    def light(self, lens: Lens, goal: Goal, effort: Effort) -> Light:
-        """Return the light of a lens on a target."""
-        [light] = self.lights(lens, [goal], effort)
-        return light
-
-    def lights(self, lens: Lens, goals: Sequence[Goal], effort: Effort) -> list[Light]:
-        """Return the light of a lens on each target, by the same rays."""
-        images = self._source_images(lens, goals) if effort.cells > 1 else ()
-        ghost, draw = self.scene.ghost, self.scene.draw
-        return measure_goals(lens, self.channels, goals, effort, ghost=ghost, draw=draw, images=images)
-
-    def _source_images(self, lens: Lens, goals: Sequence[Goal]) -> Sequence[float]:
-        """Return the diameter (pixels) of the image of the real source on each target; () if its size is simulated."""
-        if (size := real_size(self.scene.source)) is None:
-            return ()
-        centre = replace(self.heaviest, source=self.heaviest.source.central, weight=1.0)
-        return image_diameters(size, centre, lens, [goal.receiver for goal in goals])
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from bstcad.designs import folder as folders
 from bstcad.report import prescription, report
 from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks, text_checks
+from bstcad.verify.nominal import Nominal
 from tests.conftest import flat_pictures, quick_effort
 from tests.two_faces import CHANGES, bent, made_of, scene_of
 
@@ -113,7 +114,7 @@ def test_a_file_whose_front_is_flat_is_no_lens_of_two_nets(two, tmp_path):
     text = part21.read_lens(tmp_path / "lens.step")
     [failed] = [check for check in text_checks.lens_checks(text, two.made.lens) if not check.passed]
     assert failed.id == "control-points" and failed.name.endswith("of the front")
-    nominal = checks.Nominal(two.made.scene, two.made.lens, two.made.goals)
+    nominal = Nominal(two.made.scene, two.made.lens, two.made.goals)
     proof = checks.verify(tmp_path, nominal, effort=quick_effort())
     failed = {check.id: check.name for check in proof.checks if not check.passed}
     assert "front" in failed["form"] and proof.lens.shaped is None

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bstcad.designs.folder import Made
+from bstcad.designs.made import Made
 from bstcad.designs.pipeline import DesignOptions, Earlier, design
 from bstcad.manufacture.measured.cloud import load as load_cloud
 from bstcad.manufacture.measured.compensation import measured_form

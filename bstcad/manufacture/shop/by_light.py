@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from bstcad.designs.folder import Made
+from bstcad.designs.made import Made
 from bstcad.optics.surfaces.bspline import BSplineSurface, interpolating_net
 from bstcad.optics.trace.measure import tubes_picture
 

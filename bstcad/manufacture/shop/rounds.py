@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from bstcad.designs import folder as folders
-from bstcad.designs.folder import Made
+from bstcad.designs.made import Made
 from bstcad.figures.shop_figures import correction_figure
 from bstcad.manufacture.measured import compensation
 from bstcad.manufacture.measured.cloud import Cloud

@@ -35,7 +35,7 @@ from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import Target
-from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Nominal
+from bstcad.verify.nominal import DEFAULT_RRMSD_LIMIT, Nominal
 
 TRACED_SOURCE_POINTS = 64  # number of points that sample an extended source
 
