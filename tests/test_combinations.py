@@ -696,7 +696,7 @@ def test_each_light_is_right_inside_the_pixels(light, wall, picture):
     scene = scene_of(PLAIN | {"light": light, "wall": wall, "picture": picture}).changed(DENSE)
     made = pipeline.design(scene, options=pipeline.DesignOptions(compare_later=True))
     effort = Effort(512, accuracy=0.0, witness=False, cells=2)
-    [found] = measure_goals(made.lens.plain(), scene.channels(), made.goals, effort, ghost=None, draw=scene.draw)
+    [found] = measure_goals(made.lens.plain(), scene.channels(), made.goals, effort, ghost=None, sampler=scene.sampler)
     noise = 3 * math.hypot(found.half.standard_error, MAX_HALF_RATIO * found.standard_error)
     assert found.half.rrmsd <= MAX_HALF_RATIO * found.rrmsd + MAX_HALF + noise
 
@@ -754,10 +754,10 @@ def landed_by_snell(lens, source, receiver, grazing):
 
     At each point the face takes every slope up to 70 degrees at which no light leaves at more than `grazing`.
     """
-    number, law = lens.freeform[-1], lens.last_freeform.law
-    half = lens.last_freeform.outline.half_extent
+    number, law = lens.tailored_numbers[-1], lens.last_tailored.law
+    half = lens.last_tailored.outline.half_extent
     x, y = torch.meshgrid(*(torch.linspace(-h, h, 19, dtype=torch.float64) for h in half), indexing="ij")
-    inside = lens.last_freeform.outline.contains(x, y)
+    inside = lens.last_tailored.outline.contains(x, y)
     q_x, q_y, at = rays_to(source, lens, x=x, y=y, number=number)
     coming = source.rays_through(q_x, q_y, lens.entrance.z, 1.0)
     arriving = across(coming, lens.interfaces[:number]).alive & (source.irradiance(q_x, q_y, lens.entrance.z) > 0)
@@ -790,7 +790,7 @@ def landed_by_snell(lens, source, receiver, grazing):
         at, position=place, direction=turned[:, fine], status=torch.zeros(place.shape[1], dtype=torch.uint8),
         flux=torch.ones(place.shape[1], dtype=torch.float64), sense=sense, chart=HEIGHTS,
     )  # fmt: skip
-    landed = receiver.plane.land(across(few, lens.unbounded().interfaces[number + 1 :]))
+    landed = receiver.receiver.land(across(few, lens.unbounded().interfaces[number + 1 :]))
     column, row = receiver.pixels_of(landed.position[:, landed.alive])
     return column.floor().long(), row.floor().long()
 
@@ -816,15 +816,15 @@ def test_what_a_face_can_light_is_not_called_dark(number):
     channels = scene.with_source_scaled(0.0).channels()
     light = max(channels, key=lambda channel: channel.weight)
     lens, grazing = light.through(scene.flat_lens(pipeline.REACH_NET)), math.radians(85.0)
-    if scene.source.extent and not lens.last_freeform.law.reverses:
+    if scene.source.extent and not lens.last_tailored.law.reverses:
         grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.light, lens))
-    columns, rows = landed_by_snell(lens, light.source, goal.receiver, grazing)
-    there = (columns >= 0) & (columns < goal.receiver.columns) & (rows >= 0) & (rows < goal.receiver.rows)
-    lit = np.zeros(goal.receiver.shape, bool)
+    columns, rows = landed_by_snell(lens, light.source, goal.screen, grazing)
+    there = (columns >= 0) & (columns < goal.screen.columns) & (rows >= 0) & (rows < goal.screen.rows)
+    lit = np.zeros(goal.screen.shape, bool)
     lit[rows[there], columns[there]] = True
     called = np.ones_like(lit) if part is None else part
     assert lit.any() and not (lit & ~binary_dilation(called, iterations=3)).any()
-    if lens.last_freeform.law.reverses or scene.lens.front.is_tailored or scene.lens.front.free:
+    if lens.last_tailored.law.reverses or scene.lens.front.is_tailored or scene.lens.front.free:
         return  # the rays of one front, or of a mirror, do not land densely on all that can be lit
     whole = binary_dilation(binary_closing(np.pad(lit, 6), iterations=2), iterations=3)[6:-6, 6:-6]
     few = 0.01 if chosen["elements"] == "none" else 0.05  # a window shifts grazing light a little further

@@ -45,7 +45,7 @@ def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
     front, back = _sags(lens, x, y)
     thickness, (front_vertex, back_vertex) = back - front, _sags(lens, *torch.zeros(2, 1, dtype=torch.float64))
     edge, flat = thickness[: 4 * grid], (x.numpy(), y.numpy())
-    of_front = _face_figures(lens.front_net, survey_front(lens), (*flat, front)) if lens.shapes("front") else {}
+    of_front = _face_figures(lens.front_net, survey_front(lens), (*flat, front)) if lens.is_tailored("front") else {}
     return {
         "centre_thickness": float((back_vertex - front_vertex)[0]),
         "edge_thickness_min": float(edge.min()),

@@ -267,7 +267,7 @@ def write_design(design: Made, lights: Sequence[Light], folder: Path) -> None:
         **_numbers(front),
         **({DISTANCES: lens.back_net.heights.cpu().double().numpy()} if isinstance(lens.back, RadialSurface) else {}),
         **({"front_control_points": front.control_points()} if is_net(front) else {}),
-        **(dict(zip(FRONT_KNOTS, map(knots, lens.front_net.shape), strict=True)) if lens.shapes("front") else {}),
+        **(dict(zip(FRONT_KNOTS, map(knots, lens.front_net.shape), strict=True)) if lens.is_tailored("front") else {}),
         **{numbered("target", k): goal.picture for k, goal in enumerate(design.goals)},
         **{numbered("reachable", k): part.astype(np.uint8) for k, part in parts if part is not None},
         **{numbered("irradiance", k): light.picture for k, light in enumerate(lights)},

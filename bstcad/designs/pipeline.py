@@ -210,7 +210,7 @@ def task_of(scene: Scene, goals: Sequence[Goal], settings: Settings, edge: Edge 
     light = scene.with_source_scaled(0.0).channels()
     sizes = stage2.SOURCE_SIZES if scene.source.extent and settings.method != "integration" else ()
     scaled = [scene.with_source_scaled(share) for share, _ in sizes]
-    sources = tuple(ExtendedSource(each.light, light, each.draw) for each in scaled if each.draw)
+    sources = tuple(ExtendedSource(each.light, light, each.sampler) for each in scaled if each.sampler)
     return Task(
         light, tuple(goals), settings, min_thickness=scene.lens.min_thickness, bounds=scene.lens.bounds,
         free=scene.lens.front.free, rim_sags=scene.rim_sags, front_sides=scene.lens.front_net,
@@ -227,7 +227,7 @@ def with_solution(scene: Scene, task: Task) -> Task:
     `task.progress` reports the angles and limits of the faces.  SceneError if the faces cannot make the pictures.
     """
     lens = scene.flat_lens(REACH_NET)
-    if not lens.shapes_two_faces or not task.several:
+    if not lens.has_two_tailored_faces or not task.several:
         return task
     demand = find_demand(task, task.heaviest.through(lens))
     sentences = tuple(demand.sentences(scene.lens.back.z - scene.lens.front.z))
@@ -385,7 +385,7 @@ def _stage1(
         stage, lens = two_faces.steps, lens.to(like.dtype, "cpu")
     steps = stage(task, lens, state)
     last = driver.run(steps, task, lambda state: DesignState(driver.record, state), lambda: driver.reason_to_interrupt)
-    lens = replace(last.lens, behind=lens.behind, shaped=lens.shaped).to(like.dtype, like.device)
+    lens = replace(last.lens, behind=lens.behind, tailored=lens.tailored).to(like.dtype, like.device)
     check_front(lens, scene)
     bounds = active_bounds(lens, task.bounds, task.min_thickness)
     if bounds is None:
@@ -394,7 +394,7 @@ def _stage1(
     driver.end(name, rrmsd)
     if bounds is not None:
         driver.hooks.progress(BOUNDS_STAGE, 0, 1, "")
-        if lens.shapes("front"):  # shifted before stage 2, which corrects the light but does not shift the back
+        if lens.is_tailored("front"):  # shifted before stage 2, which corrects the light but does not shift the back
             lens = place_back(lens, lens.back.z, task.min_thickness, bounds)
         lens = enforce_bounds(lens, bounds)
         check_thickness(lens, scene)
@@ -404,7 +404,7 @@ def _stage1(
     if compare and not driver.reason_to_end:
         precision = compare_precisions(task, lens)
         driver.end(COMPARISON_STAGE)
-    screen, mapping = task.goals[0].receiver, last.mapping
+    screen, mapping = task.goals[0].screen, last.mapping
     assert mapping is not None, "each step of stage 1 has its map"
     if last.face_points is None:
         sent = slope_map.map_from_entrance(mapping, lens, screen)
@@ -472,7 +472,7 @@ def _corrected(task: Task, lens: Lens) -> Lens:
     if task.edge is not None:
         lens = without_reflection(lens, task.edge)
     bounds = active_bounds(lens, task.bounds, task.min_thickness)
-    if not lens.shapes("front"):  # stage 2 may bend the back freely where no light falls
+    if not lens.is_tailored("front"):  # stage 2 may bend the back freely where no light falls
         lens = place_back(lens, lens.back.z, task.min_thickness, bounds)
     return lens if bounds is None else enforce_bounds(lens, bounds)
 

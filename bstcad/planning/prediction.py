@@ -47,8 +47,7 @@ MIN_PILOT_POINTS = 65  # minimum control points per side of a pilot, unless its 
 MIN_PILOT_TUBES = 16  # minimum tubes per side of a pilot
 PILOT_CELLS = (16, 256)  # minimum and maximum cells per side of the transport of a pilot
 PILOT_EFFORT = Effort(rays=2048, accuracy=0.02, witness=False, cells=2)  # effort of the measurement of a pilot's RRMSDs
-SEARCH_STAGES = ("stage 2", "stage 3")  # beginnings of the names of stages that use the minimiser
-COARSE_ROUND_TEXT = " pixels, "  # text in the names of rounds with few pixels, whose sizes do not depend on the scene
+SEARCH_STAGES = ("stage 2", "stage 3")  # stages that use the minimiser
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class Seconds:
 
     first: float  # stage 1
     search: float  # stage 2 or 3
-    rest: float  # start, writing, verification, report; for a pilot: loading, and rounds with COARSE_ROUND_TEXT
+    rest: float  # start, writing, verification, report; for a pilot: loading, and coarse rounds
 
     @property
     def total(self) -> float:
@@ -90,16 +89,16 @@ def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
     if compilations.buffer:  # the first design after an installation waits for the compiler; time another one
         finished = make_design()
     light, finer = small.channels(), factor > 1
-    lights = measure_goals(finished.lens, light, finished.goals, PILOT_EFFORT, ghost=None, draw=small.draw)
+    lights = measure_goals(finished.lens, light, finished.goals, PILOT_EFFORT, ghost=None, sampler=small.sampler)
     rrmsd = max(each.rrmsd for each in lights)
     ratios = [each.half.rrmsd / each.rrmsd for each in lights if each.half is not None and each.rrmsd > 0]
-    sides = [max(goal.receiver.shape) for goal in finished.goals]
+    sides = [max(goal.screen.shape) for goal in finished.goals]
     pairs = zip(scene.single_target_scenes(), small.single_target_scenes(), strict=True)
     blurs = [blur_rrmsd(one, finished.lens) - blur_rrmsd(few, finished.lens) for one, few in pairs] if finer else [0.0]
     times = dict.fromkeys(("first", "search", "rest"), 0.0)
     for stage in finished.making.stages:
-        part = "search" if stage.name.startswith(SEARCH_STAGES) else "first"
-        times["rest" if stage.name == "loading" or COARSE_ROUND_TEXT in stage.name else part] += stage.seconds
+        part = "search" if stage.stage in SEARCH_STAGES else "first"
+        times["rest" if stage.name == "loading" or stage.is_coarse else part] += stage.seconds
     transport: Mapping[str, Any] = finished.making.transport or {}
     steep = Steepness(transport["steep_share"], transport["steepest_deg"])
     lost = max(map(detail, (goal.picture for goal in scene.goals), sides)) if finer else 0.0

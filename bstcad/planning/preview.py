@@ -174,11 +174,11 @@ def _lit_fraction(scene: Scene, lens: Lens) -> float:
 
 @torch.no_grad()
 def _picture(scene: Scene, lens: Lens, goal: Goal) -> np.ndarray:
-    n = round(TUBES_PER_PIXEL * max(goal.receiver.shape))
+    n = round(TUBES_PER_PIXEL * max(goal.screen.shape))
     if (
-        scene.source.extent is None or scene.draw is None
+        scene.source.extent is None or scene.sampler is None
     ):  # a point source; otherwise the picture is blurred with images of the source
-        return tubes_picture(lens, scene.channels(), goal.receiver, n).numpy()
-    source = ExtendedSource(scene.light, scene.with_source_scaled(0.0).channels(), scene.draw)
+        return tubes_picture(lens, scene.channels(), goal.screen, n).numpy()
+    source = ExtendedSource(scene.light, scene.with_source_scaled(0.0).channels(), scene.sampler)
     merit = Merit.of(source.centre, lens, n, [goal], overshoot=0.0).with_blur(source, lens)
     return merit.picture(0, *merit.landing(lens).on_goals)[0].cpu().numpy().clip(min=0.0)

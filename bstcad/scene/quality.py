@@ -29,7 +29,7 @@ BASELINES = {  # method without limits of time, accuracy or shape: (name in mess
     "integration": ("point-by-point integration", "tailoring.method"),
 }
 VERIFICATION_POINTS = 32  # points of an extended source in a verification; the RRMSD uses random points instead
-VERIFICATION_DRAW = 1 << 12  # number of the set of these points; each further spectral line has the next number
+VERIFICATION_SET = 1 << 12  # number of the set of these points; each further spectral line has the next number
 
 
 class Tailoring(Record):
@@ -153,7 +153,10 @@ FINISH_KEYS = ("layer_height", "smoothing_length", "roughness", "roughness_lengt
 GRADE_NAMES = (  # grades of manufacture, which manufacture/tolerance/grades.py defines
     "moulded", "diamond-turned", "precise", "milled-polished", "milled-sanded", "resin-printed", "resin-printed-coated",
 )  # fmt: skip
-TWO_FACE_ERRORS = ("front.", "lens.wedge")  # prefixes of errors that are zero unless a [[tolerance]] names them
+TWO_FACE_ERRORS = (  # errors of one face relative to the other, which are zero unless a [[tolerance]] names them
+    "front.form", "front.decentre", "front.decentre_x", "front.decentre_y",
+    "lens.wedge", "lens.wedge_x", "lens.wedge_y",
+)  # fmt: skip
 NONE = "none"  # grade of an error that is always zero
 
 

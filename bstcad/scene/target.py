@@ -167,7 +167,7 @@ class Target(Record):
     @property
     def unit(self) -> str:
         """Unit of x and y, which the receiver states."""
-        return self.screen.plane.unit
+        return self.screen.receiver.unit
 
     @property
     def columns_rows(self) -> tuple[int, int]:
@@ -228,14 +228,14 @@ class Target(Record):
 
     def clearance(self, lens: LensBlank, highest: float) -> float:
         """Return the gap (mm) from a lens that ends at z = highest (mm) to the target's receiver; < 0: they overlap."""
-        return self.screen.plane.clearance(lens.outline, highest)
+        return self.screen.receiver.clearance(lens.outline, highest)
 
     def grazed(self, lens: LensBlank) -> Iterator[str]:
         """Yield a warning about a tilted target that is nearly edge-on, seen from the lens."""
-        plane, vertex = self.screen.plane, (0.0, 0.0, lens.back.z)
-        if plane.tilt is None or not isinstance(plane, PlaneReceiver):
+        receiver, vertex = self.screen.receiver, (0.0, 0.0, lens.back.z)
+        if receiver.tilt is None or not isinstance(receiver, PlaneReceiver):
             return
-        sine = -plane.height(vertex) / math.dist(plane.middle, vertex)  # the plane misses the lens: not zero
+        sine = -receiver.height(vertex) / math.dist(receiver.middle, vertex)  # the plane misses the lens: not zero
         if sine < math.sin(math.radians(GRAZING_VIEW)):
             angle = math.degrees(math.asin(max(sine, -1.0)))
             yield (
@@ -245,10 +245,10 @@ class Target(Record):
 
     def unfaced(self, lens: LensBlank) -> Iterator[str]:
         """Yield complaints about a target that does not face the lens, cuts the lens, or reaches down to the lens."""
-        screen, plane, back, optic = self.screen, self.screen.plane, lens.back.z, lens.optic
-        if plane.is_level:
+        screen, receiver, back, optic = self.screen, self.screen.receiver, lens.back.z, lens.optic
+        if receiver.is_level:
             return
-        tilted = plane if plane.tilt is not None and isinstance(plane, PlaneReceiver) else None
+        tilted = receiver if receiver.tilt is not None and isinstance(receiver, PlaneReceiver) else None
         key, less = ("target.tilt", "tilt it less, or ") if tilted else ("target.z", "")
         if tilted and not is_faced(tilted, (0.0, 0.0, back)):
             yield f"{key}: seen from the {optic}, the target is edge-on or turned away; tilt it less, or move it"
@@ -256,7 +256,7 @@ class Target(Record):
             yield f"{key}: the plane of the target cuts the {optic}; {less}move the target further along +z"
         if tilted is None:
             return
-        lowest = min(plane.point(x, y)[2] for x in screen.x for y in screen.y)
+        lowest = min(receiver.point(x, y)[2] for x in screen.x for y in screen.y)
         if not lowest > back:
             edge = f"is at z = {lowest:.6g}, not behind the back of the {optic} at z = {back:g}"
             yield f"{key}: an edge of the target {edge}; tilt it less, make it smaller, or move it along +z"
@@ -428,7 +428,7 @@ def coplanar_complaints(targets: tuple[Target, ...]) -> Iterator[str]:
 def _in_one_plane(one: Screen, other: Screen) -> bool:
     """Return True if the corners of each screen are in the other's plane; receivers other than planes must be equal."""
     heights = _corner_heights(one, other) + _corner_heights(other, one)
-    return max(map(abs, heights)) < PLANE_DISTANCE if heights else one.plane == other.plane
+    return max(map(abs, heights)) < PLANE_DISTANCE if heights else one.receiver == other.receiver
 
 
 def _cuts(screen: Screen, other: Screen) -> bool:
@@ -439,10 +439,10 @@ def _cuts(screen: Screen, other: Screen) -> bool:
 
 def _corner_heights(screen: Screen, other: Screen) -> list[float]:
     """Return the heights (mm) of the screen's corners above the other's plane; none if a receiver is not a plane."""
-    plane, own = other.plane, screen.plane
-    if not (isinstance(plane, PlaneReceiver) and isinstance(own, PlaneReceiver)):
+    receiver, own = other.receiver, screen.receiver
+    if not (isinstance(receiver, PlaneReceiver) and isinstance(own, PlaneReceiver)):
         return []
-    return [plane.height(own.point(x, y)) for x in screen.x for y in screen.y]
+    return [receiver.height(own.point(x, y)) for x in screen.x for y in screen.y]
 
 
 def kind(given: Any) -> str:

@@ -116,8 +116,8 @@ def _demand(task: Task, solution: float, lens: Lens) -> tuple[Demand, LightBehin
         light = replace(light, picture=light.picture / light.picture.sum())
     angle = np.degrees(np.arccos(light.direction[2].clip(-1, 1)))[lit_corners(light.picture)]
     crossed = light.crossed_fraction(lens.back)
-    near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
-    served = light_behind.without_crossings(light, near.receiver, lens.back, TRIAL_CELLS)
+    near = min(task.goals, key=lambda goal: goal.screen.receiver.throw(0.0))
+    served = light_behind.without_crossings(light, near.screen, lens.back, TRIAL_CELLS)
     outside = served.fraction_outside(lens.back, lens.apertures[1].scaled(1 + 1e-3).contains)
     limit, largest, rms = math.degrees(largest_deflection(lens.index)), float(angle.max()), np.sqrt((angle**2).mean())
     return Demand(solution, largest, float(rms), crossed, outside=outside, deflection=math.nan, limit=limit), served
@@ -126,7 +126,7 @@ def _demand(task: Task, solution: float, lens: Lens) -> tuple[Demand, LightBehin
 @torch.no_grad()
 def _largest_deflection(task: Task, lens: Lens, light: LightBehind) -> float:
     """Return the largest angle (degrees) between the directions of a ray before the front and in the glass."""
-    front, source = lens.shaping("front"), task.heaviest.source
+    front, source = lens.with_tailored("front"), task.heaviest.source
     window, b = lit_window(source, front), light.intersect(lens.back)
     grid = square_grid(source, front, window, TRIAL_CELLS)
     slopes = front_map(front, grid, window, light.picture, b=b, q=None, solver=Solver())

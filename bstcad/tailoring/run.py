@@ -40,7 +40,7 @@ class NetParameters:
 class Parameters:
     """Parameters that tailoring changes; together with a blank they determine the lens."""
 
-    nets: tuple[NetParameters, ...]  # freeform interfaces, in the order of Lens.freeform
+    nets: tuple[NetParameters, ...]  # freeform interfaces, in the order of Lens.tailored_numbers
     front: dict[str, float | Tensor]  # values by name, such as curvature (1/mm); empty for a plane or a net
     back: float  # z of the plane of the back (mm); tailoring moves it even if the heights are fixed
 
@@ -150,7 +150,7 @@ class Task:
     def sides(self, lens: Lens, sides: Sides) -> tuple[Sides, ...]:
         """Return the control points per side of each net of a lens whose back has `sides`."""
         front = self.front_sides(sides)
-        return tuple(sides if k == lens.number_of("back") or front is None else front for k in lens.freeform)
+        return tuple(sides if k == lens.number_of("back") or front is None else front for k in lens.tailored_numbers)
 
     @property
     def at_full_size(self) -> Task:
@@ -164,7 +164,7 @@ class Task:
 
     def with_imaged_receivers(self, lens: Lens) -> Task:
         """Return the task with its receivers imaged through the surfaces behind the last net, for stage 1."""
-        goals = (replace(goal, receiver=image_screen(lens, goal.receiver)) for goal in self.goals)
+        goals = (replace(goal, screen=image_screen(lens, goal.screen)) for goal in self.goals)
         return replace(self, goals=tuple(goals))
 
     def rrmsd(self, lens: Lens, effort: Effort | None = None) -> float:
@@ -179,8 +179,8 @@ class Task:
             effort = FINE_EFFORT
         effort = effort or self.stage_effort()
         sources = () if self.sampled_sources else self.extended_sources  # centre alone before stage 3
-        draw = sources[-1].draw if sources else None  # samples the task's last source
-        values = rrmsds_by_rays(lens.plain(), self.channels, self.goals, effort, draw=draw)
+        sampler = sources[-1].sampler if sources else None  # samples the task's last source
+        values = rrmsds_by_rays(lens.plain(), self.channels, self.goals, effort, sampler=sampler)
         return math.nan if any(map(math.isnan, values)) else max(values)
 
     def stage_effort(self, factor: float = 1.0) -> Effort:
@@ -206,7 +206,7 @@ class Task:
 
     def flux_on_target(self, lens: Lens) -> float:
         """Return the light on the first target as a fraction of the light that meets the lens."""
-        return measure_goal(lens.plain(), self.channels, self.goals[0], FLUX_EFFORT, ghost=None, draw=None).used
+        return measure_goal(lens.plain(), self.channels, self.goals[0], FLUX_EFFORT, ghost=None, sampler=None).used
 
 
 @dataclass(frozen=True)

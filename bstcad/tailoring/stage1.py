@@ -119,7 +119,7 @@ def is_poor_result(task: Task, lens: Lens, by_rays: float, state: SlopeRound) ->
     """
     goal = task.goals[0]
     few = resample(goal, pixels=max(as_pair(task.settings.levels[-1])))
-    if by_rays > RETRY_RRMSD and few.receiver.shape != goal.receiver.shape:
+    if by_rays > RETRY_RRMSD and few.screen.shape != goal.screen.shape:
         by_rays = replace(task, goals=(few,)).rrmsd(lens)
     return not by_rays <= RETRY_RRMSD or state.slopes.moved > RETRY_CHANGE  # NaN: no light on the target
 
@@ -193,7 +193,7 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
         side = min(3 * points, max(2 * points, settings.rays))  # many rays may leave through the sides
         counts = {"n": n, "side": side, "iterations": settings.transport_iterations}
         rays, aims, mapping = aimed_rays(task.heaviest.source, lens, goal, **counts)
-        lens = place_back(tailor_to_aim(lens, rays, aims, goal.receiver.plane), z, task.min_thickness, task.bounds)
+        lens = place_back(tailor_to_aim(lens, rays, aims, goal.screen.receiver), z, task.min_thickness, task.bounds)
     return lens, mapping
 
 
@@ -205,7 +205,7 @@ def aimed_rays(
     area = clear_window(source, lens)
     x, y = (t.to(lens.like) for t in sampling.grid(area, side))
     rays = source.rays_through(x, y, lens.entrance.z, area.area / side**2)
-    return rays, slope_map.aim_points(mapping, lens, goal.receiver, x=x, y=y), mapping
+    return rays, slope_map.aim_points(mapping, lens, goal.screen, x=x, y=y), mapping
 
 
 def shaped_front(
@@ -216,12 +216,12 @@ def shaped_front(
     free, rim_sags: parameters of the front and range of its sag, see `best_front`.  The back has the net of `lens`, and
     is fitted to each front: rays keep the aims P_i^t that they have with the front of `lens`.
     """
-    side, plane = 2 * max(lens.back_net.shape), goal.receiver.plane
+    side, receiver = 2 * max(lens.back_net.shape), goal.screen.receiver
     rays, aims, _ = aimed_rays(source, lens, goal, n=effort.cells, side=side, iterations=effort.iterations)
 
     def miss(front: Lens) -> float:
-        fitted = tailor_to_aim(front, rays, aims, plane=plane, repeats=effort.repeats)
-        return float(mean_square_miss(trace(rays, fitted, plane), aims))
+        fitted = tailor_to_aim(front, rays, aims, receiver=receiver, repeats=effort.repeats)
+        return float(mean_square_miss(trace(rays, fitted, receiver), aims))
 
     return lens.with_front(best_front(miss, lens, free, rim_sags).front)
 

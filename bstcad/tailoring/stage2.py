@@ -263,7 +263,7 @@ def _fine_round(task: Task, tubes: int, evaluations: int, is_last: bool) -> Tube
 
 def pixels_of(task: Task) -> float:
     """Return the pixels per side of the square with as many pixels as the largest target."""
-    return max(math.sqrt(math.prod(goal.receiver.shape)) for goal in task.goals)
+    return max(math.sqrt(math.prod(goal.screen.shape)) for goal in task.goals)
 
 
 def finest_cells(task: Task) -> int:
@@ -276,7 +276,7 @@ def finest_cells(task: Task) -> int:
     if task.merit is not None or task.preview:
         return 1
     wanted = math.log2(CELLS_PER_POINT * task.settings.side / pixels_of(task))
-    most = math.log2(MAX_CELLS / max(math.prod(goal.receiver.shape) for goal in task.goals)) / 2
+    most = math.log2(MAX_CELLS / max(math.prod(goal.screen.shape) for goal in task.goals)) / 2
     most = min(most, 1.0) if task.several else most
     return 1 << max(0, math.floor(min(max(wanted + CELL_MARGIN, 1.0), most)))
 
@@ -300,7 +300,7 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
     If the map has not settled, as for a lamp or a wall close to the lens, light has to move far.  This needs many
     evaluations, each in a thirtieth of the time of a full one; the tubes need not resolve the full net's cells.
     """
-    limit = min(max(task.goals[0].receiver.shape) - 1, task.settings.side // 2)  # pixels that the net can resolve
+    limit = min(max(task.goals[0].screen.shape) - 1, task.settings.side // 2)  # pixels that the net can resolve
     rounds = [TubeRound(task, tubes, count, pixels=pixels) for pixels, tubes, count in COARSE_ROUNDS if pixels <= limit]
     if not rounds or task.merit is not None or task.several or task.preview or not task.settings.stage2_iterations:
         return ()  # several goals: two nets would distort between so few tubes
@@ -433,7 +433,7 @@ def image_widths(task: Task, lens: Lens) -> list[float]:
     if task.extended_sources:
         source = replace(task.extended_sources[-1].source, wavelength=light.source.wavelength)
         few = channels_of(source, lambda _: light.index, SECOND_MOMENT_POINTS)  # with the second moments of the source
-    return [images(few, lens, goal.receiver, IMAGE_POSITIONS).width() for goal in task.goals]
+    return [images(few, lens, goal.screen, IMAGE_POSITIONS).width() for goal in task.goals]
 
 
 @dataclass(frozen=True)
@@ -478,11 +478,11 @@ def variables_of(task: Task, lens: Lens, pixels: int | None = None, level: float
     if pixels is not None:
         lens = lens.with_nets(net.refined(coarser(net.shape, pixels + 1)) for net in nets)
     source, lens = task.heaviest.source, task.heaviest.through(lens)
-    weights = [local_weight(source, lens, task.goals, number) for number in lens.freeform]
+    weights = [local_weight(source, lens, task.goals, number) for number in lens.tailored_numbers]
     if pixels is not None:
         return NetVariables(tuple(map(CoarseVariable.of, nets, lens.nets, weights)))
     blocks = tuple(SobolevVariable.of(net, weight, level=level) for net, weight in zip(nets, weights, strict=True))
-    if lens.shapes_two_faces and len(task.goals) > 1:
+    if lens.has_two_tailored_faces and len(task.goals) > 1:
         return NetVariables(blocks, *along_light(source, lens, task.goals))
     return NetVariables(blocks)
 
@@ -551,7 +551,7 @@ def stage3_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
         replace(task, channels=channels, sampled_sources=(), extended_sources=(source,))
         for channels, source in zip(task.sampled_sources, task.extended_sources, strict=True)
     ]
-    settings, screens = task.settings, [goal.receiver for goal in task.goals]
+    settings, screens = task.settings, [goal.screen for goal in task.goals]
     if task.preview:
         source = task.extended_sources[-1]
         return (TubeRound(lights[-1], settings.rays, settings.stage2_iterations, "stage 3", source=source),)

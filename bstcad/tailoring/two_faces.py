@@ -65,8 +65,8 @@ def steps(task: Task, lens: Lens, state: stage1.SlopeRound | None = None) -> Ste
     only the last net (stage1.py).
     """
     lens = task.heaviest.through(lens)
-    if not (lens.shapes_two_faces and task.several):
-        alone = replace(task.refined(lens, task.settings.levels[-1]), shaped=lens.freeform[-1:])
+    if not (lens.has_two_tailored_faces and task.several):
+        alone = replace(task.refined(lens, task.settings.levels[-1]), tailored=lens.tailored_numbers[-1:])
         yield from stage1.steps(task, alone, state)
         return
     for last in follow_rays(task, lens, state if isinstance(state, FrontRound) else None):
@@ -79,8 +79,8 @@ def follow_rays(task: Task, lens: Lens, state: FrontRound | None) -> Steps:
     """Yield a step per round: coarse rounds until the map has settled, then FINE_PAIR_ROUNDS fine ones."""
     task = task.with_imaged_receivers(lens)
     settings, z = task.settings, lens.back.z
-    near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
-    light = without_crossings(light_for_task(task), near.receiver, lens.back, settings.transport_grid)
+    near = min(task.goals, key=lambda goal: goal.screen.receiver.throw(0.0))
+    light = without_crossings(light_for_task(task), near.screen, lens.back, settings.transport_grid)
     slopes, b, done = (None, None, 0) if state is None else (state.slopes, state.back, state.round)
     lens = lens if state is None else state.lens.apply_to(lens)
     number = min(done, settings.rounds - 1)
@@ -106,9 +106,9 @@ def _round(
     task: Task, lens: Lens, light: LightBehind, q: Points | None, *, number: int, cells: int, fit: Fit
 ) -> tuple[Lens, SlopeMap, Points]:
     """Run a round; return the lens, the map of its front, and b(t) for the pixel corners of the first target."""
-    source, front = task.heaviest.source, lens.shaping("front")
+    source, front = task.heaviest.source, lens.with_tailored("front")
     window, met = slope_map.lit_window(source, front), light.intersect(lens.back)
-    b_x, b_y = light.sampled_at(task.goals[0].receiver, met[:2])
+    b_x, b_y = light.sampled_at(task.goals[0].screen, met[:2])
 
     def progress(s: TransportStep) -> None:
         task.progress("stage 1", number, task.settings.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
@@ -121,7 +121,7 @@ def _round(
     lens = lens.with_front(slope_map.fit_to_map(front, slopes, grid, fit).front)
     window = slope_map.lit_window(source, lens)
     grid = slope_map.face_grid(source, lens, window, back_side)
-    law = lens.last_freeform.law
+    law = lens.last_tailored.law
     out = light.directions_at(lens.back, *sampling.grid(window, grid.shape))
     needed = limit_refraction(grid.at_face, slopes_towards(grid.at_face, out, law), law)
     x, y = (p.reshape(-1) for p in sampling.grid(window, grid.shape))
@@ -157,7 +157,7 @@ def front_map(
 def _slopes_at(rays: Rays, aims: Tensor, lens: Lens) -> Slopes:
     """Return the slopes of the front that send rays to points (3, …) mm in space."""
     path = aims - _in_space(rays)
-    return slopes_towards(rays, path / torch.sqrt((path * path).sum(0)), lens.last_freeform.law)
+    return slopes_towards(rays, path / torch.sqrt((path * path).sum(0)), lens.last_tailored.law)
 
 
 def _in_space(rays: Rays) -> Tensor:

@@ -171,7 +171,7 @@ def verify(
     )
     proof = Proof(checks, made_lens, lights, shape, stability=stability, wavefront=wavefront, values=values)
     goal = nominal.goals[proof.worst]
-    blurred = blur(nominal.channels, made_lens, goal.receiver, goal.picture)
+    blurred = blur(nominal.channels, made_lens, goal.screen, goal.picture)
     return replace(proof, blur=blurred, lines=lines[proof.worst], at_bounds=at_bounds or None)
 
 
@@ -203,7 +203,7 @@ def _measure_targets(lens: Lens, nominal: Nominal, effort: Effort, on_light: OnL
     lights = nominal.lights(lens, nominal.goals, effort)
     for number, (goal, light) in enumerate(zip(nominal.goals, lights, strict=True)):
         if not light.rrmsd >= 0:
-            if nominal.scene.draw is not None and nominal.scene.draw.largest_side is not None:
+            if nominal.scene.sampler is not None and nominal.scene.sampler.largest_side is not None:
                 few = f"so few of the rays fall on {goal.words} that an eighth of them may give no picture"
                 raise SceneError(f"source.rays: {few}; give a file with more rays, or widen lens or target")
             name = "lens.step" if nominal.scene.mount is None else "part.step"
@@ -216,8 +216,8 @@ def _measure_targets(lens: Lens, nominal: Nominal, effort: Effort, on_light: OnL
 
 def _with_design_facts(lens: Lens, designed: Lens) -> Lens:
     """Return the re-read lens with data that no file states: elements around it, and which of two nets are tailored."""
-    shaped = designed.shaped if lens.front.is_net else None
-    return replace(lens, before=designed.before, behind=designed.behind, shaped=shaped)
+    shaped = designed.tailored if lens.front.is_net else None
+    return replace(lens, before=designed.before, behind=designed.behind, tailored=shaped)
 
 
 def _mounted_lens(read: Future[Lens], bare: Lens, nominal: Nominal, path: Path) -> tuple[Lens, list[Check], str]:
@@ -260,7 +260,7 @@ def _stability(
     lens: Lens, nominal: Nominal, lights: Sequence[Light], shape: Mapping[str, float | None]
 ) -> tuple[dict[str, float | int | None], list[Check]]:
     """Return figures of stability (record.Contents), and checks of total internal reflection and of finite values."""
-    margin = margins(nominal.channels, lens, nominal.goals[0].receiver, nominal.scene.tailoring.seed + VERIFY_SEED)
+    margin = margins(nominal.channels, lens, nominal.goals[0].screen, nominal.scene.tailoring.seed + VERIFY_SEED)
     keys = (f"{face}radius_min_{kind}" for face in ("", "front_") for kind in ("concave", "convex"))
     radii = [radius for key in keys if (radius := shape.get(key))]
     non_finite = margin.non_finite + sum(int((~np.isfinite(light.picture)).sum()) for light in lights)
@@ -317,8 +317,8 @@ def _ripple_rrmsd(lens: Lens, nominal: Nominal) -> dict[str, float]:
     """Return the RRMSD due to the ripple of the back alone, and of a tailored front alone, by keys of Proof.shape."""
     light = nominal.heaviest
     channel = replace(light, source=light.source.central, weight=1.0)
-    faces: dict[Face, str] = {"back": "", "front": "front_"} if lens.shapes("front") else {"back": ""}
-    screen = nominal.goals[0].receiver
+    faces: dict[Face, str] = {"back": "", "front": "front_"} if lens.is_tailored("front") else {"back": ""}
+    screen = nominal.goals[0].screen
     return {f"{key}ripple_rrmsd": rrmsd_of_ripple(channel, lens, screen, face) for face, key in faces.items()}
 
 
@@ -334,7 +334,9 @@ def bound_checks(
     found: dict[str, list[tuple[float, Extreme, str]]] = {}
     radius, degrees, kind = asked.tool_radius, asked.max_slope, "convex" if asked.mould else "concave"
     if radius is not None or degrees is not None:
-        surveys = [(survey, "")] * lens.shapes("back") + [(survey_front, " of the front")] * lens.shapes("front")
+        surveys = [(survey, "")] * lens.is_tailored("back") + [(survey_front, " of the front")] * lens.is_tailored(
+            "front"
+        )
         for surveyed, of in surveys:
             bending = surveyed(lens, **{kind: radius}, slope=degrees)
             if radius is not None:

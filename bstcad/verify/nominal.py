@@ -56,12 +56,12 @@ class Nominal:
     def lights(self, lens: Lens, goals: Sequence[Goal], effort: Effort) -> list[Light]:
         """Return the light of a lens on each target, by the same rays."""
         images = self._source_images(lens, goals) if effort.cells > 1 else ()
-        ghost, draw = self.scene.ghost, self.scene.draw
-        return measure_goals(lens, self.channels, goals, effort, ghost=ghost, draw=draw, images=images)
+        ghost, sampler = self.scene.ghost, self.scene.sampler
+        return measure_goals(lens, self.channels, goals, effort, ghost=ghost, sampler=sampler, images=images)
 
     def _source_images(self, lens: Lens, goals: Sequence[Goal]) -> Sequence[float]:
         """Return the diameter (pixels) of the image of the real source on each target; () if its size is simulated."""
         if (size := real_size(self.scene.source)) is None:
             return ()
         centre = replace(self.heaviest, source=self.heaviest.source.central, weight=1.0)
-        return image_diameters(size, centre, lens, [goal.receiver for goal in goals])
+        return image_diameters(size, centre, lens, [goal.screen for goal in goals])

@@ -40,7 +40,7 @@ def task_of(scene):
     light, least = scene.with_source_scaled(0.0).channels(), scene.lens.min_thickness
     task = Task(
         light, scene.goals, settings, least, sampled_sources=tuple(each.channels() for each in scaled),
-        extended_sources=tuple(ExtendedSource(each.source, light, each.draw) for each in scaled),
+        extended_sources=tuple(ExtendedSource(each.source, light, each.sampler) for each in scaled),
     )  # fmt: skip
     return task, scene.flat_lens(settings.levels[0])
 
@@ -52,7 +52,7 @@ def driven(task, steps):
 def judge(scene, lens):
     """(RRMSD, its standard error) by points of the source that nobody tailored with."""
     target = scene.target
-    light = measure(lens, scene.verification_channels(), target.screen, target.irradiance(), draw=scene.draw)
+    light = measure(lens, scene.verification_channels(), target.screen, target.irradiance(), sampler=scene.sampler)
     return light.rrmsd, light.standard_error
 
 
@@ -63,7 +63,7 @@ def feedback(task, lens, power, seconds):
     few = replace(task.settings, stage2_iterations=ROUND)
     while time.process_time() - began < seconds:
         tubes = round(2 * side_factor(whole.channels) * task.settings.rays)
-        made = tubes_picture(lens, whole.channels, goal.receiver, tubes)
+        made = tubes_picture(lens, whole.channels, goal.screen, tubes)
         made = made.numpy() * (wanted.sum() / float(made.sum()))
         target = target * np.clip(wanted / np.maximum(made, 1e-6 * wanted.max()), 0.2, 5.0) ** power
         target = target / target.sum()

@@ -23,7 +23,7 @@ from bstcad.scene.blank import Back, LensBlank
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.fronts import PlaneFront, SphereFront
 from bstcad.scene.lamp import Point
-from bstcad.scene.mount import LENS_COLOUR, MIRROR_COLOUR, Box, Part, Round
+from bstcad.scene.mount import LENS_COLOUR, MIRROR_COLOUR, Box, CircleRim, Part
 from bstcad.scene.picture import Picture
 from bstcad.scene.quality import PRESETS, VERIFICATION_POINTS, Tailoring, coarse_to_fine
 from bstcad.scene.scene import Scene, load
@@ -437,8 +437,8 @@ def test_levels_grow_to_the_net_asked_for():
 def test_a_target_that_is_tilted_by_nothing_is_level():
     level, tilted = load(THU), load(THU, {"target.tilt": "[0, 0]"})
     assert level == tilted and level.toml() == tilted.toml() and "tilt" not in level.toml()
-    assert level.target.screen.plane == LevelPlane(1000.0)
-    plane = load(THU, {"target.tilt": "[0, 40.5]"}).target.screen.plane
+    assert level.target.screen.receiver == LevelPlane(1000.0)
+    plane = load(THU, {"target.tilt": "[0, 40.5]"}).target.screen.receiver
     assert plane == TiltedPlane((200.0, 200.0, 1000.0), (0.0, 40.5))
 
 
@@ -450,7 +450,7 @@ def test_a_tilted_plane_passes_the_lens_by_so_much(outline, tilt):
     scene = scene.changed({"lens.outline": outline})
     turns = np.linspace(0.0, 2 * np.pi, 3601)
     rim = (12.0 * np.cos(turns), 12.0 * np.sin(turns)) if outline.is_round else outline.rim_points()
-    highest = max(scene.target.screen.plane.height((x, y, 25.0)) for x, y in zip(*rim, strict=True))
+    highest = max(scene.target.screen.receiver.height((x, y, 25.0)) for x, y in zip(*rim, strict=True))
     room, key = scene.clearance(25.0)
     assert room == pytest.approx(-highest, rel=1e-5) and key == "target.z"
 
@@ -471,7 +471,7 @@ def test_a_part_is_of_the_lens_s_material_unless_the_scene_says_another(path, ch
 
 
 @pytest.mark.parametrize("outline", [
-    Round(shape="circle", diameter=7.0),
+    CircleRim(shape="circle", diameter=7.0),
     Box(shape="rectangle", width=8.0, height=6.0),
     Box(shape="rectangle", width=8.0, height=6.0, corner_radius=1.5),
 ])  # fmt: skip

@@ -42,7 +42,7 @@ def near():
 def rrmsd(made):
     """RRMSD by rays of its own."""
     [goal] = made.goals
-    return measure(made.lens, made.scene.channels(), goal.receiver, goal.picture, Effort(512, witness=False)).rrmsd
+    return measure(made.lens, made.scene.channels(), goal.screen, goal.picture, Effort(512, witness=False)).rrmsd
 
 
 def names(made):

@@ -12,7 +12,7 @@ import torch
 from bstcad.designs import pipeline
 from bstcad.designs.pipeline import design
 from bstcad.optics.trace.measure import rrmsd_by_tubes
-from bstcad.scene.quality import VERIFICATION_DRAW
+from bstcad.scene.quality import VERIFICATION_SET
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
 from bstcad.tailoring.source_image import ExtendedSource
@@ -79,7 +79,7 @@ def test_a_round_for_several_pictures_ends_once_it_fits_its_tubes_alone(monkeypa
 
 def judged(scene, lens):
     """RRMSD with the real source, by points that no tailoring knows."""
-    return rrmsd_by_tubes(lens, scene.channels(64, VERIFICATION_DRAW), scene.goals[0], 34)
+    return rrmsd_by_tubes(lens, scene.channels(64, VERIFICATION_SET), scene.goals[0], 34)
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,7 @@ def task_of(scene):
     scaled = [scene.with_source_scaled(share) for share, _ in stage2.SOURCE_SIZES]
     return pipeline.Task(
         light, scene.goals, settings, sampled_sources=tuple(each.channels() for each in scaled),
-        extended_sources=tuple(ExtendedSource(each.source, light, each.draw) for each in scaled),
+        extended_sources=tuple(ExtendedSource(each.source, light, each.sampler) for each in scaled),
     )  # fmt: skip
 
 

@@ -175,7 +175,7 @@ def test_stage_1_finds_the_front_curvature_and_the_back_together():
     tailored, mapping = last.lens, last.mapping
     assert tailored.front.curvature != 0.0
     assert mapping.transport.mass_error[-1] < 0.02
-    found = simulated(task.heaviest.source, tailored, task.goals[0].receiver, 300, 0)
+    found = simulated(task.heaviest.source, tailored, task.goals[0].screen, 300, 0)
     assert efficiency(found.flux) > 0.98
     assert task.rrmsd(tailored) < 0.6 * task.rrmsd(replace(lens, back=lens.back.refined(17)))
 

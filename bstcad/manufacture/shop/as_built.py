@@ -168,13 +168,13 @@ def _moved(lens: Lens, scene: Scene, shift: float) -> Parameters:
     """Return the parameters of a lens, its back moved by a shift (mm), for the blank of a scene."""
     old, flat, dome = Parameters.of(lens), scene.flat_lens(scene.lens.back.net), scene.lens.dome
     every: tuple[Face, ...] = ("front", "back")
-    faces = [face for face in every if lens.shapes(face)]
-    nets = {face: old.nets[lens.freeform.index(lens.number_of(face))] for face in faces}
+    faces = [face for face in every if lens.is_tailored(face)]
+    nets = {face: old.nets[lens.tailored_numbers.index(lens.number_of(face))] for face in faces}
     if "back" in nets and dome is None:
         nets["back"] = NetParameters(nets["back"].z + shift, nets["back"].heights)
     elif "back" in nets and dome is not None:  # the dome grows about its centre
         nets["back"] = NetParameters(nets["back"].z, dome.radius / (dome.radius - shift) * nets["back"].heights)
-    shaped = [face for face in faces if flat.shapes(face)]  # a front as built is tailored no more
+    shaped = [face for face in faces if flat.is_tailored(face)]  # a front as built is tailored no more
     shaped.sort(key=lambda face: flat.number_of(face))
     front = {} if flat.front.is_net else flat.front.parameters()
     return Parameters(tuple(nets[face] for face in shaped), front, old.back + (shift if dome is None else 0.0))

@@ -49,7 +49,7 @@ class Screen:
         return sum(self.x) / 2, sum(self.y) / 2, self.z
 
     @property
-    def plane(self) -> Receiver:
+    def receiver(self) -> Receiver:
         """Receiver on which light lands: a plane, or a receiver of another form."""
         if self.surface is not None:
             return self.surface
@@ -102,12 +102,12 @@ class Screen:
     @property
     def areas(self) -> np.ndarray | None:
         """Relative areas or solid angles of the pixels (rows, columns), of mean 1; None: all are equal."""
-        return self.plane.areas(self.x, self.y, self.shape)
+        return self.receiver.areas(self.x, self.y, self.shape)
 
     @property
     def cell_sizes(self) -> np.ndarray:
         """Areas (mm²) or solid angles (sr) of the pixels, (rows, columns)."""
-        return self.plane.cell_sizes(self.x, self.y, self.shape)
+        return self.receiver.cell_sizes(self.x, self.y, self.shape)
 
     def pixel(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return (column, row) of (x, y) as real numbers: pixel i extends from i to i + 1."""

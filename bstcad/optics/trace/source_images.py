@@ -131,7 +131,7 @@ def _through(channels: Sequence[Channel], lens: Lens, screen: Screen, x: Tensor,
     dome = lens.back
     if is_radial(dome):  # its points in given directions are known to the square of the pitch: start before the face
         rays = replace(rays, position=rays.position - STEP_BACK * dome.radius * rays.direction)
-    [landed] = through(rays, last, [screen.plane])
+    [landed] = through(rays, last, [screen.receiver])
     centre = tubes.middle(p), tubes.middle(q)
     cells = zip(channels, *centre, strict=True)
     density = [each.weight * each.source.irradiance(x, y, lens.entrance.z) for each, x, y in cells]

@@ -79,14 +79,14 @@ def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: 
     n = min(task.settings.rays, MAX_RAYS_PER_CONTROL_POINT * max(lens.back_net.shape))
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays_through(x, y, lens.entrance.z, area.area / n**2)
-    screen, shape = task.goals[0].receiver, lens.front.parameters()
+    screen, shape = task.goals[0].screen, lens.front.parameters()
     aim = slope_map.aim_points(mapping, lens, screen, x=x, y=y)
     start = [lens.back_net.heights, *(torch.as_tensor(shape[name]).to(lens.like) for name in task.free)]
     nearest = min(STAGE1_RATES, key=lambda m: abs(m - max(lens.back_net.shape)))
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaves = [p.detach().clone().requires_grad_() for p in parameters]
-        merit = mean_square_miss(trace(rays, with_parameters(lens, leaves, task.free), screen.plane), aim)
+        merit = mean_square_miss(trace(rays, with_parameters(lens, leaves, task.free), screen.receiver), aim)
         return float(merit.detach()), list(torch.autograd.grad(merit, leaves)), float("nan")
 
     steps, rates = task.settings.stage1_iterations, [STAGE1_RATES[nearest], *(FRONT_RATES[name] for name in task.free)]
@@ -160,7 +160,7 @@ def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[S
     """Run stage 2, or resume it from `state`, with new random rays in each step."""
     settings, goal, start = task.settings, task.goals[0], lens if state is None else state.lens.apply_to(lens)
     target = torch.from_numpy(goal.picture).to(lens.like.device)
-    merit = TentMerit.of(task.channels, goal.receiver, target, settings.overshoot)
+    merit = TentMerit.of(task.channels, goal.screen, target, settings.overshoot)
     seeds = itertools.count(settings.seed + 2 + (state.best.evaluations if state else 0))
     bundles = (random_bundles(task.channels, start, settings.rays**2, seed) for seed in seeds)
     if state is None:
@@ -204,7 +204,9 @@ def tailor_to_irradiance(
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaf = parameters[0].detach().clone().requires_grad_()
         trial, pairs = with_parameters(lens, [leaf]), zip(merit.channels, next(bundles), strict=True)
-        square, rrmsd = merit(tuple(trace(rays, channel.through(trial), merit.screen.plane) for channel, rays in pairs))
+        square, rrmsd = merit(
+            tuple(trace(rays, channel.through(trial), merit.screen.receiver) for channel, rays in pairs)
+        )
         (gradient,) = torch.autograd.grad(square.sqrt(), leaf)
         return float(square.detach().sqrt()), [gradient], float(rrmsd)
 

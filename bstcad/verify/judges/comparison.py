@@ -141,11 +141,11 @@ def compare(
     began = time.perf_counter()
     (functions, name, version), key = _judge_functions(judge), goal.key if goal.suffix else ""
     declined = functions.cannot(lens, channels)
-    if isinstance(judge, str) and goal.receiver.plane.frame is None:
+    if isinstance(judge, str) and goal.screen.receiver.frame is None:
         declined = "it collects light only on planes"
     if declined:
         return Comparison(Judge(name, version, declined, target=key))
-    raster = coarse_screen(goal.receiver)
+    raster = coarse_screen(goal.screen)
     target, light = resample(goal.picture, raster.shape), functions.light(lens, channels)
     traced = functions.trace(lens, light, raster, rays=rays, seed=seed)
     seconds = time.perf_counter() - began

@@ -9,7 +9,7 @@ import torch
 
 from bstcad.optics.lens import interfaces
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.numerics import compiling
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
@@ -66,7 +66,7 @@ def test_a_kernel_keeps_its_code_there():
     assert Path(kernel.stats.cache_path).is_relative_to(compiling._caches(before))
 
 
-SOURCE, SCREEN = Point((0.0, 0.0, -40.0), "lambertian"), Screen(400.0, (-80.0, 80.0), (-80.0, 80.0), (8, 8))
+SOURCE, SCREEN = PointSource((0.0, 0.0, -40.0), "lambertian"), Screen(400.0, (-80.0, 80.0), (-80.0, 80.0), (8, 8))
 CHANGED = {  # constant: (where it stands, a value that no ray can fail to feel)
     "NEWTON_STEPS": (interfaces, 1),
     "APPROACH_STEPS": (interfaces, 0),

@@ -8,8 +8,8 @@ import torch
 from bstcad.designs import pipeline
 from bstcad.optics.lens.interfaces import Reflect, Refract
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
@@ -71,11 +71,11 @@ class Known:
 
 
 LENSES = {
-    "collimated": Known(Conic(20.0, -0.03, -0.5), Collimated(Circle(9.0))),
-    "point": Known(Conic(20.0, -0.04, -0.5), Point(), Sphere(15.0, 0.02)),
-    "point, off axis": Known(Sphere(20.0, -0.02), Point((1.0, -2.0, 0.0)), Plane(15.0)),
-    "tilted target": Known(Sphere(20.0, -0.03), Point(), Plane(15.0), plane=TILTED),
-    "mirror": Known(Sphere(20.0, 0.01), Point((30.0, 0.0, 300.0)), law=Reflect(), plane=LEVEL),
+    "collimated": Known(Conic(20.0, -0.03, -0.5), CollimatedSource(Circle(9.0))),
+    "point": Known(Conic(20.0, -0.04, -0.5), PointSource(), Sphere(15.0, 0.02)),
+    "point, off axis": Known(Sphere(20.0, -0.02), PointSource((1.0, -2.0, 0.0)), Plane(15.0)),
+    "tilted target": Known(Sphere(20.0, -0.03), PointSource(), Plane(15.0), plane=TILTED),
+    "mirror": Known(Sphere(20.0, 0.01), PointSource((30.0, 0.0, 300.0)), law=Reflect(), plane=LEVEL),
 }  # fmt: skip
 
 
