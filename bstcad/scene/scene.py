@@ -11,6 +11,7 @@ import datetime
 import json
 import math
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path, PurePath
@@ -53,7 +54,7 @@ from bstcad.scene.moulding import CAVITY, MISSING, Moulding
 from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture
 from bstcad.scene.quality import VERIFICATION_POINTS, VERIFICATION_SET, Tailoring, Tolerance
-from bstcad.scene.schema import FILE, FileContent, Record, contents, of_model
+from bstcad.scene.schema import FileContent, Record, contents, of_model
 from bstcad.scene.target import FAR_Z, AngularTarget, Target, Targets, coplanar_complaints
 from bstcad.tailoring.settings import SEARCH_RANGE
 
@@ -642,4 +643,4 @@ def _image(values: np.ndarray, key: str) -> Picture:
 
 
 if __name__ == "__main__":
-    FILE.write_text(json.dumps(of_model(Scene), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    sys.stdout.buffer.write(json.dumps(of_model(Scene), indent=1, ensure_ascii=False).encode() + b"\n")
