@@ -38,6 +38,7 @@ PAGES = [
     ROOT / "README.md",
     *sorted((ROOT / "docs").glob("tutorials/*.md")),
     *sorted((ROOT / "docs").glob("how-to/*.md")),
+    *sorted((ROOT / "docs").glob("explanation/*.md")),
     ROOT / "docs" / "reference" / "files.md",
 ]
 RUN = [page for page in PAGES if any(block.kind != "toml" for block in blocks(page))]
@@ -219,6 +220,17 @@ def test_every_field_of_a_json_file_has_a_meaning():
 
     rows = re.findall(r"^\| `(\w+)` \| .*? \| (.*) \|$", json_files(), re.M)
     assert len(rows) > 100 and [name for name, meaning in rows if not meaning] == []
+
+
+def test_the_tables_of_the_house_name_each_part_and_the_kinds_of_each_noun():
+    from reference_pages import NOUNS, imports, kinds
+
+    from tests.test_architecture import MAY_IMPORT, ONLY
+
+    parts = re.findall(r"^\| `?([\w.]+)`? \| [`n]", imports(), re.M)
+    assert parts == [*(part for part in MAY_IMPORT if part != "bstcad"), *ONLY]
+    found = dict(re.findall(r"^\| `(\w+)` \| `(\w+)` \| `[\w/.]+` \| [^|]{4,} \|$", kinds(), re.M))
+    assert found.keys() == set(NOUNS) and "`Point`" in kinds() and "`_" not in kinds()
 
 
 def test_the_site_is_complete_without_a_network():

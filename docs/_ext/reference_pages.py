@@ -1,4 +1,4 @@
-"""The generated pages of docs/reference: keys of a scene by the schema, commands by typer, JSON files by records."""
+"""Generated pages of docs/reference (keys of a scene, commands, JSON files) and tables of docs/explanation/house.md."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "reference"
+TABLES = ROOT / "docs" / "_made"  # folder of the tables that pages include
+NOUNS = ("Surface", "Chart", "Emitter", "Receiver", "FittedFront", "FileContent")  # classes whose kinds house.md lists
 RECORDS = {  # JSON file: (module, names of its records), with the record of the file first
     "report.json": [
         ("report/record.py", ["Contents", "LineFigures", "LeftOut"]),
@@ -39,6 +41,10 @@ RECORDS = {  # JSON file: (module, names of its records), with the record of the
         ("planning/results.py", ["TradeoffTable", "TableKnob", "Calibration", "Preset", "KnobPoint"]),
         ("planning/cold_run.py", ["ColdRun", "HistoryPoint"]),
     ],
+    "compensation.json": [
+        ("manufacture/shop/production.py", ["RoundFigures", "CloudFigures", "DeviationFigures", "RoundLight"])
+    ],
+    "state.json": [("app/design_process.py", ["State"])],
 }
 
 
@@ -214,19 +220,61 @@ def cell(text: str) -> str:
     return "".join(parts)
 
 
-def write(page: str, text: str) -> None:
-    """Write a page, if it changes."""
-    path = PAGES / page
+# ---- tables of the house ---------------------------------------------------------------------------------------------
+
+
+def imports() -> str:
+    """Return the tables MAY_IMPORT and ONLY of tests/test_architecture.py: a row per part, and per library."""
+    from tests.test_architecture import MAY_IMPORT, ONLY
+
+    page = ["| part | may import, besides itself |", "|---|---|"]
+    for part, others in MAY_IMPORT.items():
+        if part != "bstcad":
+            page.append(f"| `{part}` | {', '.join(f'`{other}`' for other in sorted(others - {'bstcad'})) or 'nothing'} |")
+    page += ["", "| library | may be imported by |", "|---|---|"]
+    page += [f"| {name} | {', '.join(f'`{part}`' for part in sorted(parts))} |" for name, parts in ONLY.items()]
+    return "\n".join(page) + "\n"
+
+
+def kinds() -> str:
+    """Return a table of the classes of the package that derive from each of NOUNS: noun, class, file, docstring."""
+    classes = [
+        (node, file.relative_to(ROOT / "bstcad").as_posix())
+        for file in sorted((ROOT / "bstcad").rglob("*.py"))
+        for node in ast.parse(file.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef)
+    ]
+    page = ["| noun | kind | file | what it is |", "|---|---|---|---|"]
+    for noun in NOUNS:
+        known = {noun}
+        while derived := [
+            (node, file)
+            for node, file in classes
+            if node.name not in known and known & {ast.unparse(base).rpartition(".")[2] for base in node.bases}
+        ]:
+            known |= {node.name for node, _ in derived}
+            for node, file in derived:
+                if not node.name.startswith("_"):
+                    said = (ast.get_docstring(node) or "").partition("\n\n")[0]
+                    page.append(f"| `{noun}` | `{node.name}` | `{file}` | {cell(' '.join(said.split()))} |")
+    return "\n".join(page) + "\n"
+
+
+def write(path: Path, text: str) -> None:
+    """Write a page or a table, if it changes."""
+    path.parent.mkdir(exist_ok=True)
     if not path.exists() or path.read_text(encoding="utf-8") != text:
         path.write_text(text, encoding="utf-8")
 
 
 def make(app: Any = None) -> None:
-    """Write the generated pages."""
+    """Write the generated pages and tables."""
     for page, text in (
         ("scene-keys.md", scene_keys()), ("command-line.md", command_line()), ("json-files.md", json_files())
     ):  # fmt: skip
-        write(page, text)
+        write(PAGES / page, text)
+    for table, text in (("imports.md", imports()), ("kinds.md", kinds())):
+        write(TABLES / table, text)
 
 
 def plain_text(app: Any, what: str, name: str, of: Any, options: Any, lines: list[str]) -> None:
