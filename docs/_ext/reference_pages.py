@@ -227,12 +227,13 @@ def imports() -> str:
     """Return the tables MAY_IMPORT and ONLY of tests/test_architecture.py: a row per part, and per library."""
     from tests.test_architecture import MAY_IMPORT, ONLY
 
+    def listed(parts: set[str]) -> str:
+        return ", ".join(f"`{part}`" for part in sorted(parts - {"bstcad"})) or "nothing"
+
     page = ["| part | may import, besides itself |", "|---|---|"]
-    for part, others in MAY_IMPORT.items():
-        if part != "bstcad":
-            page.append(f"| `{part}` | {', '.join(f'`{other}`' for other in sorted(others - {'bstcad'})) or 'nothing'} |")
+    page += [f"| `{part}` | {listed(others)} |" for part, others in MAY_IMPORT.items() if part != "bstcad"]
     page += ["", "| library | may be imported by |", "|---|---|"]
-    page += [f"| {name} | {', '.join(f'`{part}`' for part in sorted(parts))} |" for name, parts in ONLY.items()]
+    page += [f"| {name} | {listed(parts)} |" for name, parts in ONLY.items()]
     return "\n".join(page) + "\n"
 
 
