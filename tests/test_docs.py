@@ -223,12 +223,13 @@ def test_every_field_of_a_json_file_has_a_meaning():
 
 
 def test_the_tables_of_the_house_name_each_part_and_the_kinds_of_each_noun():
-    from reference_pages import NOUNS, imports, kinds
+    from reference_pages import NOUNS, kinds, libraries, rooms
 
     from tests.test_architecture import MAY_IMPORT, ONLY
 
-    parts = re.findall(r"^\| `?([\w.]+)`? \| [`n]", imports(), re.M)
-    assert parts == [*(part for part in MAY_IMPORT if part != "bstcad"), *ONLY]
+    parts = re.findall(r"^\| `([\w.]+)` \| [^|]{20,} \| [`n][^|]+ \|$", rooms(), re.M)
+    assert parts == [part for part in MAY_IMPORT if part != "bstcad"]
+    assert re.findall(r"^\| (\w+) \| `", libraries(), re.M) == list(ONLY)
     found = dict(re.findall(r"^\| `(\w+)` \| `(\w+)` \| `[\w/.]+` \| [^|]{4,} \|$", kinds(), re.M))
     assert found.keys() == set(NOUNS) and "`Point`" in kinds() and "`_" not in kinds()
 
@@ -241,12 +242,18 @@ def test_the_site_is_complete_without_a_network():
             assert not re.search(r"!\[[^\]]*\]\(https?:|src=.https?:|@import|url\(.?https?:", text), path
 
 
-def test_the_guide_to_tolerances_names_every_error():
-    from bstcad.scene.quality import Name
+def test_the_table_of_grades_bounds_every_error_once_and_has_all_their_limits():
+    from reference_pages import grades
 
-    text = (ROOT / "docs" / "how-to" / "tolerances.md").read_text(encoding="utf-8")
+    from bstcad.manufacture.tolerance.grades import GRADES
+    from bstcad.scene.quality import FINISH_KEYS, Name
+
     families = {name.removesuffix("_x").removesuffix("_y") for name in get_args(Name)}
-    assert families - set(re.findall(r"[`\"]([\w.]+)[`\"]", text)) == set()
+    rows = [row.split(" | ") for row in grades().splitlines()[2:]]
+    named = [name for row in rows for name in re.findall(r"`([\w.]+)`", row[1])]
+    assert sorted(named) == sorted({*families, *FINISH_KEYS})
+    [tilt] = [row for row in rows if "`lens.tilt`" in row[1]]
+    assert [float(value.rstrip(" |")) for value in tilt[2:]] == [grade.tilt for grade in GRADES.values()]
 
 
 def test_the_guide_to_checks_names_all_that_a_proof_tells_of_the_shape():

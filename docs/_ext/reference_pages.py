@@ -9,7 +9,7 @@ import re
 import tokenize
 import tomllib
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -223,18 +223,41 @@ def cell(text: str) -> str:
 # ---- tables of the house ---------------------------------------------------------------------------------------------
 
 
-def imports() -> str:
-    """Return the tables MAY_IMPORT and ONLY of tests/test_architecture.py: a row per part, and per library."""
-    from tests.test_architecture import MAY_IMPORT, ONLY
+def rooms() -> str:
+    """Return a table of the parts of the package, by AT_TOP and MAY_IMPORT of tests/test_architecture.py, from below.
 
-    def listed(parts: set[str]) -> str:
-        return ", ".join(f"`{part}`" for part in sorted(parts - {"bstcad"})) or "nothing"
+    The contents of a part are the first lines of the docstrings of its __init__.py, or of its files.
+    """
+    from tests.test_architecture import AT_TOP, MAY_IMPORT
 
-    page = ["| part | may import, besides itself |", "|---|---|"]
-    page += [f"| `{part}` | {listed(others)} |" for part, others in MAY_IMPORT.items() if part != "bstcad"]
-    page += ["", "| library | may be imported by |", "|---|---|"]
-    page += [f"| {name} | {listed(parts)} |" for name, parts in ONLY.items()]
+    page = ["| part | contents | may import, besides itself |", "|---|---|---|"]
+    for part, others in MAY_IMPORT.items():
+        if part == "bstcad":
+            continue
+        files = {name: f"{name}.py" for name in sorted(AT_TOP.get(part, ()))}
+        said = [f"`{file}`: {first_line(file)}" for file in files.values()]
+        said = said or [first_line(f"{part.replace('.', '/')}/__init__.py")]
+        page.append(f"| `{part}` | {' '.join(said)} | {listed(others)} |")
     return "\n".join(page) + "\n"
+
+
+def libraries() -> str:
+    """Return the table ONLY of tests/test_architecture.py: the parts that may import a library."""
+    from tests.test_architecture import ONLY
+
+    rows = [f"| {name} | {listed(parts)} |" for name, parts in ONLY.items()]
+    return "\n".join(["| library | may be imported by |", "|---|---|", *rows]) + "\n"
+
+
+def listed(parts: set[str]) -> str:
+    """Return the names of parts as code, without that of bstcad/__init__.py."""
+    return ", ".join(f"`{part}`" for part in sorted(parts - {"bstcad"})) or "nothing"
+
+
+def first_line(file: str) -> str:
+    """Return the first line of the docstring of a file of the package."""
+    docstring = ast.get_docstring(ast.parse((ROOT / "bstcad" / file).read_text(encoding="utf-8"))) or ""
+    return cell(docstring.partition("\n")[0])
 
 
 def kinds() -> str:
@@ -261,6 +284,42 @@ def kinds() -> str:
     return "\n".join(page) + "\n"
 
 
+# ---- grades of manufacture -------------------------------------------------------------------------------------------
+
+
+def grades() -> str:
+    """Return the limits of all grades of manufacture, a row per limit with the errors that it bounds, and the finish."""
+    from dataclasses import fields
+
+    from bstcad.manufacture.tolerance.grades import GRADES, ToleranceGrade, limit_of
+    from bstcad.optics.trace.finish import Finish
+    from bstcad.scene.quality import FINISH_KEYS, Name
+
+    names: dict[str, list[str]] = {}
+    for name in typing.get_args(Name):
+        if not name.endswith(("_x", "_y")):
+            names.setdefault(limit_of(name), []).append(f"`{name}`")
+    page = [f"| limit | errors | {' | '.join(f'`{name}`' for name in GRADES)} |", "|---|---|" + "--:|" * len(GRADES)]
+    for field, said in field_comments(ToleranceGrade, [f.name for f in fields(ToleranceGrade)]).items():
+        values = [getattr(grade, field) for grade in GRADES.values()]
+        if field not in ("words", "finish"):
+            page.append(f"| {cell(said)} | {', '.join(names.get(field, []))} | {numbers(values)} |")
+    for key, said in field_comments(Finish, FINISH_KEYS).items():
+        page.append(f"| {cell(said)} | `{key}` | {numbers(getattr(grade.finish, key) for grade in GRADES.values())} |")
+    return "\n".join(page) + "\n"
+
+
+def field_comments(record: type, names: Iterable[str]) -> dict[str, str]:
+    """Return the comments of fields of a record by their names."""
+    found = dict(re.findall(r"^    (\w+): [^#\n]+#[: ]*(.+)$", inspect.getsource(record), re.M))
+    return {name: found[name] for name in names if name in found}
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Return numbers as cells of a table; an infinite or absent one is empty."""
+    return " | ".join(f"{value:g}" if value and value < float("inf") else "" for value in values)
+
+
 def write(path: Path, text: str) -> None:
     """Write a page or a table, if it changes."""
     path.parent.mkdir(exist_ok=True)
@@ -274,8 +333,8 @@ def make(app: Any = None) -> None:
         ("scene-keys.md", scene_keys()), ("command-line.md", command_line()), ("json-files.md", json_files())
     ):  # fmt: skip
         write(PAGES / page, text)
-    for table, text in (("imports.md", imports()), ("kinds.md", kinds())):
-        write(TABLES / table, text)
+    for table in (rooms, libraries, kinds, grades):
+        write(TABLES / f"{table.__name__}.md", table())
 
 
 def plain_text(app: Any, what: str, name: str, of: Any, options: Any, lines: list[str]) -> None:

@@ -92,17 +92,23 @@ GRADES = {
 
 def grade_limit(kind: Kind, grade: ToleranceGrade, setup: Setup) -> float:
     """Return the limit (±) that a grade sets for a kind of error, in the unit of the kind."""
-    part, _, error = kind.name.partition(".")
-    if part == "screen" and kind.unit == "mm":
+    field = limit_of(kind.name)
+    if field == "screen" and kind.unit == "mm":
         screen, z = setup.screen, setup.pivot("lens")[2]
         distance = abs(screen.plane.throw(z))
         width = (screen.x[1] - screen.x[0]) * (distance / abs(screen.plane.per_radian(z)))  # mm
-        return grade.screen * (distance if error == "axial" else width)
+        return grade.screen * (distance if kind.name == "screen.axial" else width)
+    return grade.decentre if field == "screen" else getattr(grade, field)
+
+
+def limit_of(name: str) -> str:
+    """Return the field of ToleranceGrade that limits the error of this name, such as lens.decentre_x."""
+    part, _, error = name.partition(".")
     if error.startswith(("tilt", "clocking", "wedge")):
-        return grade.tilt
+        return "tilt"
     if error.startswith(("decentre", "axial")):
-        return grade.decentre
-    return grade.source if part == "source" else getattr(grade, error or part)
+        return "screen" if part == "screen" else "decentre"
+    return "source" if part == "source" else error or part
 
 
 def graded_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[Tolerance, ...]:
