@@ -242,6 +242,16 @@ def test_the_site_is_complete_without_a_network():
             assert not re.search(r"!\[[^\]]*\]\(https?:|src=.https?:|@import|url\(.?https?:", text), path
 
 
+def test_the_table_of_arrays_has_those_of_a_design(small_design):
+    from reference_pages import arrays
+
+    with np.load(small_design.folder / "design.npz") as stored:
+        shapes = {name: stored[name].ndim for name in stored.files}
+    listed = dict(re.findall(r"^\| `(\w+)` \| (\(.*?\)) \| .+ \|$", arrays(), re.M))
+    dimensions = {name: len([size for size in shape.strip("()").split(",") if size]) for name, shape in listed.items()}
+    assert len(shapes) >= 10 and shapes.items() <= dimensions.items()
+
+
 def test_the_table_of_grades_bounds_every_error_once_and_has_all_their_limits():
     from reference_pages import grades
 

@@ -1,4 +1,4 @@
-"""Generated pages of docs/reference (keys of a scene, commands, JSON files) and tables of docs/explanation/house.md."""
+"""Generated pages of docs/reference (keys of a scene, commands, JSON files), and tables that other pages include."""
 
 from __future__ import annotations
 
@@ -220,6 +220,17 @@ def cell(text: str) -> str:
     return "".join(parts)
 
 
+# ---- arrays of a design ----------------------------------------------------------------------------------------------
+
+
+def arrays() -> str:
+    """Return the table of the arrays of design.npz: name, shape, meaning."""
+    from bstcad.designs.folder import ARRAYS
+
+    rows = [f"| `{name}` | {shape} | {cell(meaning)} |" for name, (shape, meaning) in ARRAYS.items()]
+    return "\n".join(["| array | shape | meaning |", "|---|---|---|", *rows]) + "\n"
+
+
 # ---- tables of the house ---------------------------------------------------------------------------------------------
 
 
@@ -288,7 +299,7 @@ def kinds() -> str:
 
 
 def grades() -> str:
-    """Return the limits of all grades of manufacture, a row per limit with the errors that it bounds, and the finish."""
+    """Return the limits of all grades, a row per limit with the errors that it bounds, and their finish."""
     from dataclasses import fields
 
     from bstcad.manufacture.tolerance.grades import GRADES, ToleranceGrade, limit_of
@@ -333,7 +344,7 @@ def make(app: Any = None) -> None:
         ("scene-keys.md", scene_keys()), ("command-line.md", command_line()), ("json-files.md", json_files())
     ):  # fmt: skip
         write(PAGES / page, text)
-    for table in (rooms, libraries, kinds, grades):
+    for table in (arrays, rooms, libraries, kinds, grades):
         write(TABLES / f"{table.__name__}.md", table())
 
 
