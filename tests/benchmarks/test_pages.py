@@ -26,7 +26,8 @@ def test_each_page_is_what_its_records_give():
 def test_figures_of_both_precisions_share_a_row_of_the_hard_cases():
     figures = {
         ("7. A plane.", "error, float32: sag"): (2e-7, 1e-6, "mm"), ("7. A plane.", "miss"): (0.0, 0.0, ""),
-        ("7. A plane.", "error, float64: sag"): (3e-16, 1e-15, "mm"), ("2. A ray.", "slope, float64"): (1e-16, 1e-15, ""),
+        ("7. A plane.", "error, float64: sag"): (3e-16, 1e-15, "mm"),
+        ("2. A ray.", "slope, float64"): (1e-16, 1e-15, ""),
     }  # fmt: skip
     assert by_case(figures) == [
         ["2. A ray", "slope, float64", "1e-16", "1e-15"],
