@@ -266,13 +266,6 @@ def test_imports_keep_to_the_house():
     assert {file: wrong for file, wrong in found.items() if wrong} == {}
 
 
-def test_the_plan_of_the_house_has_this_table():
-    plan = (PACKAGE.parent / "docs" / "explanation" / "house.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| `([\w.]+)`[^|]*\| (.*) \|$", plan.partition("| part | may import")[2], re.M)
-    stated = {part: {*re.findall(r"`([\w.]+)`", others)} for part, others in rows if part in MAY_IMPORT}
-    assert stated == {part: may - {"bstcad"} for part, may in MAY_IMPORT.items() if part != "bstcad"}
-
-
 APPLICATIONS = {"report", "figures", "exports", "designs", "manufacture", "planning", "app", "commands"}
 
 

@@ -92,13 +92,29 @@ GRADES = {
 
 def grade_limit(kind: Kind, grade: ToleranceGrade, setup: Setup) -> float:
     """Return the limit (±) that a grade sets for a kind of error, in the unit of the kind."""
-    part, _, error = kind.name.partition(".")
-    if part == "screen" and kind.unit == "mm":
+    field = limit_of(kind.name)
+    if field == "screen" and kind.unit == "mm":
         screen, z = setup.screen, setup.pivot("lens")[2]
         distance = abs(screen.receiver.throw(z))
         width = (screen.x[1] - screen.x[0]) * (distance / abs(screen.receiver.per_radian(z)))  # mm
-        return grade.screen * (distance if error == "axial" else width)
-    return getattr(grade, kind.grade)
+        return grade.screen * (distance if kind.name == "screen.axial" else width)
+    return grade.decentre if field == "screen" else getattr(grade, field)
+
+
+# field of ToleranceGrade by the name of an error without its part; other errors have a field of their own name
+FIELDS = {
+    **dict.fromkeys(("tilt", "tilt_x", "tilt_y", "clocking", "wedge", "wedge_x", "wedge_y"), "tilt"),
+    **dict.fromkeys(("decentre", "decentre_x", "decentre_y", "axial"), "decentre"),
+}
+
+
+def limit_of(name: str) -> str:
+    """Return the field of ToleranceGrade that limits the error of this name, such as lens.decentre_x."""
+    part, _, error = name.partition(".")
+    field = FIELDS.get(error)
+    if field is not None:
+        return "screen" if (part, field) == ("screen", "decentre") else field
+    return "source" if part == "source" else error or part
 
 
 def graded_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[Tolerance, ...]:

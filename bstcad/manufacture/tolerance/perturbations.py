@@ -121,7 +121,6 @@ class Kind:
     words: str  # name in reports
     unit: str  # unit of its amounts; "" for a ratio
     apply: Callable[[Setup, float], Setup]  # function (setup, amount) -> setup with this error added
-    grade: str  # field of a ToleranceGrade with the limit of the error; "" if no grade limits it
     moves: bool = False  # True if a part moves; errors of shape act before motions
 
 
@@ -209,9 +208,8 @@ def _motions(setup: Setup) -> Iterator[Kind]:
         name = setup.lens.passes.optic if part == "lens" else part
         for error, words, axis, turns in MOTIONS:
             if f"{part}.{error}" not in without_effect:
-                unit, grade = ("deg", "tilt") if turns else ("mm", "decentre")
                 move = partial(_move_part, part, axis, turns)
-                yield Kind(f"{part}.{error}", words.format(name), unit, move, grade, moves=True)
+                yield Kind(f"{part}.{error}", words.format(name), "deg" if turns else "mm", move, moves=True)
 
 
 def _move_part(part: str, axis: int, turns: bool, setup: Setup, by: float) -> Setup:
@@ -227,16 +225,16 @@ def _along(axis: int, amount: float) -> Vector:
 def _shapes(setup: Setup, material: str | None) -> Iterator[Kind]:
     optic, refracts = setup.lens.passes.optic, setup.lens.passes.enters
     if refracts:
-        yield Kind("lens.thickness", f"thickness of the {optic}", "mm", _change_thickness, "thickness")
-        yield Kind("lens.index", "refractive index", "", lambda s, by: s.with_indices(lambda n: n + by), "index")
+        yield Kind("lens.thickness", f"thickness of the {optic}", "mm", _change_thickness)
+        yield Kind("lens.index", "refractive index", "", lambda s, by: s.with_indices(lambda n: n + by))
         if not domes.is_dome(setup.lens):  # whose front is nearly vertical at its rim
-            yield Kind("lens.front_power", "sag of the front at its rim", "mm", _change_front_power, "front_power")
-    yield Kind("lens.scale", f"scale of the {optic} (shrinkage)", "", lambda s, by: s.with_lens_scaled(1 + by), "scale")
+            yield Kind("lens.front_power", "sag of the front at its rim", "mm", _change_front_power)
+    yield Kind("lens.scale", f"scale of the {optic} (shrinkage)", "", lambda s, by: s.with_lens_scaled(1 + by))
     if material in THERMAL_COEFFICIENTS and refracts:
         warm = partial(_change_temperature, material)
-        yield Kind("temperature", f"temperature of the {optic} ({material})", "K", warm, "temperature")
+        yield Kind("temperature", f"temperature of the {optic} ({material})", "K", warm)
     if material is not None and refracts and _disperses(material, setup):
-        yield Kind("wavelength", "wavelength of the light", "nm", partial(_change_wavelength, material), "wavelength")
+        yield Kind("wavelength", "wavelength of the light", "nm", partial(_change_wavelength, material))
 
 
 def _change_thickness(setup: Setup, by: float) -> Setup:
@@ -280,10 +278,10 @@ def _change_wavelength(material: str, setup: Setup, by: float) -> Setup:
 def _lights(setup: Setup) -> Iterator[Kind]:
     sources = [channel.source for channel in setup.channels]
     if any(source.with_wider_cone(0.0) for source in sources):
-        yield Kind("source.angle", "width of the source's cone, relative", "", _change_cone, "source", moves=True)
+        yield Kind("source.angle", "width of the source's cone, relative", "", _change_cone, moves=True)
     extended = len({source.place for source in sources}) > 1
     if extended and all(source.moved_away(0.0, source.place) for source in sources):
-        yield Kind("source.size", "size of the source, relative", "", _change_size, "source", moves=True)
+        yield Kind("source.size", "size of the source, relative", "", _change_size, moves=True)
 
 
 def _change_cone(setup: Setup, by: float) -> Setup:
@@ -301,10 +299,10 @@ def _alignments(lens: Lens) -> Iterator[Kind]:
     """Yield the wedge between two refracting faces, and the decentre of a front that is not plane."""
     for axis, name in enumerate("xy" if "front" in lens.passes.faces else ""):
         words = f"wedge of the {lens.passes.optic}: tilt of its back about {name} relative to the front"
-        yield Kind(f"lens.wedge_{name}", words, "deg", partial(_tilt_back, axis), "tilt")
+        yield Kind(f"lens.wedge_{name}", words, "deg", partial(_tilt_back, axis))
         if not lens.front.level:
             words = f"decentre of the front in {name} relative to the back"
-            yield Kind(f"front.decentre_{name}", words, "mm", partial(_decentre_front, axis), "decentre", moves=True)
+            yield Kind(f"front.decentre_{name}", words, "mm", partial(_decentre_front, axis), moves=True)
 
 
 def _decentre_front(axis: int, setup: Setup, by: float) -> Setup:
@@ -366,7 +364,7 @@ def form_error(lens: Lens, correlation_length: float, seed: int, face: str = "ba
     seed_of_face = seed + FRONT_SEED_OFFSET * (face == "front")
     field = random_field(net, correlation_length, seed_of_face, inside_outline(outline, net))
     words = f"form of the {face}, correlated over {correlation_length:.3g} mm (sample {seed})"
-    return Kind(f"{face}.form_{seed}", words, "mm RMS", partial(_add_form, face, field), "form")
+    return Kind(f"{face}.form_{seed}", words, "mm RMS", partial(_add_form, face, field))
 
 
 def ripple(lens: Lens, period: float, pattern: Literal["raster", "spiral"]) -> Kind:
@@ -384,7 +382,7 @@ def ripple(lens: Lens, period: float, pattern: Literal["raster", "spiral"]) -> K
         s = back.radius * np.arctan2(d_x if pattern == "raster" else np.hypot(d_x, d_y), d_z)
     field = _normalise(np.sin(2 * np.pi * s / period), inside_outline(lens.outline, back))
     words = f"{pattern} ripple of the back, period {period:g} mm"
-    return Kind("back.ripple", words, "mm RMS", partial(_add_form, "back", field), "ripple")
+    return Kind("back.ripple", words, "mm RMS", partial(_add_form, "back", field))
 
 
 def random_field(surface: BSplineSurface, correlation_length: float, seed: int, where: np.ndarray) -> np.ndarray:
