@@ -51,6 +51,7 @@ from bstcad.scene.fronts import as_front, net_extent
 from bstcad.scene.lamp import IntensityFile, RayFile
 from bstcad.tailoring.run import stage_effort
 from bstcad.tailoring.stage2 import PrecisionComparison
+from tests import suite
 from tests.conftest import verify_with
 from tests.planning.conftest import typical_pilot
 
@@ -414,22 +415,21 @@ def scene_with(first, holding, chance):
     return scene
 
 
-def holding_each_value(scenes):
-    """Return the numbers of few scenes that together hold each value that occurs (greedy cover)."""
+def holding_each_value(scenes, first=0):
+    """Return the numbers of few scenes that together hold each value that occurs (greedy cover, from the `first`)."""
     missing, found = {value for scene in scenes for value in scene.items()}, []
+    order = [*range(first, len(scenes)), *range(first)]
     while missing:
-        new = [len(missing & scene.items()) for scene in scenes]
-        found.append(new.index(max(new)))
+        found.append(max(order, key=lambda k: len(missing & scenes[k].items())))
         missing -= scenes[found[-1]].items()
     return found
 
 
 PAIRS = covering(to_cover(2))
 PREVIEWED = holding_each_value(PAIRS)  # numbers of the scenes that are previewed
-PLANNED = [len(PAIRS) - 1 - k for k in holding_each_value(PAIRS[::-1])]  # numbers of the scenes that are planned
-HALF = len(PAIRS) // 2
-TURNED = holding_each_value(PAIRS[HALF:] + PAIRS[:HALF])
-RETAILORED = [(k + HALF) % len(PAIRS) for k in TURNED]  # numbers of the scenes with a blank as built
+PLANNED = holding_each_value(PAIRS, len(PAIRS) // 3)  # numbers of the scenes that are planned
+RETAILORED = holding_each_value(PAIRS, 2 * len(PAIRS) // 3)  # numbers of the scenes with a blank as built
+DAILY = holding_each_value(PAIRS, suite.turn(len(PAIRS)))  # numbers of the scenes of the daily suite
 TRIPLES = "light", "rim", "front"
 
 
@@ -654,29 +654,18 @@ def test_a_refusal_names_both_keys(together, tmp_path, capsys):
     assert all(named.get(value, NAMED[choice]) in str(refusal.value) for choice, value in together)
 
 
-def test_each_value_is_previewed_planned_and_tailored_to_a_blank():
+def test_each_value_is_previewed_planned_and_tailored_to_a_blank_and_is_daily():
     all_values = {value for scene in PAIRS for value in scene.items()}
-    for numbers in (PREVIEWED, PLANNED, RETAILORED):
+    for numbers in (PREVIEWED, PLANNED, RETAILORED, DAILY):
         assert {value for k in numbers for value in PAIRS[k].items()} == all_values
         assert len(set(numbers)) == len(numbers) < len(PAIRS) / 4
 
 
-@pytest.mark.parametrize(
-    ("number", "chosen"),
-    list(enumerate(PAIRS)),
-    ids=[f"{chosen['light']}, {chosen['front']}, {chosen['rim']}" for chosen in PAIRS],
-)
-def test_each_pair(number, chosen, tmp_path):
-    assert (
-        faults(
-            chosen,
-            tmp_path / "out",
-            previewed=number in PREVIEWED,
-            planned=number in PLANNED,
-            retailored=number in RETAILORED,
-        )
-        == []
-    )
+@pytest.mark.parametrize("number", suite.daily(range(len(PAIRS)), DAILY))
+def test_each_pair(number, tmp_path):
+    kinds = {"previewed": PREVIEWED, "planned": PLANNED, "retailored": RETAILORED}
+    done = {kind: number in numbers for kind, numbers in kinds.items()}
+    assert faults(PAIRS[number], tmp_path / "out", **done) == [], PAIRS[number]
     gc.collect()
     gc.freeze()  # kernels and modules that it loaded stay: they are walked over once
 
@@ -690,7 +679,7 @@ MAX_HALF_RATIO_OF_ALL, MAX_HALF_OF_ALL = 2.5, 0.1  # both for every pair, after 
 
 
 @pytest.mark.parametrize(("wall", "picture"), [("square", "even"), ("directions", "letters")])
-@pytest.mark.parametrize("light", CHOICES["light"])
+@pytest.mark.parametrize("light", suite.in_turns(CHOICES["light"], 3))
 def test_each_light_is_right_inside_the_pixels(light, wall, picture):
     """Without cells in the merit, even light deviates by 0.05 on half pixels, and letters by 0.2."""
     scene = scene_of(PLAIN | {"light": light, "wall": wall, "picture": picture}).changed(DENSE)
@@ -712,7 +701,7 @@ BODIES = {  # choices of a scene, by the body that it has
 }
 
 
-@pytest.mark.parametrize("body", BODIES)
+@pytest.mark.parametrize("body", suite.in_turns(BODIES, 4))
 def test_a_design_remains_the_design_of_its_folder(body, tmp_path):
     """Methods of a design work after it was written, opened, and written again: its net is equal to the last bit."""
     folder = tmp_path / "design"
@@ -795,7 +784,9 @@ def landed_by_snell(lens, source, receiver, grazing):
     return column.floor().long(), row.floor().long()
 
 
-@pytest.mark.parametrize("number", range(len(REACHING)))
+@pytest.mark.parametrize(
+    "number", suite.daily(range(len(REACHING)), holding_each_value(REACHING, suite.turn(len(REACHING))))
+)
 def test_what_a_face_can_light_is_not_called_dark(number):
     """Rays by Snell's law from each point of the face, for every slope, agree with the closed form of `reachable_part`.
 

@@ -27,6 +27,7 @@ from bstcad.planning import batch
 from bstcad.planning import tradeoff as sweeping
 from bstcad.runs.processes import ExitStatus
 from bstcad.scene.scene import load
+from tests import suite
 from tests.conftest import draws_nothing, quick_effort, verify_with
 from tests.planning.conftest import Synthetic, typical_pilot
 
@@ -149,8 +150,17 @@ def run_command(words):
             runpy.run_path(arguments[0], run_name="__main__")
 
 
+def params(pages, **options):
+    return [pytest.param(page, id=name_of(page), **options) for page in pages]
+
+
+LONG_PAGES = [page for page in RUN if page.stem in LONG]
+SHORT_PAGES = [page for page in RUN[1:] if page.stem not in LONG]  # those after the README
+
+
 @pytest.mark.parametrize(
-    "page", [pytest.param(page, marks=[pytest.mark.bench] * (page.stem in LONG)) for page in RUN], ids=name_of
+    "page",
+    [*params(RUN[:1]), *suite.in_turns(params(SHORT_PAGES), 4), *params(LONG_PAGES, marks=pytest.mark.bench)],
 )
 def test_its_blocks_run_one_after_the_other(page, workplace):
     for block in blocks(page):

@@ -15,7 +15,7 @@ from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring.minimise import AdamState, Best, LbfgsState, adam, lbfgs, minimise
 from bstcad.tailoring.run import Hooks
-from tests import domes, two_faces
+from tests import domes, suite, two_faces
 from tests.conftest import DISK, SMALL
 
 TINY = SMALL | {"tailoring.rays": 64, "target.pixels": 32, "tailoring.transport_grid": 32, "tailoring.rounds": 3}
@@ -103,7 +103,11 @@ def heights_of(made):
 
 
 @pytest.mark.parametrize(
-    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.bench) for name in SCENES]
+    "name",
+    [
+        *suite.in_turns(QUICK, len(QUICK)),
+        *(pytest.param(name, marks=pytest.mark.bench) for name in SCENES if name not in QUICK),
+    ],
 )
 def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
     scene = load(DISK, SCENES[name])
@@ -128,6 +132,7 @@ def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
         assert np.array_equal(again.transport.source, whole.transport.source)
 
 
+@suite.in_turn(0, 2)
 def test_an_interrupt_anywhere_gives_a_lens_and_loses_nothing():
     """Asked at every look: before the first round there is no lens; later the best so far, and the way on."""
     scene = load(DISK, SCENES["paper"])
