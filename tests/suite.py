@@ -1,4 +1,4 @@
-"""Which tests the daily suite runs, in which order, and on which of several processes.
+"""Choice, order and distribution of the tests: the daily suite, the thorough tests, and several processes.
 
 Tests that are marked `thorough` are left to `make test-all`: their law is held by a shorter test every day, or each
 commit runs a share of their samples (`in_turns`).  `--in-turn 4` leaves one test of four, by the commit's hash.
