@@ -61,6 +61,7 @@ def daily(values: Iterable, numbers: Container[int]) -> list:
 def in_turns(values: Iterable, parts: int) -> list:
     """Return values for pytest.mark.parametrize: one of `parts` is daily, by the commit; the others are `thorough`."""
     values = list(values)
+    assert len(values) >= parts, "each part has a value"
     return daily(values, range(turn(parts), len(values), parts))
 
 
