@@ -1,4 +1,4 @@
-"""Which tests the daily suite runs, in which order, and on which of several processes.
+"""Choice of the tests that the daily suite runs, their order, and the processes that run them.
 
 Tests that are marked `thorough` are left to `make test-all`: their law is held by a shorter test every day, or each
 commit runs a share of their samples (`in_turns`).  `--in-turn 4` leaves one test of four, by the commit's hash.
@@ -61,6 +61,7 @@ def daily(values: Iterable, numbers: Container[int]) -> list:
 def in_turns(values: Iterable, parts: int) -> list:
     """Return values for pytest.mark.parametrize: one of `parts` is daily, by the commit; the others are `thorough`."""
     values = list(values)
+    assert len(values) >= parts, "each part has a value"
     return daily(values, range(turn(parts), len(values), parts))
 
 

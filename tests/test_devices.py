@@ -22,6 +22,7 @@ from bstcad.tailoring import stage2
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Hooks
 from bstcad.tailoring.stage2 import Problem
+from tests import suite
 from tests.conftest import pixels_of_all
 from tests.fake_device import SECOND, SecondDevice, on_second
 
@@ -77,6 +78,7 @@ def test_a_design_mixes_no_devices_and_finds_the_lens_of_the_cpu(template, quali
     held_to_the_cpu(scene(template, quality), quality)
 
 
+@suite.in_turn(0, 2)
 def test_so_does_one_for_a_tilted_target_that_loses_light_on_the_way():
     metal = {"kind": "fresnel", "metal": "Al", "polarisation": "s"}
     wanted = scene(TEMPLATES[0].with_name("mirror.toml"), "draft")
@@ -137,6 +139,7 @@ def evaluated(wanted, heights):
     return value, torch.cat([gradient.reshape(-1) for gradient in gradients])
 
 
+@suite.in_turn(1, 2)
 @pytest.mark.parametrize("quality", [pytest.param("standard", marks=pytest.mark.bench), "paper"])
 def test_resume_brings_everything_back_to_the_device(quality, tmp_path):
     """States of every stage are read as from a file."""

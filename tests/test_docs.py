@@ -155,7 +155,7 @@ def params(pages, **options):
 
 
 LONG_PAGES = [page for page in RUN if page.stem in LONG]
-SHORT_PAGES = [page for page in RUN[1:] if page.stem not in LONG]  # those after the README
+SHORT_PAGES = [page for page in RUN[1:] if page.stem not in LONG]  # pages after the README, which runs at each commit
 
 
 @pytest.mark.parametrize(

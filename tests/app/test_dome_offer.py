@@ -132,6 +132,7 @@ def test_the_light_in_a_cone_is_the_integral_of_the_lamp_s_intensity():
     assert found == pytest.approx(beside, abs=5e-4)
 
 
+@pytest.mark.thorough
 def test_the_page_offers_a_dome_which_one_press_makes_and_which_has_a_preview(open_page, shared):
     page = open_page(shared.address)
     path = shared.folder / "lamp.toml"

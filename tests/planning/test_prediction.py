@@ -22,6 +22,7 @@ from bstcad.planning.prediction import (
 )
 from bstcad.scene.scene import load
 from bstcad.scene.target import MIN_PIXELS
+from tests import suite
 
 NET, PIXELS = "lens.back.control_points", "target.pixels"
 THU = load("templates/thu.toml")
@@ -128,7 +129,7 @@ def test_a_pilot_that_waited_for_the_compiler_is_designed_again(tiny, monkeypatc
     assert len(calls) == 3
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", suite.in_turns(SCENES, 3))
 def test_every_scene_is_predicted(name, tiny):
     template, changes = SCENES[name]
     scene = load(f"templates/{template}.toml", {"tailoring.quality": "draft"} | changes)

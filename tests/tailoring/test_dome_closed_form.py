@@ -32,6 +32,7 @@ from bstcad.optics.trace import trace
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.slope_map import Solver
 from bstcad.tailoring.stage1 import COARSE_FACE_FIT, FINE_FACE_FIT
+from tests import suite
 
 N, R, INNER = 1.4936, 15.0, 8.0  # index, radii in mm
 CONE, DISC = math.radians(80.0), math.radians(50.0)  # half angles Θ and Φ
@@ -144,6 +145,7 @@ def by_rounds(profile, m, plan):
     return lens
 
 
+@suite.in_turn(0, 2)
 @pytest.mark.parametrize(("profile", "finest", "at_rim"), [
     ("uniform", 128, 1e-4), pytest.param("lambertian", 256, 2e-4, marks=pytest.mark.bench),
 ])  # fmt: skip

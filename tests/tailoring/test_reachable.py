@@ -20,6 +20,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.tailoring.grazing import Grazing
 from bstcad.tailoring.run import Edge
+from tests import suite
 from tests.conftest import draws_nothing, quick_effort, verify_with
 
 SCENE = """
@@ -126,6 +127,7 @@ def test_refuse_names_angle_and_remedy(wide, capsys):
     assert not (wide.parent / "out").exists()
 
 
+@suite.in_turn(1, 2)
 def test_each_of_several_targets_is_cut_to_what_light_can_reach(wide):
     """A small target near by, which light reaches whole, and the wide one behind it, of which it reaches a disc."""
     text = wide.read_text()
@@ -171,6 +173,7 @@ def designed(tmp_path_factory):
         yield folder / "out", cli.run(["generate", str(folder / "wide.toml"), "-o", str(folder / "out")])
 
 
+@suite.in_turn(0, 2)
 def test_a_design_lights_its_part_without_total_reflection(designed):
     folder, code = designed
     report = json.loads((folder / "report.json").read_text())
@@ -181,6 +184,7 @@ def test_a_design_lights_its_part_without_total_reflection(designed):
     assert any("cannot be lit" in sentence for sentence in report["given_up"])
 
 
+@suite.in_turn(0, 2)
 def test_a_verification_keeps_to_the_part(designed):
     """The verification compares the stored target with the scene's on that part."""
     folder, _ = designed

@@ -16,7 +16,7 @@ from bstcad.scene.quality import VERIFICATION_SET
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
 from bstcad.tailoring.source_image import ExtendedSource
-from tests import two_faces
+from tests import suite, two_faces
 from tests.conftest import DISK, SMALL
 
 TINY = SMALL | {
@@ -89,12 +89,14 @@ def compensated():
     return found, judged(found.scene, found.lens)
 
 
+@suite.in_turn(0, 2)
 def test_the_size_of_the_source_is_made_up_for(compensated):
     found, rrmsd = compensated
     point = pipeline.design(found.scene.with_source_scaled(0.0), device="cpu")
     assert rrmsd < 0.7 * judged(found.scene, point.lens)
 
 
+@suite.in_turn(0, 2)
 def test_it_tells_what_each_size_costs(compensated):
     """Stage 2 is replaced; the rays between the stages see the source's points, which no tailoring sees."""
     found, rrmsd = compensated
@@ -144,6 +146,7 @@ def found():
     return design(load(DISK, TWINS), device="cpu").making.twins
 
 
+@suite.in_turn(1, 2)
 def test_the_twins_agree_to_what_single_precision_keeps(found):
     assert found["control_points"] == 33 and found["evaluations"] == stage2.COMPARED_EVALUATIONS
     assert 0 < found["merit"] < 1e-4  # sums of 2^16 tubes, each with some 1e-6 of the lens's size in its corners
@@ -163,6 +166,7 @@ def test_a_stationary_start_has_differences_that_are_finite(monkeypatch, merit, 
     assert (found.merit, found.gradient) == (difference, difference)
 
 
+@suite.in_turn(1, 2)
 def test_a_coarser_arithmetic_shows(monkeypatch, found):
     """Heights rounded to 1e-4 of themselves, as half precision would, in the single one of the twins."""
     call = stage2.Problem.__call__

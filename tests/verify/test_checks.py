@@ -26,7 +26,7 @@ from bstcad.scene.accept import Accept
 from bstcad.verify import checks, step_checks
 from bstcad.verify.checks import Check
 from bstcad.verify.verdict import verdict
-from tests.conftest import draws_nothing, verify_with
+from tests.conftest import draws_nothing, quick_effort, verify_with
 
 POINT = r"CARTESIAN_POINT\('',\([^,]*,[^,]*,\s*"  # up to its z
 NUMBER = r"([-+.E\d]+)"
@@ -196,6 +196,7 @@ def test_a_lens_out_of_its_place_fails_in_the_folder_of_its_design(folder, nomin
 def test_where_no_limit_was_asked_the_verdict_is_one_of_its_own(small_design, tmp_path, capsys, monkeypatch):
     """Neither a pass nor a fail, in the terminal, in report.json and in Python; a check that fails, fails."""
     draws_nothing(monkeypatch)
+    verify_with(monkeypatch, quick_effort())
     folder = shutil.copytree(small_design.folder, tmp_path / "unasked")
     text = (folder / "scene.toml").read_text(encoding="utf-8")
     (folder / "scene.toml").write_text(re.sub(r"(?ms)^\[accept\].*?(?=^\[|\Z)", "", text), encoding="utf-8")

@@ -28,6 +28,7 @@ from bstcad.optics.trace.measure import Effort, measure
 from bstcad.scene.mount import Mount
 from bstcad.scene.scene import load
 from bstcad.verify import step_checks
+from tests import suite
 from tests.conftest import DISK, draws_nothing, proofs, quick_effort
 from tests.lenses import net
 
@@ -58,7 +59,7 @@ def held(design, mount, curvature=None):
     return replace(lens, clear=mount.clear(lens)), mount
 
 
-@pytest.mark.parametrize("name", MOUNTS)
+@pytest.mark.parametrize("name", suite.in_turns(MOUNTS, 3))
 def test_the_light_is_that_of_rays_through_the_faces_of_the_part(design, name, tmp_path):
     """Polygons along the edges of part.step's faces decide which rays get through: all parallel, or from a point."""
     table = dict(MOUNTS[name])
@@ -182,6 +183,7 @@ def cut(tmp_path_factory):
     return scene, folder, report, kept[0]
 
 
+@suite.in_turn(0, 2)
 def test_a_lens_is_tailored_for_what_the_mount_leaves_of_it(cut):
     _, folder, contents, proof = cut
     assert proof.passed and proof.light.rrmsd < 0.03  # of the uncut lens through these apertures over 0.4
@@ -190,6 +192,7 @@ def test_a_lens_is_tailored_for_what_the_mount_leaves_of_it(cut):
     assert bstcad.open(folder).lens.clear == (Circle(4.5), Circle(4.5))
 
 
+@suite.in_turn(0, 2)
 def test_the_figures_of_its_shape_are_those_of_what_is_left(cut):
     """The corners of the whole square are thicker than the edge of the circle that is cut out of it."""
     _, folder, contents, proof = cut
@@ -200,6 +203,7 @@ def test_the_figures_of_its_shape_are_those_of_what_is_left(cut):
     assert proof.shape["thickness_max"] < describe(lens, 129)["thickness_max"] - 1e-3
 
 
+@suite.in_turn(0, 2)
 def test_a_part_with_another_rim_is_judged_by_its_own_light_and_fails_by_name(cut, tmp_path):
     scene, folder, _, before = cut
     made = bstcad.open(folder)

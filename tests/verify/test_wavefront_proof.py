@@ -17,6 +17,7 @@ from bstcad.optics.trace.wavefront_error import wavefront_error
 from bstcad.report import record, report
 from bstcad.verify import checks
 from bstcad.verify.nominal import Nominal
+from tests import suite
 from tests.conftest import flat_pictures, proofs, quick_effort
 from tests.two_faces import CHANGES, made_of, scene_of
 
@@ -48,6 +49,7 @@ def judged(lens, nominal, **accept):
     return error, {check.id: check for check in found}
 
 
+@suite.in_turn(0, 3)
 def test_the_written_lens_has_the_wavefront_of_the_designed_one(one):
     scene, lens = one.made.scene, one.made.lens
     designed, found = wavefront_error(scene.source, lens, scene.wavefront), one.proof.wavefront
@@ -56,6 +58,7 @@ def test_the_written_lens_has_the_wavefront_of_the_designed_one(one):
     assert found.rays == designed.rays and found.wavelength == 633.0 and 0 < found.floor < 1e-8
 
 
+@suite.in_turn(0, 3)
 def test_without_a_limit_both_values_are_stated(one):
     found = {check.id: check for check in one.report.checks if check.id.startswith("wavefront")}
     assert found.keys() == {RMS, FLOOR} and all(check.passed and check.limit is None for check in found.values())
@@ -63,6 +66,7 @@ def test_without_a_limit_both_values_are_stated(one):
     assert one.report.passed and found[FLOOR].topic == "check-wavefront-floor"
 
 
+@suite.in_turn(0, 3)
 def test_a_wavefront_beyond_its_limit_fails(one):
     nominal, rms = folders.read_nominal(one.folder)[1], one.proof.wavefront.without_tilt.rms
     assert nominal.scene.wavefront == one.made.scene.wavefront
@@ -72,12 +76,14 @@ def test_a_wavefront_beyond_its_limit_fails(one):
     assert found[RMS].passed and found[RMS].limit == 1.01 * rms
 
 
+@suite.in_turn(0, 3)
 def test_a_limit_that_rounding_hides_fails_by_the_floor(one):
     nominal, floor = folders.read_nominal(one.folder)[1], one.proof.wavefront.floor
     _, found = judged(one.proof.lens, nominal, wavefront=5 * floor)
     assert not found[FLOOR].passed and found[FLOOR].limit == 0.5 * floor
 
 
+@suite.in_turn(0, 3)
 def test_a_wave_that_no_light_meets_fails_and_has_no_figures(one):
     nominal, beside = folders.read_nominal(one.folder)[1], ZernikeWave((0.0,), 1.0, z=60.0, centre=(500.0, 0.0))
     nominal = replace(nominal, scene=nominal.scene.model_copy(update={"wavefront": beside}))
@@ -114,6 +120,7 @@ def test_waves_are_those_of_the_main_line():
 # ---- the report ------------------------------------------------------------------------------------------------------
 
 
+@suite.in_turn(0, 3)
 def test_report_json_tells_the_wavefront_and_reads_back(one):
     told, error = json.loads((one.folder / "report.json").read_text())["wavefront"], one.proof.wavefront
     assert list(told) == KEYS and told["removed"] == "piston and tilt" and told["z"] == 60.0
@@ -126,6 +133,7 @@ def test_report_json_tells_the_wavefront_and_reads_back(one):
     assert error.flux > 1 == told["flux"]  # on a grid the edge of the beam is a little too wide
 
 
+@suite.in_turn(0, 3)
 def test_the_page_the_terminal_and_the_figures_show_it(one):
     page = (one.folder / "report.html").read_text(encoding="utf-8")
     assert page.count("<h2>Wavefront</h2>") == 1 and page.count("optical path difference in waves") == 1

@@ -14,6 +14,7 @@ from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.profiles import Net, Profile
 from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.outlines import EVERYWHERE, Circle, Rectangle, Rounded
+from tests import suite
 from tests.lenses import Measured
 
 APERTURES = [Circle(5.0), Rectangle(8.0, 3.0), Rounded(9.0, 7.0, corner_radius=2.0)]
@@ -34,7 +35,7 @@ def summed(law, outline, n=3000):
 
 
 @pytest.mark.parametrize("outline", APERTURES, ids=str)
-@pytest.mark.parametrize("name", PROFILES)
+@pytest.mark.parametrize("name", suite.in_turns(PROFILES, 3))
 def test_the_flux_inside_an_outline_is_the_sum_over_small_cells(name, outline):
     assert PROFILES[name].flux(outline) == pytest.approx(
         summed(PROFILES[name], outline), rel=2e-3
