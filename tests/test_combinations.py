@@ -49,7 +49,8 @@ from bstcad.planning.preview import PreviewSize, preview
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import as_front, net_extent
 from bstcad.scene.lamp import IntensityFile, RayFile
-from bstcad.tailoring.run import stage_effort
+from bstcad.tailoring import effort as efforts
+from bstcad.tailoring.effort import TailoringEffort
 from bstcad.tailoring.stage2 import PrecisionComparison
 from tests import suite
 from tests.conftest import verify_with
@@ -466,16 +467,22 @@ MAY_REFUSE = (  # sentences of designs, and the choices that cannot be had toget
 COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which figures are found
     "optics.trace.measure": {"SETS": 4, "MIN_TUBES": 48, "MIN_SOURCE_POINTS": 2, "MAX_SOURCE_POINTS": 4},
     "scene.scene": {"VERIFICATION_POINTS": 4},
-    "tailoring.run": {
-        "FINE_EFFORT": Effort(48, accuracy=0.0, witness=False),
-        "STAGE_EFFORT": Effort(96, accuracy=0, witness=False),
-        "STAGE_EFFORT_PIXELS": 48,
-        "FLUX_EFFORT": Effort(32, accuracy=1.0, witness=False),
-        "WAVEFRONT_TUBES": 48,
+    "tailoring.effort": {
+        "FULL": TailoringEffort(
+            stage=Effort(96, accuracy=0, witness=False),
+            stage_pixels=48,
+            fine=Effort(48, accuracy=0.0, witness=False),
+            flux=Effort(32, accuracy=1.0, witness=False),
+            wavefront_tubes=48,
+            coarsest_grid=16,
+            trial_cells=24,
+            trial_pixels=32,
+            trial_iterations=20,
+            compared_tubes=16,
+            compared_evaluations=2,
+        )
     },
-    "tailoring.stage1": {"COARSEST_GRID": 16},
     "tailoring.slope_map.lit_window": {"__defaults__": (32,)},
-    "tailoring.stage2": {"COMPARED_EVALUATIONS": 2, "COMPARED_TUBES": 16},
     "tailoring.source_image": {
         "ERROR_RAYS": 32,
         "ERROR_POINTS": 4,
@@ -484,7 +491,6 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
         "IMAGE_PAIRS": 32,
     },
     "tailoring.machinability": {"THICKNESS_POINTS": 65, "QUARTER_RIM_POINTS": 129, "REPAIR_EVALUATIONS": 20},
-    "tailoring.feasibility": {"TRIAL_CELLS": 24, "TRIAL_PIXELS": 32, "TRIAL_ITERATIONS": 20},
     "analysis.light": {"MOUNT_RAYS": 48, "MIN_MOUNT_RAYS": 16, "MARGIN_RAYS": 64, "NEEDED_RAYS": 17},
     "analysis.light.blur": {"__defaults__": (12,)},
     "analysis.neglected_effects": {"FACE_POINTS": 24, "GHOST_RAYS_PER_SIDE": 16},
@@ -601,7 +607,7 @@ def _as_built(design):
     thickness = made.lens.back_net.vertex_z - made.lens.front.z + 0.02
     index = made.scene.index + 2e-3 if made.scene.lens.passes.enters else None
     found = as_built.retailor(made, AsBuilt(thickness=thickness, index=index))
-    again, effort = found.made, stage_effort(made.goals, as_built.RAYS)
+    again, effort = found.made, efforts.FULL.between_stages(made.goals, as_built.RAYS)
     after = max(light.rrmsd for light in again.lights(again.lens, again.goals, effort))
     if not after < 1.1 * max(found.design, found.before) + MAX_DIFFERENCE:
         yield f"as built: RRMSD {found.design:.3f} designed, {found.before:.3f} before, {after:.3f} after"

@@ -28,6 +28,7 @@ from bstcad.optics.trace.reach import MAX_EXIT_ANGLE, grazing_of, spread_at, unr
 from bstcad.runs import processes
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
+from bstcad.tailoring import effort as efforts
 from bstcad.tailoring import slope_map, stage1, stage2, two_faces
 from bstcad.tailoring.baselines import integration, paper
 from bstcad.tailoring.carried import carry_light
@@ -99,7 +100,7 @@ class DesignState:
     first: Stage1State | None = None  # state of stage 1; None: it has not begun, or it has ended
     followed: Stage1Result | None = None  # result of stage 1; None: it has not ended
     second: Stage2State | None = None  # state of stage 2 or 3; None: it has not begun, or it has ended
-    best: RatedLens | None = None  # best lens before or during stage 2 or 3; None: stage not running, or a preview
+    best: RatedLens | None = None  # best lens before or during stage 2 or 3; None: not running, or no lens is rated
     lens: Parameters | None = None  # lens after stage 2 or 3; None: tailoring has not ended
     stopped: str = ""  # reason why tailoring ended; "": it has not ended
 
@@ -110,7 +111,7 @@ class DesignOptions:
 
     merit: PictureError | None = None  # function of a picture and the target that stages 2 and 3 minimise; None: RRMSD²
     compare_later: bool = False  # compare float32 with float64 only when a report needs it (`Made.with_report_data`)
-    preview: bool = False  # make a preview, see `Task.preview`
+    effort: efforts.TailoringEffort | None = None  # effort beside the scene's settings; None: FULL
     earlier: Earlier | None = None  # earlier lens that stage 2 or 3 refines; None: stage 1 makes a lens
 
 
@@ -147,12 +148,13 @@ def design(
     goals, edge = within_reach(scene, hooks.progress)
     settings = scene.tailoring.resolved(scene.lens.back.net)
     later = options.compare_later and settings.max_time is None
-    task = replace(task_of(scene, goals, settings, edge), progress=hooks.progress, merit=merit, preview=options.preview)
+    task = task_of(scene, goals, settings, edge)
+    task = replace(task, progress=hooks.progress, merit=merit, effort=options.effort or efforts.FULL)
     if options.earlier is not None:
         if PROCEDURES[settings.method][2] is not stage2.steps:
             raise SceneError(f"tailoring.method: {settings.method!r} refines no earlier lens; remove this key")
         task = replace(task, refines=True)
-    if not task.preview:  # a preview is so small that the return of its memory takes longer than it helps
+    if task.effort.rates_lenses:  # a preview is so small that the return of its memory takes longer than it helps
         task = replace(task, tidy=processes.return_freed)
     task = with_solution(scene, task)
     fresh, start = start is None, start or DesignState(DesignRecord())
@@ -268,7 +270,7 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
         return found.part, None  # no part of the light is held from total internal reflection yet
     part = found.part
     if part is not None and scene.lens.front.free:  # another front may send light further
-        free, effort = scene.lens.front.free, stage1.FrontSearch(repeats=1)
+        free, effort = scene.lens.front.free, efforts.FrontSearch(repeats=1)
         shaped = stage1.shaped_front(light.source, lens, goal, free, rim_sags=scene.rim_sags, effort=effort)
         part = reach_of(light.source, lens.with_front(shaped.front), goal, grazing=grazing).part
     if part is None:
@@ -425,7 +427,8 @@ def _stage2(
     name, steps = second_stage(task, lens, state)
     full = task.at_full_size
     known = not task.sampled_sources and lens.clear is None
-    first = None if task.preview else full.rated(lens, followed.rrmsd if known else full.rrmsd(lens))
+    rates = task.effort.rates_lenses
+    first = full.rated(lens, followed.rrmsd if known else full.rrmsd(lens)) if rates else None
 
     def design_state(state: Stage2State) -> DesignState:
         return DesignState(driver.record, None, followed, state, best=driver.best)
@@ -447,7 +450,7 @@ def _final_lens(task: Task, driver: Driver, last: StageStep, before: Sequence[Ra
     """
     lens = last.lens
     corrected, value = _corrected(task, lens), last.rays_rrmsd
-    if task.preview:
+    if not task.effort.rates_lenses:
         return corrected
     if active_bounds(lens, task.bounds, task.min_thickness) is not None:
         driver.end(BOUNDS_STAGE, value := task.rrmsd(corrected))

@@ -33,6 +33,7 @@ from bstcad.scene.real_source import DEFAULT_DIAMETER as DEFAULT_DIAMETER
 from bstcad.scene.real_source import DEFAULT_DIVERGENCE as DEFAULT_DIVERGENCE
 from bstcad.scene.real_source import real_size
 from bstcad.scene.scene import Scene
+from bstcad.tailoring.effort import FrontSearch
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import Solver, face_grid, fit_to_map, lit_window, slope_map, square_grid
@@ -57,7 +58,7 @@ def coarse_lens(scene: Scene) -> Lens:
         from bstcad.tailoring import stage1  # with scipy.optimize, a tenth of a second to load
 
         start = replace(lens, back=scene.flat_lens(FRONT_NET).back)
-        free, effort = scene.lens.front.free, stage1.FrontSearch(COARSE_CELLS, COARSE_STEPS, repeats=1)
+        free, effort = scene.lens.front.free, FrontSearch(COARSE_CELLS, COARSE_STEPS, repeats=1)
         found = stage1.shaped_front(channel.source, start, goal, free, rim_sags=scene.rim_sags, effort=effort)
         lens = replace(lens, front=found.front)
     slopes, z = None, lens.back.z

@@ -1,6 +1,6 @@
 """A preview of a scene: the light of its lens after about a second, from a reduced design.
 
-The preview is a quick design (`Task.preview`) of the same scene with fewer pixels, control points, flux tubes and
+The preview is a design with the effort PREVIEW of the same scene with fewer pixels, control points, flux tubes and
 evaluations.  Details finer than its pixels are not shown.
 """
 
@@ -30,6 +30,7 @@ from bstcad.optics.trace.source_images import landing_pixels
 from bstcad.optics.trace.tubes import corners, middle
 from bstcad.scene.dome_back import MIN_DOME_POINTS
 from bstcad.scene.scene import Scene
+from bstcad.tailoring.effort import PREVIEW
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Hooks, Progress
 from bstcad.tailoring.source_image import ExtendedSource
@@ -107,7 +108,7 @@ def preview(scene: Scene, size: PreviewSize = QUICK, outdated: Callable[[], bool
     began, remarks = time.perf_counter(), list(scene.warnings())
     small = reduced_scene(scene, size)
     hooks = Hooks(progress=_progress(outdated, remarks))
-    made = pipeline.design(small, hooks=hooks, options=pipeline.DesignOptions(compare_later=True, preview=True))
+    made = pipeline.design(small, hooks=hooks, options=pipeline.DesignOptions(compare_later=True, effort=PREVIEW))
     return replace(_evaluate(small, made), remarks=tuple(remarks), seconds=time.perf_counter() - began)
 
 

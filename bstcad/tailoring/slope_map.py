@@ -48,6 +48,7 @@ from bstcad.optics.trace.trace import across, behind, clear_window, is_transmitt
 from bstcad.optics.trace.tubes import rays_to
 from bstcad.optics.trace.unfolding import image_screen
 from bstcad.runs.files import SceneError
+from bstcad.tailoring.effort import GATHERING, Gathering
 from bstcad.tailoring.slope_fit import Fit, blocks, fit_slopes, monomials, with_polynomial
 from bstcad.transport.density import Density, resample_flux
 from bstcad.transport.mapping import Frame, Mapping, Points, TransportMap, nodes, solve
@@ -56,13 +57,11 @@ from bstcad.transport.mapping import Solver as Solver  # exported to packages th
 SUBCELLS = 2  # samples of the light per axis in a transport cell, since a rim may cross the cell
 SUBPIXELS = 8  # number of pixel parts per axis in a transport cell; a pixel has at least one part
 SLOPE_FLOOR = 1e-3  # smallest density of light over slopes, relative to its mean: the solver needs light in black parts
-GATHERING_NET, GATHERING_SAMPLES = 33, 96  # control points per side of g, and samples per side for its fit
+GATHERING_NET = 33  # control points per side of g
 GATHERING_WIDTH = (GATHERING_NET - 1) / (GATHERING_NET - 5)  # width of g / width of the window: end spans lie outside
-GATHERING_FIT = Fit(bending=1e-3, steps=40, degree=5)  # fit of g
 PARABOLOID_FIT = Fit(steps=0, degree=2)  # fit of g by a paraboloid, if no face can send all light to m
 BENDING_DEGREE, BENDING_STEP = 8, 1e-3  # degree of g on a dome; step of its differences / width of the window
 BENT_SHARE = 0.5  # share of a round's b(t) on a dome; with all of it large deflections make the rounds diverge
-PREVIEW_FIT, PREVIEW_SAMPLES = Fit(steps=0, degree=5), 32  # fit and samples per side of g in a preview, 5 times faster
 TARGET_FLOOR = 1e-3  # smallest irradiance of the target in the map of the paper, relative to its mean
 
 Slopes = tuple[Tensor, Tensor]  # ∂z/∂x and ∂z/∂y, of one shape
@@ -144,12 +143,12 @@ class SlopeMap:
 
 
 def slope_map(
-    lens: Lens, grid: FaceGrid, goal: Goal, previous: SlopeMap | None, solver: Solver, preview: bool = False
+    lens: Lens, grid: FaceGrid, goal: Goal, previous: SlopeMap | None, solver: Solver, effort: Gathering = GATHERING
 ) -> SlopeMap:
     """Return the slope map of one round, for the sag of `lens`.
 
     grid: `square_grid` of the lit window.  previous: map of the last round, which gives b(t); None: b = 0.
-    preview: use a coarser fit of g, which does not change the fixed point.
+    effort: of the fit of g.
     """
     picture, screen, law = goal.picture, image_screen(lens, goal.screen), lens.last_tailored.law
     t = pixel_corners(screen)
@@ -159,7 +158,7 @@ def slope_map(
     else:
         b = (np.zeros_like(t[0]), np.zeros_like(t[1])) if flat else straight_points(grid, screen, lit_corners(picture))
     if flat:
-        g = gathering(grid, lens, screen.receiver, centroid(picture, screen), preview=preview)
+        g = gathering(grid, lens, screen.receiver, centroid(picture, screen), effort)
     else:
         g = bending(grid, lens, screen.receiver, t, points=b, lit=lit_corners(picture))
     needed = wanted_slopes(rays_at(grid, b), torch.from_numpy(np.stack(t)), screen.receiver, law)
@@ -266,18 +265,17 @@ def centroid(picture: np.ndarray, screen: Screen) -> tuple[float, float]:
 
 
 def gathering(
-    grid: FaceGrid, lens: Lens, receiver: Receiver, middle: tuple[float, float], preview: bool = False
+    grid: FaceGrid, lens: Lens, receiver: Receiver, middle: tuple[float, float], effort: Gathering
 ) -> BSplineSurface:
     """Return g, the net of GATHERING_NET points per side whose slopes fit p(b, m) best over the lit part of a grid.
 
     The slopes p(b, m) themselves are in general not exactly the gradient of a surface.  middle: m on the receiver.
     """
-    count, fit = (PREVIEW_SAMPLES, PREVIEW_FIT) if preview else (GATHERING_SAMPLES, GATHERING_FIT)
-    few, law = grid.thinned(count), lens.last_tailored.law
+    few, law = grid.thinned(effort.samples), lens.last_tailored.law
     x, y = few.at_face.places
     aim = torch.stack([torch.full_like(x, m) for m in middle])
     reaches = reach_margin(few.at_face, aim, receiver, law=law) >= 0  # False: the slope is a placeholder
-    fit = fit if few.at_face.chart is not HEIGHTS or bool(reaches[few.density > 0].all()) else PARABOLOID_FIT
+    fit = effort.fit if few.at_face.chart is not HEIGHTS or bool(reaches[few.density > 0].all()) else PARABOLOID_FIT
     return fit_gathering(few, wanted_slopes(few.at_face, aim, receiver, law), fit)
 
 
@@ -293,7 +291,7 @@ def bending(
     half_x, half_y = (GATHERING_WIDTH * size / 2 for size in (grid.window.width, grid.window.height))
     flat = torch.zeros((GATHERING_NET, GATHERING_NET), dtype=torch.float64)
     net, law = BSplineSurface(0.0, flat, (-half_x, half_x), (-half_y, half_y)), lens.last_tailored.law
-    few = tuple(slice(None, None, max(1, n // GATHERING_SAMPLES)) for n in lit.shape)
+    few = tuple(slice(None, None, max(1, n // GATHERING.samples)) for n in lit.shape)
     x, y, *aims = (p[few][lit[few]] for p in (*points, *corners))
     aim, step = torch.from_numpy(np.stack(aims)), BENDING_STEP * grid.window.width
 

@@ -31,11 +31,12 @@ from bstcad.optics.surfaces.sides import as_pair, coarser
 from bstcad.optics.trace.reach import MAX_EXIT_ANGLE
 from bstcad.optics.trace.trace import clear_window, trace
 from bstcad.tailoring import slope_map
+from bstcad.tailoring.effort import FrontSearch
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.merit import mean_square_miss
 from bstcad.tailoring.reachable import resample
 from bstcad.tailoring.run import Parameters, StageStep, Steps, Task
-from bstcad.tailoring.settings import COARSEST_GRID, CONIC_CONSTANTS, SEARCH_RANGE
+from bstcad.tailoring.settings import CONIC_CONSTANTS, SEARCH_RANGE
 from bstcad.tailoring.slope_fit import Fit, tailor_to_aim
 from bstcad.tailoring.slope_map import SlopeMap
 from bstcad.transport.bfm import TransportStep
@@ -71,18 +72,6 @@ class SlopeRound:
     slopes: SlopeMap  # map of the last round
 
 
-@dataclass(frozen=True)
-class FrontSearch:
-    """Effort of `shaped_front`."""
-
-    cells: int = COARSEST_GRID  # cells per side of the transport map
-    iterations: int = 100  # iterations of the map; stage 1 states its own number
-    repeats: int = 3  # slope fits of the back for each front
-
-
-PREVIEW_NET, PREVIEW_SEARCH = 17, FrontSearch(cells=32, iterations=40, repeats=1)  # points per side; effort in previews
-
-
 def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
     """Yield the steps of stage 1 from a blank, or from a saved state.
 
@@ -91,15 +80,15 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
     """
     lens = task.heaviest.through(lens)
     if state is None and task.free:
-        net, effort = task.settings.levels[0], FrontSearch(iterations=task.settings.transport_iterations)
-        if task.preview:
-            net, effort = coarser(lens.back_net.shape, PREVIEW_NET), PREVIEW_SEARCH
+        few, settings = task.effort.front_net, task.settings
+        net = settings.levels[0] if few is None else coarser(lens.back_net.shape, few)
+        effort = task.effort.front_search or FrontSearch(iterations=settings.transport_iterations)
         source, blank = task.heaviest.source, lens.refined(net)
         shaped = shaped_front(source, blank, task.goals[0], task.free, rim_sags=task.rim_sags, effort=effort)
         lens = lens.with_front(shaped.front)
     for last in follow_slopes(task, lens, state):
         yield last
-    if task.preview:
+    if not task.effort.rates_lenses:
         return
     first, by_rays = last.lens, task.rrmsd(last.lens)
     yield replace(last, state=None, rays_rrmsd=by_rays)
@@ -158,7 +147,7 @@ def round_step(task: Task, lens: Lens, state: SlopeRound, face_points: Points) -
 def _round(task: Task, lens: Lens, previous: SlopeMap | None, number: int) -> tuple[Lens, SlopeMap]:
     """Run the round of this number (from 0); return the lens and the map to which it is fitted."""
     settings, source, goal, left = task.settings, task.heaviest.source, task.goals[0], task.settings.rounds - number
-    cells = max(COARSEST_GRID, settings.transport_grid // 2 ** min(left - 1, 2))
+    cells = max(task.effort.coarsest_grid, settings.transport_grid // 2 ** min(left - 1, 2))
     m = settings.levels[max(-left, -len(settings.levels))] if left <= FINE_ROUNDS else settings.levels[0]
 
     def progress(s: TransportStep) -> None:
@@ -168,7 +157,7 @@ def _round(task: Task, lens: Lens, previous: SlopeMap | None, number: int) -> tu
     window = slope_map.lit_window(source, lens)
     grid = slope_map.square_grid(source, lens, window, cells)
     solver = Solver(settings.transport_iterations, progress=progress)
-    slopes = slope_map.slope_map(lens, grid, goal, previous, solver=solver, preview=task.preview)
+    slopes = slope_map.slope_map(lens, grid, goal, previous, solver=solver, effort=task.effort.gathering)
     sides = [min(2 * points, settings.rays) for points in as_pair(m)]
     parts = math.ceil(max(sides) / MAX_RAY_CELLS)
     grid = slope_map.face_grid(source, lens, window, (math.ceil(sides[0] / parts), math.ceil(sides[1] / parts)))
@@ -186,8 +175,9 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     """
     settings, goal, z = task.settings, task.goals[0], lens.back.z
     for number in range(AIM_ROUNDS):
-        last = number == AIM_ROUNDS - 1
-        n, m = (settings.transport_grid, settings.levels[-1]) if last else (COARSEST_GRID, settings.levels[0])
+        n, m = settings.transport_grid, settings.levels[-1]
+        if number < AIM_ROUNDS - 1:
+            n, m = task.effort.coarsest_grid, settings.levels[0]
         lens = task.refined(lens, m)
         points = max(as_pair(m))
         side = min(3 * points, max(2 * points, settings.rays))  # many rays may leave through the sides

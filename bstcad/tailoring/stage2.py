@@ -93,9 +93,6 @@ CELLS_PER_POINT, CELL_MARGIN, MAX_CELLS = 4.0, 0.25, 1 << 22
 # easily; share of the errors on cells smaller than each further size in the rest.
 CELL_SHARE, CELL_SHARE_POWER, FINER_SHARE = 0.21, 0.33, 0.2
 MIN_EVALUATIONS = 30  # evaluations below which stage 2 has a single round and stage 3 gets twice as many
-COMPARED_NET = 65  # largest number of control points per side in `compare_precisions`, for speed
-COMPARED_TUBES = 128  # tubes per side in `compare_precisions`
-COMPARED_EVALUATIONS = 6  # evaluations in each precision in `compare_precisions`
 # Rounds of stage 3: (size of the source, evaluations), as fractions of the full size and of all evaluations.  Each
 # round measures the error of the blur anew (source_image.py).
 SOURCE_SIZES = ((1 / 3, 1 / 8), (2 / 3, 1 / 8), (1.0, 1 / 4), (1.0, 1 / 4), (1.0, 1 / 4))
@@ -162,7 +159,7 @@ class TubeRound:
         merit = Merit.of(self.channels, lens, self.tubes, goals, overshoot=overshoot, wave=task.wave)
         merit = replace(merit, picture_error=task.merit, shares=self.shares)
         # the blur by a source hides folds; two nets that form several goals converge slowly without them
-        may_fold = task.merit is not None or task.preview or task.several or task.extended_sources
+        may_fold = task.merit is not None or not task.effort.refines_merit or task.several or task.extended_sources
         if not may_fold and any(map(needs_no_folds, task.goals)):
             with torch.no_grad():
                 landed = merit.landing(lens).on_goals
@@ -172,7 +169,7 @@ class TubeRound:
             merit = replace(merit, folds=tuple(folds))
         if self.source is None:
             return merit
-        return merit.with_blur(self.source, lens, seed=None if task.preview else task.settings.seed)
+        return merit.with_blur(self.source, lens, seed=task.settings.seed if task.effort.refines_merit else None)
 
     def run(
         self, problem: Problem, variables: NetVariables, position: SearchPosition, total: int,
@@ -199,7 +196,7 @@ class TubeRound:
                     step = replace(step, rrmsd=best.figure)
                     reason = "accuracy" if best.figure <= position.goal_by_tubes else reason
                 if self.ends_distorted and not reason and best.evaluations % COMPARISON_INTERVAL == 0:
-                    rough = self.task.rrmsd(step.lens, self.task.stage_effort(ROUGH_RAYS))
+                    rough = self.task.rrmsd(step.lens, self.task.effort.between_stages(self.task.goals, ROUGH_RAYS))
                     distorted = best.figure < DISTORTION_RATIO * rough
                     reason = "distortion" if distorted else ""
             if iterate.state is not None and not reason:
@@ -256,7 +253,7 @@ def _fine_round(task: Task, tubes: int, evaluations: int, is_last: bool) -> Tube
     ends_early = resolved and few and task.settings.stage2_iterations <= SHORT_EVALUATIONS
     return TubeRound(
         task, tubes, evaluations, plateau=FEW_TUBES if ends_early else PLATEAU, resolved=resolved,
-        ends_distorted=len(task.goals) > 1 and not task.preview and not is_last,
+        ends_distorted=len(task.goals) > 1 and task.effort.divides_rounds and not is_last,
         shares=shares_on_cells(task, cells if is_last or cells <= 2 else cells // 2),
     )  # fmt: skip
 
@@ -273,7 +270,7 @@ def finest_cells(task: Task) -> int:
     bright, its pixels have more cells of the net: ten for letters.  Half pixels are rated in any case, and are the
     smallest cells for several goals, with which two nets converge faster.
     """
-    if task.merit is not None or task.preview:
+    if task.merit is not None or not task.effort.refines_merit:
         return 1
     wanted = math.log2(CELLS_PER_POINT * task.settings.side / pixels_of(task))
     most = math.log2(MAX_CELLS / max(math.prod(goal.screen.shape) for goal in task.goals)) / 2
@@ -302,7 +299,8 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
     """
     limit = min(max(task.goals[0].screen.shape) - 1, task.settings.side // 2)  # pixels that the net can resolve
     rounds = [TubeRound(task, tubes, count, pixels=pixels) for pixels, tubes, count in COARSE_ROUNDS if pixels <= limit]
-    if not rounds or task.merit is not None or task.several or task.preview or not task.settings.stage2_iterations:
+    one_round = not task.effort.divides_rounds or not task.settings.stage2_iterations
+    if not rounds or one_round or task.merit is not None or task.several:
         return ()  # several goals: two nets would distort between so few tubes
     coarse, tubes = with_pixels(task, LARGE_PIXELS), COARSE_ROUNDS[0][1]
     [goal] = coarse.goals
@@ -317,7 +315,7 @@ def with_pixels(task: Task, pixels: int) -> Task:
 
 def round_shares(task: Task) -> RoundFractions | None:
     """Return the rounds of a task; None: `sheet_sizes` chooses dense, finer or sparse rounds."""
-    if task.preview:
+    if not task.effort.divides_rounds:
         return ((1.0, 1.0),)
     if not task.several:
         few = DENSE_ROUNDS[0][0] * task.settings.rays < DENSE_TUBES * task.settings.side  # in the first round
@@ -407,7 +405,7 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
             elif reason != "evaluations":
                 break
         del merit, problem  # free the sheet before the next one is made
-        by_rays = None if task.preview else measured or task.rrmsd(lens)
+        by_rays = (measured or task.rrmsd(lens)) if task.effort.rates_lenses else None
         full = task.channels == rounds[-1].task.channels  # True: the light of the source at full size
         if by_rays is not None and by_rays <= accuracy:
             reason = "accuracy"  # reached according to rays, perhaps not according to tubes
@@ -543,7 +541,7 @@ def with_stage3(before: Stage | None, task: Task, lens: Lens, state: Any = None)
 
 
 def stage3_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
-    """Return the rounds of stage 3, one per entry of SOURCE_SIZES; in a preview, one round.
+    """Return the rounds of stage 3, one per entry of SOURCE_SIZES, or one round.
 
     lens: lens at the start.  Cells narrower than half of the source's image through it are not rated: it blurs them.
     """
@@ -552,7 +550,7 @@ def stage3_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
         for channels, source in zip(task.sampled_sources, task.extended_sources, strict=True)
     ]
     settings, screens = task.settings, [goal.screen for goal in task.goals]
-    if task.preview:
+    if not task.effort.divides_rounds:
         source = task.extended_sources[-1]
         return (TubeRound(lights[-1], settings.rays, settings.stage2_iterations, "stage 3", source=source),)
     counts = stage3_sheet_sizes(settings, (max(each.columns for each in screens), max(each.rows for each in screens)))
@@ -599,18 +597,18 @@ def compare_precisions(task: Task, lens: Lens) -> PrecisionComparison:
 
     Rounding can change where a line search ends, so the lenses may differ by more than rounding and be equally good.
     """
-    lens = lens.with_nets(net.refined(coarser(net.shape, COMPARED_NET)) for net in lens.nets)
+    lens = lens.with_nets(net.refined(coarser(net.shape, task.effort.compared_net)) for net in lens.nets)
     (merit, gradient, single), (exact_merit, exact_gradient, double) = (
         _tailor_briefly(task, lens.to(d)) for d in (torch.float32, torch.float64)
     )
-    n, goal = round(side_factor(task.channels) * (COMPARED_TUBES + 1)), task.goals[0]
+    n, goal = round(side_factor(task.channels) * (task.effort.compared_tubes + 1)), task.goals[0]
     rrmsd = [rrmsd_by_tubes(end, task.channels, goal, n=n) for end in (single, double)]
     pairs = zip(single.nets, double.nets, strict=True)
     return PrecisionComparison(
         control_points=max(max(net.shape) for net in lens.nets),
         merit=_relative(abs(merit - exact_merit), abs(merit), abs(exact_merit)),
         gradient=_relative(*(float(each.norm()) for each in (gradient - exact_gradient, gradient, exact_gradient))),
-        evaluations=COMPARED_EVALUATIONS,
+        evaluations=task.effort.compared_evaluations,
         rrmsd_float64=rrmsd[1],
         rrmsd_float32=rrmsd[0],
         heights=max(float((a.heights - b.heights).abs().max()) for a, b in pairs),
@@ -623,12 +621,12 @@ def _relative(difference: float, *sizes: float) -> float:
 
 
 def _tailor_briefly(task: Task, lens: Lens) -> tuple[float, Tensor, Lens]:
-    """Return merit and gradient at the start, and the lens after COMPARED_EVALUATIONS, in the precision of `lens`."""
-    n = min(COMPARED_TUBES, task.settings.rays)
+    """Return merit and gradient at the start, and the lens after a few evaluations, in the precision of `lens`."""
+    n = min(task.effort.compared_tubes, task.settings.rays)
     merit = Merit.of(task.channels, lens, n, task.goals[:1], overshoot=task.settings.overshoot)
     merit = replace(merit, picture_error=task.merit)
     problem, variables = Problem(lens, merit), variables_of(task, lens)
     value, gradients, _ = problem([net.heights for net in lens.nets])
-    *_, last = minimise_merit(lens, problem, variables, COMPARED_EVALUATIONS)
+    *_, last = minimise_merit(lens, problem, variables, task.effort.compared_evaluations)
     flat = torch.cat([g.reshape(-1).double().cpu() for g in gradients])
     return value, flat, with_best_nets(lens, variables, last.best).plain()

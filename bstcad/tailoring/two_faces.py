@@ -31,10 +31,10 @@ from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.optics.surfaces.rays import Rays
 from bstcad.optics.trace.reach import limit_refraction, slopes_towards
 from bstcad.tailoring import slope_map, stage1
+from bstcad.tailoring.effort import GATHERING
 from bstcad.tailoring.light_behind import LightBehind, light_for_task, without_crossings
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.run import Parameters, Steps, Task
-from bstcad.tailoring.settings import COARSEST_GRID
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.tailoring.slope_map import FaceGrid, SlopeMap, Slopes
 from bstcad.transport.bfm import TransportStep
@@ -71,7 +71,7 @@ def steps(task: Task, lens: Lens, state: stage1.SlopeRound | None = None) -> Ste
         return
     for last in follow_rays(task, lens, state if isinstance(state, FrontRound) else None):
         yield last
-    if not task.preview:
+    if task.effort.rates_lenses:
         yield replace(last, state=None, rays_rrmsd=task.rrmsd(last.lens))
 
 
@@ -89,7 +89,7 @@ def follow_rays(task: Task, lens: Lens, state: FrontRound | None) -> Steps:
             left = settings.rounds - number
             fine = left <= FINE_PAIR_ROUNDS
             halvings = 0 if left == 1 else 1 if fine else 2
-            cells = max(COARSEST_GRID, settings.transport_grid // 2**halvings)
+            cells = max(task.effort.coarsest_grid, settings.transport_grid // 2**halvings)
             level = settings.levels[max(-1 - halvings, -len(settings.levels))] if fine else settings.levels[0]
             lens = task.refined(lens, level)
             fit = stage1.FINE_FACE_FIT if fine else stage1.COARSE_FACE_FIT
@@ -166,7 +166,7 @@ def _in_space(rays: Rays) -> Tensor:
 
 def _gathering(grid: FaceGrid, lens: Lens, back: Tensor, stretch: np.ndarray, shift: np.ndarray) -> BSplineSurface:
     """Return g (see the module) fitted to the lit part of a grid; back: b (3, …) mm; r(q) = stretch q + shift."""
-    few = grid.thinned(slope_map.GATHERING_SAMPLES)
+    few = grid.thinned(GATHERING.samples)
     x, y, z = _in_space(few.at_face).cpu().double()
     height = float(total(back[2]) / back[2].numel())
     r = torch.stack([stretch[0] * x + shift[0], stretch[1] * y + shift[1], torch.full_like(x, height)])
@@ -178,4 +178,4 @@ def _gathering(grid: FaceGrid, lens: Lens, back: Tensor, stretch: np.ndarray, sh
         nudge[axis] = step
         shifted = _slopes_at(few.at_face, r + nudge, lens)[axis]
         quotient += float(total((shifted - p[axis])[lit]) / lit.sum()) / (2 * step)
-    return slope_map.fit_gathering(few, (p[0] - r[0] * quotient, p[1] - r[1] * quotient), slope_map.GATHERING_FIT)
+    return slope_map.fit_gathering(few, (p[0] - r[0] * quotient, p[1] - r[1] * quotient), GATHERING.fit)

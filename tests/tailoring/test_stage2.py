@@ -15,6 +15,7 @@ from bstcad.optics.trace.measure import rrmsd_by_tubes
 from bstcad.scene.quality import VERIFICATION_SET
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
+from bstcad.tailoring.effort import FULL
 from bstcad.tailoring.source_image import ExtendedSource
 from tests import suite, two_faces
 from tests.conftest import DISK, SMALL
@@ -148,7 +149,7 @@ def found():
 
 @suite.in_turn(1, 2)
 def test_the_twins_agree_to_what_single_precision_keeps(found):
-    assert found["control_points"] == 33 and found["evaluations"] == stage2.COMPARED_EVALUATIONS
+    assert found["control_points"] == 33 and found["evaluations"] == FULL.compared_evaluations
     assert 0 < found["merit"] < 1e-4  # sums of 2^16 tubes, each with some 1e-6 of the lens's size in its corners
     assert 0 < found["gradient"] < 1e-2
     assert found["rrmsd_float32"] == pytest.approx(found["rrmsd_float64"], rel=0.2)  # two line searches, equally good

@@ -28,7 +28,8 @@ from bstcad.scene.blank import INDEX_OFFSETS
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import FIT_SIZES, FileNet, NetFront, fit_net, net_extent
 from bstcad.scene.scene import Scene
-from bstcad.tailoring.run import NO_HOOKS, Hooks, NetParameters, Parameters, stage_effort
+from bstcad.tailoring import effort as efforts
+from bstcad.tailoring.run import NO_HOOKS, Hooks, NetParameters, Parameters
 
 KEYS = "front", "thickness", "index"
 OPTION = "--as-built"
@@ -88,9 +89,8 @@ def retailor(made: Made, built: AsBuilt, hooks: Hooks = NO_HOOKS) -> Retailored:
     found = design(scene, device=made.device, hooks=hooks, options=options)
     before = earlier.parameters.apply_to(scene.flat_lens(scene.lens.back.net))
     states = (made, made.lens), (found, scene.as_mounted(replace(before.plain(), index=scene.index)))
-    rrmsds = (
-        max(light.rrmsd for light in of.lights(lens, of.goals, stage_effort(of.goals, RAYS))) for of, lens in states
-    )
+    rays = efforts.FULL.between_stages(made.goals, RAYS)
+    rrmsds = (max(light.rrmsd for light in of.lights(lens, of.goals, rays)) for of, lens in states)
     return Retailored(found, *rrmsds)
 
 
