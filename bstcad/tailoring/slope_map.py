@@ -158,7 +158,7 @@ def slope_map(
     else:
         b = (np.zeros_like(t[0]), np.zeros_like(t[1])) if flat else straight_points(grid, screen, lit_corners(picture))
     if flat:
-        g = gathering(grid, lens, screen.receiver, centroid(picture, screen), effort)
+        g = gathering(grid, lens, screen.receiver, centroid(picture, screen), effort=effort)
     else:
         g = bending(grid, lens, screen.receiver, t, points=b, lit=lit_corners(picture))
     needed = wanted_slopes(rays_at(grid, b), torch.from_numpy(np.stack(t)), screen.receiver, law)
