@@ -22,7 +22,7 @@ import numpy as np
 
 from bstcad.analysis.shape import MAX_RADIUS, describe, heights, survey_front, thickness_range
 from bstcad.designs.as_designed import vertex, vertex_key
-from bstcad.optics.lens import domes, passes, quadrature
+from bstcad.optics.lens import passes, quadrature
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.media import density
 from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface
@@ -259,9 +259,7 @@ def part(
 
 def _corners(lens: Lens, whole: WholePart | None) -> tuple[Point, Point]:
     """Return the smallest and the largest x, y and z (mm) of a part."""
-    half = np.array(lens.plan.half_extent)
-    bare = domes.silhouette(lens) if domes.is_dome(lens) else np.array([-half, half])
-    edge = bare if whole is None else whole.edge
+    edge = lens.back.silhouette(lens.outline) if whole is None else whole.edge
     faces = np.concatenate(heights(lens, None if whole is None else edge))
     low, high = np.array([*edge.min(0), faces.min()]), np.array([*edge.max(0), faces.max()])
     if whole is not None:
