@@ -205,7 +205,7 @@ def surface_maps(lens: Lens, found: Survey, face: str = "back") -> Figure:
     maps = (
         (scale * height, unit, heading),
         (slope, "degrees", f"Slope: up to {found.slope.largest:.3g}°"),
-        (bend, "1/mm", f"Mean curvature ({'seen from +z: ' * chart.flat}+ hollow, − bulge)"),
+        (bend, "1/mm", f"Mean curvature ({'seen from +z: ' if chart.flat else ''}+ hollow, − bulge)"),
     )
     for axes, (values, label, title) in zip(panels, maps, strict=True):
         signed = axes is panels[2]
@@ -217,13 +217,12 @@ def surface_maps(lens: Lens, found: Survey, face: str = "back") -> Figure:
         bar = figure.colorbar(map_image, ax=axes, label=label, fraction=0.046, pad=0.03, extend=extend)
         if not signed and np.nanmax(values) - np.nanmin(values) > ROUNDING * (1 + np.nanmax(np.abs(values))):
             bar.add_lines(axes.contour(x, y, values, 10, colors="white", linewidths=0.35))
-    overhangs = found.slope.largest > 90.0
-    if overhangs:
+    if overhangs := found.slope.largest > 90.0:
         panels[1].contour(x, y, slope, [90.0], colors=VERMILION, linewidths=1.2)
     radii = (("concave", found.concave), ("convex", found.convex))
     radii = (f"{n}, {quantity(r.largest, 'mm')} {r.where}" for n, r in radii if r.largest < MAX_RADIUS)
     radii = f"Smallest radii of curvature, seen from outside: {'; '.join(radii) or 'none: the face is flat'}."
-    footnote(figure, radii + " Beyond the red line, at 90°, the face overhangs." * overhangs)
+    footnote(figure, radii + (" Beyond the red line, at 90°, the face overhangs." if overhangs else ""))
     return figure
 
 
@@ -238,7 +237,8 @@ def _height_map(chart: Chart, h: np.ndarray) -> tuple[np.ndarray, str, tuple[flo
     height = h - plane if tilted else h - np.nanmean(h)
     pv = float(np.nanmax(height) - np.nanmin(height))
     scale, unit = (1.0, "mm") if pv >= 0.5 else (1e3, "µm")
-    return height, f"{chart.distance}{', best plane removed' * tilted}: PV {scale * pv:.3g} {unit}", (scale, unit)
+    heading = f"{chart.distance}{', best plane removed' if tilted else ''}: PV {scale * pv:.3g} {unit}"
+    return height, heading, (scale, unit)
 
 
 def mean_curvature(
