@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.shape import MAX_RADIUS, describe, heights, survey_front, thickness_range
-from bstcad.designs.as_designed import vertex, vertex_key
+from bstcad.designs.as_designed import vertex
 from bstcad.optics.lens import passes, quadrature
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.media import density
@@ -84,7 +84,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "net": _net(lens.back_net),
         **({"front_net": _net(lens.front_net), "front_asked": scene.lens.front.z} if lens.shapes("front") else {}),
         "back_asked": scene.lens.back.z,  # position of the back's vertex in the scene
-        **({"back_key": vertex_key(scene)} if scene.lens.dome else {}),  # key of this position, if not lens.back.z
+        **({} if scene.lens.back.chart.flat else {"back_key": scene.lens.back.vertex_key}),  # if not lens.back.z
         "centre_thickness": shape["centre_thickness"],
         "edge_thickness": (shape["edge_thickness_min"], shape["edge_thickness_max"]),
         "volume": shape["volume"],  # mm³
