@@ -43,7 +43,8 @@ def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
     which is seen from outside, as the back is: valleys are concave.
     """
     x, y = _points(lens.outline, grid)
-    glass, (centre,) = thickness(lens, x, y), thickness(lens, *torch.zeros(2, 1, dtype=torch.float64))
+    points = points_on(lens.back, x, y)
+    glass, [centre] = thickness(lens, points), thickness(lens, points_on(lens.back, [0.0], [0.0]))
     of_front = {}
     if lens.shapes("front"):
         of_front = _face_figures(lens.front_net, survey_front(lens), points_on(lens.front, x, y))
@@ -54,7 +55,7 @@ def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
         "edge_thickness_max": edge_thickest,
         "thickness_min": thinnest,
         "thickness_max": thickest,
-        **_face_figures(lens.back_net, survey(lens), points_on(lens.back, x, y)),
+        **_face_figures(lens.back_net, survey(lens), points),
         **{f"front_{key}": value for key, value in of_front.items()},
     }
 
@@ -76,17 +77,18 @@ def _face_figures(net: BSplineSurface, bends: Survey, points: np.ndarray) -> dic
     }
 
 
-def thickness(lens: Lens, x: Tensor, y: Tensor) -> np.ndarray:
-    """Return the thickness (mm) at (x, y) (mm) of the back's chart: along z, or else along lines from its centre.
+def thickness(lens: Lens, points: np.ndarray) -> np.ndarray:
+    """Return the thickness (mm) at points (n, 3) of the back: along z, or along lines from the centre of its chart.
 
     A front beside the centre, such as a plane below it, gives NaN where the line meets it behind the centre.
     """
     if lens.back.chart.flat:
-        return sag(lens.back, x, y) - sag(lens.front, x, y)
-    position = lens.back.at(x, y).position
+        x, y, z = points.T
+        return z - sag(lens.front, x, y)
+    position = torch.from_numpy(np.ascontiguousarray((points - (0.0, 0.0, lens.back.z)).T))
     rho = torch.sqrt(dot(position, position))
-    status = torch.zeros(x.shape, dtype=torch.uint8)
-    rays = Rays(torch.zeros_like(position), position / rho, torch.ones_like(x), status, z=lens.back.z)
+    status = torch.zeros(rho.shape, dtype=torch.uint8)
+    rays = Rays(torch.zeros_like(position), position / rho, torch.ones_like(rho), status, z=lens.back.z)
     met, _ = intersect(lens.front.optical, rays, EVERYWHERE, Status.MISSED_FRONT)
     at = torch.stack([*met.position[:2], met.above(lens.back.z)])
     return torch.where(met.alive, rho - torch.sqrt(dot(at, at)), torch.full_like(rho, math.nan)).numpy()
@@ -100,7 +102,7 @@ def _range(glass: np.ndarray) -> tuple[float, float]:
 
 def thickness_range(lens: Lens, edge: np.ndarray | None = None) -> tuple[float, float]:
     """Return the minimum and maximum `thickness` (mm); edge: as in `heights`."""
-    return _range(thickness(lens, *_places(lens, edge)))
+    return _range(thickness(lens, points_on(lens.back, *_places(lens, edge))))
 
 
 def heights(lens: Lens, edge: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -110,8 +110,8 @@ def _sums_of_points(face: Surface, raised: float, x: np.ndarray, y: np.ndarray, 
 
     n dA = ∂S/∂x × ∂S/∂y dx dy for the surface S(x, y).
     """
-    patch = face.at(torch.from_numpy(x), torch.from_numpy(y))
-    (x, y, z), (n_x, n_y, n_z) = patch.position.numpy(), patch.normal.numpy()
+    vectors = face.position_and_normal(torch.from_numpy(x), torch.from_numpy(y))
+    (x, y, z), (n_x, n_y, n_z) = ([part.numpy() for part in vector] for vector in vectors)
     area, z = weight * np.sqrt(n_z * n_z + n_x * n_x + n_y * n_y), z + raised
     cone = weight * (z * n_z + x * n_x + y * n_y)
     return Sums(float(area.sum()), float(cone.sum()) / 3, _moment(cone, x, y, z))

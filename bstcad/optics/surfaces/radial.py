@@ -39,7 +39,7 @@ from bstcad.optics.surfaces.charts import Chart, SphereChart
 from bstcad.optics.surfaces.motion import Motion, along_axis
 from bstcad.optics.surfaces.outlines import POINTS_AROUND, Circle, Outline
 from bstcad.optics.surfaces.rays import Rays
-from bstcad.optics.surfaces.surfaces import Patch, Surface, points_on
+from bstcad.optics.surfaces.surfaces import Patch, Surface, Vectors, points_on
 
 NEWTON_STEPS = 20  # maximum number of Newton steps, after which a ray misses; a smooth dome needs 3 to 5
 FLATTEST = 0.05  # lowest start of the search for the height over a point (x, y), as a fraction of R
@@ -206,6 +206,12 @@ class RadialSurface(BSplineSurface):
         parts = [evaluate((self.radius + self.heights) * d, u, v) for d in directions]
         value, along_u, along_v = (torch.stack(same) for same in zip(*parts, strict=True))
         return Patch(value, along_u / self.pitch[0], along_v / self.pitch[1])
+
+    def position_and_normal(self, x: Tensor, y: Tensor) -> tuple[Vectors, Vectors]:
+        """Return the components of S - c (mm) and of ∂S/∂x × ∂S/∂y at (x, y) (mm) of the chart."""
+        patch = self.at(x, y)
+        (p_x, p_y, p_z), (n_x, n_y, n_z) = patch.position, patch.normal
+        return (p_x, p_y, p_z), (n_x, n_y, n_z)
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return (distance from the centre - R in mm, ∂f/∂x, ∂f/∂y) at (x, y) (mm) of the chart; f: see charts.py."""

@@ -24,6 +24,9 @@ MIN_ARRIVAL_COSINE = 1e-3  # smallest cosine with the axis by which a height is 
 RIM_POINTS = 1440  # number of points of a rim at which its height and its distance from the axis are examined
 
 
+Vectors = tuple[Tensor, Tensor, Tensor]  # components x, y and z of vectors
+
+
 class Patch(NamedTuple):
     """Positions and tangents of a surface S at points (x, y) of its chart."""
 
@@ -100,6 +103,11 @@ class Surface(ABC):
         h, z_x, z_y = self.relative_sag_and_slope(x, y)
         one, zero = torch.ones_like(h), torch.zeros_like(h)
         return Patch(torch.stack([x, y, h]), torch.stack([one, zero, z_x]), torch.stack([zero, one, z_y]))
+
+    def position_and_normal(self, x: Tensor, y: Tensor) -> tuple[Vectors, Vectors]:
+        """Return the components of S - (0, 0, z) (mm) and of ∂S/∂x × ∂S/∂y at (x, y) (mm) of the chart; see `at`."""
+        h, z_x, z_y = self.relative_sag_and_slope(x, y)
+        return (x, y, h), (-z_x, -z_y, torch.ones_like(h))
 
     def rim(self, outline: Outline) -> np.ndarray:
         """Return points (n, 3) (mm) of the surface along an outline of its chart, at equal angles."""
