@@ -42,13 +42,12 @@ def normals_near(face: Surface, points: np.ndarray) -> np.ndarray:
 
 
 def distances_of_points(points: np.ndarray, lens: Lens) -> np.ndarray:
-    """Return the distances (n,) (mm) of points (n, 3) near a lens on its base from the nearest of its faces.
+    """Return the distances (n,) (mm) of points (n, 3) near a lens on its base from the nearer of its two faces.
 
     From a face of heights it is that from the tangent plane, |Δz| / sqrt(1 + |∇z|²): a distance along z would contain
     the rounding of x and y, multiplied by |∇z|.
     """
-    distance = np.minimum(_from_face(lens.back, points), _from_face(lens.front.around, points))
-    return distance if lens.front.outline is None else np.minimum(distance, from_conic(lens.front, points))
+    return np.minimum(_from_face(lens.back, points), _from_face(lens.front, points))
 
 
 def _from_face(face: Surface, points: np.ndarray) -> np.ndarray:
@@ -63,14 +62,6 @@ def _feet(face: Surface, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     face = face.plain()
     assert isinstance(face, RadialSurface)  # the only surface that is not one of heights
     return dome_distance.heights(face, points - (0.0, 0.0, face.z))
-
-
-def from_conic(face: Surface, points: np.ndarray) -> np.ndarray:
-    """Return |F| / |∇F| (mm), the distance of near points from F = c r² - 2 h + (1 + k) c h² = 0, h = z - z0."""
-    (c, k), (x, y, z) = face.conic(), points.T
-    h = z - face.z
-    value = c * (x * x + y * y) - 2 * h + (1 + k) * c * h * h
-    return np.abs(value) / (2 * np.sqrt((c * x) ** 2 + (c * y) ** 2 + (1 - (1 + k) * c * h) ** 2))
 
 
 def distances_of_facets(vertices: np.ndarray, faces: np.ndarray, lens: Lens) -> Iterator[float]:
@@ -109,7 +100,7 @@ def _from_base_and_back(corners: np.ndarray, lens: Lens) -> float:
     edges = (corners[wall] + np.roll(corners[wall], -1, axis=1)) / 2
     parts = [_from_wall(lens, edges.reshape(-1, 3))]
     if lens.front.outline is not None:
-        parts.append(from_conic(lens.front, _samples(corners[~outer & ~wall & ~flat])))
+        parts.append(_from_conic(lens.front, _samples(corners[~outer & ~wall & ~flat])))
     on_back = dome_distance.distance_of_facets(back, corners[outer & ~wall & ~flat] - middle)
     return max(on_back, *(float(part.max(initial=0.0)) for part in parts))
 
@@ -118,6 +109,14 @@ def _samples(corners: np.ndarray) -> np.ndarray:
     """Return the centres of facets (n, 3, 3) and the middles of their edges, (4 n, 3)."""
     middles = (corners + np.roll(corners, -1, axis=1)) / 2
     return np.concatenate([corners.mean(axis=1), middles.reshape(-1, 3)])
+
+
+def _from_conic(face: Surface, points: np.ndarray) -> np.ndarray:
+    """Return |F| / |∇F| (mm), the distance of near points from F = c r² - 2 h + (1 + k) c h² = 0, h = z - z0."""
+    (c, k), (x, y, z) = face.conic(), points.T
+    h = z - face.z
+    value = c * (x * x + y * y) - 2 * h + (1 + k) * c * h * h
+    return np.abs(value) / (2 * np.sqrt((c * x) ** 2 + (c * y) ** 2 + (1 - (1 + k) * c * h) ** 2))
 
 
 def _from_wall(lens: Lens, points: np.ndarray) -> np.ndarray:
