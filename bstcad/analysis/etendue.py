@@ -30,7 +30,6 @@ from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.receivers import Receiver
 from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.outlines import Rectangle
-from bstcad.optics.surfaces.radial import RadialSurface
 from bstcad.optics.surfaces.rays import Rays
 from bstcad.optics.trace.trace import clear_window, is_transmitted
 from bstcad.optics.trace.unfolding import image_from_last_net
@@ -155,7 +154,7 @@ class Silhouette:
     def of(cls, lens: Lens) -> Silhouette:
         """Return the silhouette of the last face of a lens."""
         cosines, back = np.linspace(0.0, 1.0, SILHOUETTES), lens.plain().back
-        if not isinstance(back, RadialSurface):
+        if back.chart.flat:
             return cls(cosines, lens.apertures[1].area * cosines)
         x, y = (torch.from_numpy(p) for p in lens.last_tailored.outline.rim_points())
         share = torch.linspace(0.0, 1.0, DOME_RINGS, dtype=torch.float64)[:, None]

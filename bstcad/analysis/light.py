@@ -13,7 +13,6 @@ from torch import Tensor
 
 from bstcad.analysis.neglected_effects import difference
 from bstcad.analysis.shape import ripple
-from bstcad.optics.lens import domes
 from bstcad.optics.lens.interfaces import cross, deflect, intersect
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel, points_per_line
@@ -169,7 +168,7 @@ def mount_losses(lens: Lens, channels: Sequence[Channel], flange: tuple[float, f
     """Return the losses of a lens at its mount; flange: z (mm) of the two ends of its opening; None: no flange."""
     uncut = passing = blocked = 0.0
     n = max(MIN_MOUNT_RAYS, math.ceil(MOUNT_RAYS / math.sqrt(len(channels))))
-    rim = domes.opening(lens) if domes.is_dome(lens) else lens.apertures[1]
+    rim = lens.back.opening(lens.apertures[1])
     for channel in channels:
         own = replace(channel.through(lens), losses=None)
         bare = replace(own, clear=None)

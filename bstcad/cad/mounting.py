@@ -30,9 +30,9 @@ from bstcad.cad.solid import (
     NamedSolid,
     cap,
     cut_loops,
-    dome_cap,
     front_caps,
     named_solid,
+    optical_cap,
     prepared,
     rim_heights,
     rim_points,
@@ -193,8 +193,8 @@ class _Opening:
         if below_front is None:  # the front lies in the lower plane: one face
             below = [rail.against() for rail in inner]
             if lens.front.outline is not None:
-                dome, edge = dome_cap(lens)
-                faces.append(dome)
+                front, edge = optical_cap(lens)
+                faces.append(front)
                 below.append(edge.along())
         else:
             bottom = walls.rail_on(plane, rim)

@@ -17,7 +17,6 @@ from bstcad.cad.patches import FacePatch
 from bstcad.cad.solid import cap, prepared
 from bstcad.cad.tiling import Cell, Side, Tiling
 from bstcad.cad.wires import LoopPiece
-from bstcad.optics.lens import domes
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.quadrature import MassProperties
 from bstcad.optics.surfaces.bspline import is_net
@@ -47,7 +46,7 @@ def tiles_of(lens: Lens, tiling: Tiling) -> Iterator[Tile]:
 
     ValueError in one sentence if the lens is a dome, if its front has an outline of its own, or if a tile is a sliver.
     """
-    if domes.is_dome(lens):
+    if not lens.back.chart.flat:
         raise ValueError("tiles: the back of a dome is not cut into tiles; use lens.step")
     if lens.front.outline is not None:
         raise ValueError("tiles: the front ends in an outline of its own and is not cut into tiles; use lens.step")

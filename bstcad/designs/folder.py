@@ -280,7 +280,7 @@ def write_design(design: Made, lights: Sequence[Light], folder: Path) -> None:
         "degree": DEGREE,
         "front_curvature": 0.0,
         **_numbers(front),
-        **({DISTANCES: lens.back_net.heights.cpu().double().numpy()} if isinstance(lens.back, RadialSurface) else {}),
+        **({DISTANCES: lens.back_net.heights.cpu().double().numpy()} if not lens.back.chart.flat else {}),
         **({"front_control_points": front.control_points()} if is_net(front) else {}),
         **(dict(zip(FRONT_KNOTS, map(knots, lens.front_net.shape), strict=True)) if lens.is_tailored("front") else {}),
         **{numbered("target", k): goal.picture for k, goal in enumerate(design.goals)},
@@ -352,7 +352,7 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
     if scene.lens.front.is_tailored:
         shapes["front_control_points"] = (*as_pair(scene.lens.nets()[1]), 3)
     names = files.names(folder / DESIGN)
-    if scene.lens.dome is not None and DISTANCES in names:  # an earlier version stored the points alone
+    if not scene.lens.back.chart.flat and DISTANCES in names:  # an earlier version stored the points alone
         shapes[DISTANCES] = as_pair(scene.lens.back.net)
     for k, target in enumerate(scene.targets):
         shapes[numbered("target", k)] = target.columns_rows[::-1]
@@ -421,7 +421,7 @@ def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
         front = _surface(found["front_control_points"], blank.front.z)
     else:
         front = front.with_parameters(**{name.removeprefix("front_"): float(found[name]) for name in _numbers(front)})
-    if blank.dome is not None:
+    if not blank.back.chart.flat:
         flat = scene.flat_lens(blank.back.net).with_front(front)
         try:
             return flat.with_back(RadialSurface.like(flat.back, found["control_points"], found.get(DISTANCES)))

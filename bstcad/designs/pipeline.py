@@ -264,7 +264,7 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
     if refracts := lens.passes.largest_deflection(light.index) is not None:
         grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.light, lens))
     found = reach_of(light.source, lens, goal, grazing=grazing)
-    if scene.lens.dome is not None:
+    if not lens.back.chart.flat:
         if found.astray > MAX_ASTRAY:
             raise SceneError(light_astray(scene, found))
         return found.part, None  # no part of the light is held from total internal reflection yet
@@ -547,7 +547,7 @@ def require_bounded_light(scene: Scene, rrmsd: float) -> float:
 def check_thickness(lens: Lens, scene: Scene) -> None:
     """Raise SceneError, before stage 2, if the back crosses the front or reaches the next element or target."""
     thinnest, thickest = thickness_range(lens.plain())
-    if not thinnest > 0 and scene.lens.dome is not None:
+    if not thinnest > 0 and not lens.back.chart.flat:
         raise SceneError(
             f"lens.back.radius: the dome that the target needs would cross the front by {-thinnest:.3g} mm; "
             "increase the radius, or move the target to where the light falls without the lens"
@@ -558,7 +558,7 @@ def check_thickness(lens: Lens, scene: Scene) -> None:
             f"lower lens.front.z by more than this, widen the target, or make the lens smaller"
         )
     reach = lens.front.z + thickest
-    if scene.lens.dome is not None:
+    if not lens.back.chart.flat:
         reach = lens.back.z + lens.back.sags(lens.outline)[1]
     room, key = scene.clearance(reach)
     if not room > 0:

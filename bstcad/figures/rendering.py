@@ -61,7 +61,7 @@ FINE, COARSE = 256, 64  # cells per axis of a net, and of a surface without knot
 MAX_MODEL_RAYS = 200  # largest number of rays in the model
 POSITION_DECIMALS, FLUX_DECIMALS = 4, 3  # decimals of a position (mm), and of a relative flux
 STEPS = 65535  # largest 16-bit integer: a range of values has this number of steps
-MIN_DOME_COSINE = 0.02  # smallest n_z of the normals of a dome, which are stated as slopes; steeper parts look upright
+MIN_COSINE = 0.02  # smallest n_z of normals, which are stated as slopes; steeper parts look upright
 MIN_RANGE = 1e-9  # lower bound of a range, for values that are all equal (mm, or a slope)
 
 
@@ -333,22 +333,26 @@ def turnable(lens: Lens, path: RayPath | None = None, cells: int = FINE) -> str:
     the front and z of the back around the rim.  A path adds the keys of `_light`.
     """
     from bstcad.cad.grids import nodes, rim
-    from bstcad.optics.lens import domes
-    from bstcad.optics.surfaces.surfaces import sampled
+    from bstcad.optics.lens.base import on_base
+    from bstcad.optics.surfaces.surfaces import points_and_normals, points_on, sag
+
+    def on_face(surface: Surface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return x, y, z (mm), ∂z/∂x and ∂z/∂y of a face at nodes (x, y) (mm) of its chart, (5, rows, columns)."""
+        points, normals = points_and_normals(surface, x, y)
+        slopes = -normals[..., :2] / np.maximum(normals[..., 2:], MIN_COSINE)
+        return np.moveaxis(np.concatenate([points, slopes], axis=-1), -1, 0)
 
     def at_nodes(surface: Surface) -> np.ndarray:
-        """Return x, y, z (mm), ∂z/∂x and ∂z/∂y of a face at its nodes, (5, cells + 1, cells + 1)."""
-        if dome is not None and surface is lens.back:
-            points, normals = domes.points_and_normals(dome, *nodes(lens.outline, cells))
-            slopes = -normals[..., :2] / np.maximum(normals[..., 2:], MIN_DOME_COSINE)
-            return np.moveaxis(np.concatenate([points, slopes], axis=-1), -1, 0)
-        if dome is not None and surface.outline is None:  # a plane front, which ends below the rim of the dome
-            x, y = nodes(lens.outline, COARSE)
-            r = np.hypot(x, y) / domes.rim_radius(lens.outline)
-            x, y = r * below_rim(np.stack([x, y]) / np.maximum(r, 1e-12))
-            return np.stack([x, y, *sampled(surface, x, y)])
-        x, y = nodes(surface.outline or lens.outline, min(COARSE, cells) if math.isinf(surface.detail) else cells)
-        return np.stack([x, y, *sampled(surface.optical, x, y)])
+        """Return the values of `on_face` at the nodes of a face inside its outline, or inside the rim of the lens."""
+        smooth = min(COARSE, cells) if math.isinf(surface.detail) else cells
+        if surface.outline is not None:
+            return on_face(surface.optical, *nodes(surface.outline, smooth))
+        x, y = nodes(lens.outline, smooth)
+        if surface.chart != lens.back.chart:  # a plane front, which ends below the rim: rings between axis and rim
+            k = np.abs(np.linspace(-1.0, 1.0, smooth + 1))
+            ring = np.maximum(k[:, None], k)
+            x, y = ring * below_rim(np.stack([x, y]) / np.maximum(ring, 1e-12))
+        return on_face(surface, x, y)
 
     def on_rim(outline: Outline, cells: int) -> np.ndarray:
         """Return x and y (mm) of the nodes once around an outline, (2, 4 cells)."""
@@ -361,24 +365,18 @@ def turnable(lens: Lens, path: RayPath | None = None, cells: int = FINE) -> str:
         begin, end = on_rim(inner, COARSE)[:, None], below_rim(on_rim(lens.outline, COARSE))[:, None]
         places = begin + np.linspace(0, 1, COARSE + 1)[:, None] * (end - begin)
         for k in range(4):
-            x, y = places[:, :, np.arange(k * COARSE, (k + 1) * COARSE + 1) % (4 * COARSE)]
-            yield np.stack([x, y, *sampled(plane, x, y)])
+            yield on_face(plane, *places[:, :, np.arange(k * COARSE, (k + 1) * COARSE + 1) % (4 * COARSE)])
 
     def below_rim(places: np.ndarray) -> np.ndarray:
-        """Return x and y (2, …) (mm) of the rim; places: in the outline, which a dome has in its chart."""
-        return places if dome is None else np.moveaxis(domes.points_on(dome, *places)[..., :2], -1, 0)
+        """Return x and y (2, …) (mm) in space of places (2, …) (mm) on the rim in the back's chart."""
+        return np.moveaxis(points_on(lens.back, *places)[..., :2], -1, 0)
 
-    lens = domes.on_base(lens.plain())
-    dome = domes.radial_back(lens) if domes.is_dome(lens) else None
+    lens = on_base(lens.plain())
     faces = [at_nodes(lens.back), at_nodes(lens.front)]
     if lens.front.outline is not None:
         faces += around(lens.front.around, lens.front.outline)
-    x, y = on_rim(lens.outline, cells)
-    if dome is None:
-        high = sampled(lens.back, x, y)[0]
-    else:
-        x, y, high = domes.points_on(dome, x, y).T
-    wall = np.stack([x, y, sampled(lens.front, x, y)[0], high])
+    x, y, high = points_on(lens.back, *on_rim(lens.outline, cells)).T
+    wall = np.stack([x, y, sag(lens.front, x, y), high])
     places = np.concatenate([*(face[:3].reshape(3, -1) for face in faces), wall[:3], wall[[0, 1, 3]]], axis=1)
     if not np.isfinite(places).all():
         return ""

@@ -28,7 +28,6 @@ from bstcad.optics.surfaces.sides import as_pair, coarser
 from bstcad.optics.trace.measure import side_factor, simulated, tubes_picture
 from bstcad.optics.trace.source_images import landing_pixels
 from bstcad.optics.trace.tubes import corners, middle
-from bstcad.scene.dome_back import MIN_DOME_POINTS
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.effort import PREVIEW
 from bstcad.tailoring.merit import Merit
@@ -128,7 +127,7 @@ def reduced_scene(scene: Scene, size: PreviewSize) -> Scene:
     """Return the scene with the pixels, control points and tailoring settings of a preview, and the default method."""
     several = len(scene.targets) > 1 or scene.wavefront is not None
     size_factor, evaluations_factor = (GOALS_SIZE_FACTOR, GOALS_EVALUATIONS_FACTOR) if several else (1.0, 1)
-    max_net = max(round(size_factor * size.net), 0 if scene.lens.dome is None else MIN_DOME_POINTS)
+    max_net = max(round(size_factor * size.net), scene.lens.back.fewest_points)
     net = scene.lens.back.control_points or max_net
     if max(as_pair(net)) > max_net:
         net = coarser(net, max_net)

@@ -18,6 +18,7 @@ from bstcad.optics.surfaces.key import Key
 from bstcad.optics.surfaces.outlines import STRICT, Circle, Outline, Rectangle, Rounded
 from bstcad.optics.surfaces.surfaces import Surface, sag, sampled
 from bstcad.scene.blank import LensBlank
+from bstcad.scene.dome_back import RadialBack
 from bstcad.scene.schema import COORDINATES, LENGTHS, Record
 
 MAX_DRAFT = 30.0  # degrees; largest draft angle of the walls of a lens
@@ -258,8 +259,8 @@ def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
         if shape is not None and not shape.corner_radius < (half := min(shape.outline.half_extent)):
             size = f"{shape.corner_radius:g} mm is not less than {half:g} mm, half the width"
             yield f"mount.{key}.corner_radius: {size}; make it smaller"
-    if lens.dome is not None:
-        yield from _dome_complaints(mount, lens)
+    if (dome := lens.dome) is not None:
+        yield from _dome_complaints(mount, dome)
     rim = mount.rim_of(lens.outline)
     if (lens.outline.depth(*rim.outline.rim_points()) < -1e-9).any():
         yield "mount.rim: extends past lens.outline; make it smaller, or the lens larger"
@@ -273,13 +274,12 @@ def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
         yield from _flange_complaints(mount.flange, lens, rim)
 
 
-def _dome_complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
+def _dome_complaints(mount: Mount, dome: RadialBack) -> Iterator[str]:
     """Yield complaints about a mount of a dome, whose rim and wall stay as they are and whose light leaves sideways."""
     can = "a dome can have mount.datum and mount.flange"
     for key in (key for key in ("rim", "draft", "bevel") if getattr(mount, key)):
         yield f"mount.{key}: a dome keeps its own rim and its low wall; remove this key; {can}"
-    dome, flange = lens.dome, mount.flange
-    if dome is None or flange is None:
+    if (flange := mount.flange) is None:
         return
     rim, upper = dome.rim_z, flange.z + flange.thickness
     if not upper < rim:

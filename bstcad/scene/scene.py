@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 import tomli_w
-import torch
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_serializer, model_validator
 
 from bstcad.optics.lens.lens import Lens
@@ -37,13 +36,13 @@ from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.surfaces.key import Key
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.optics.surfaces.rays import Status
-from bstcad.optics.surfaces.sides import Sides, as_pair
+from bstcad.optics.surfaces.sides import Sides
 from bstcad.runs import files
 from bstcad.scene import effects, elements, lighting, mount, picture, quality, scene_file
 from bstcad.scene.accept import Accept
 from bstcad.scene.beam import Collimated, of_beam
 from bstcad.scene.blank import LensBlank, export_complaints
-from bstcad.scene.dome_back import RadialBack, complete, forget_outlines
+from bstcad.scene.dome_back import complete, forget_outlines
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
 from bstcad.scene.effects import Effects
 from bstcad.scene.elements import Around, Elements, LightPath
@@ -125,7 +124,7 @@ class Scene(Record):
         yield from lighting.encapsulant_complaints(source, lens, self._of_dome)
         ends = getattr(lens.front, "outline", None) is not None
         of_export = export_complaints(
-            self.output.export, lens.dome is not None, lens.passes.index_before, front_ends=ends,
+            self.output.export, not lens.back.chart.flat, lens.passes.index_before, front_ends=ends,
             tool_radius=None if lens.mould else lens.tool_radius,
         )  # fmt: skip
         yield from (f"output.export: {complaint}" for complaint in of_export)
@@ -315,24 +314,11 @@ class Scene(Record):
         finest net to which `net` will be refined (default: `net`), whose spans determine how far the nets extend past
         the rim.
         """
-        from bstcad.optics.surfaces.bspline import BSplineSurface  # loads numba, which a scene alone does not need
-
-        if self.lens.dome is not None:
-            return self.assembled(self._flat_dome(self.lens.dome, net, as_wide_as or net))
-        half_x, half_y = net_extent(self.lens.outline, as_wide_as or net)
-        heights = torch.zeros(as_pair(net), dtype=torch.float64)
-        back = BSplineSurface(self.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
-        front, outline, passes = self.lens.flat_front(net, as_wide_as), self.lens.outline, self.lens.passes
-        return self.assembled(Lens(front, back, outline, self.index, own_passes=passes))
-
-    def _flat_dome(self, dome: RadialBack, net: Sides, as_wide_as: Sides) -> Lens:
-        """Return a lens with a sphere about the centre as its back; its outline is the lit disc of the back's chart."""
-        from bstcad.optics.surfaces.radial import RadialSurface
-
-        back = RadialSurface.sphere(dome.centre[2], dome.radius, net_extent(dome.lit, as_wide_as), as_pair(net))
-        front, passes = self.lens.flat_front(net, as_wide_as), self.lens.passes
-        clear = (front.outline or self.lens.outline, dome.lit)
-        return Lens(front, back, dome.lit, self.index, clear=clear, own_passes=passes)
+        blank, passes = self.lens, self.lens.passes
+        outline, front = blank.back.lit(blank.outline), blank.flat_front(net, as_wide_as)
+        back = blank.back.flat(net, net_extent(outline, as_wide_as or net))
+        clear = None if back.chart.flat else (front.outline or blank.outline, outline)
+        return self.assembled(Lens(front, back, outline, self.index, clear=clear, own_passes=passes))
 
     def assembled(self, lens: Lens) -> Lens:
         """Return the lens with the scene's windows, mirrors and mount, and with its tailored faces marked."""
@@ -341,7 +327,7 @@ class Scene(Record):
 
     def as_mounted(self, lens: Lens) -> Lens:
         """Return the lens with the clear apertures that the mount leaves; the mount of a dome cuts nothing."""
-        if self.mount is None or self.lens.dome is not None:
+        if self.mount is None or not self.lens.back.chart.flat:
             return lens
         return replace(lens, clear=self.mount.clear(lens))
 
@@ -380,7 +366,7 @@ class Scene(Record):
     @property
     def light(self) -> Emitter:
         """The source, which a dome needs by the points of a sphere about its centre instead of by points of planes."""
-        return self.source if self.lens.dome is None else self.lens.dome.light(self.source, self.lens.front.surface)
+        return self.lens.back.light(self.source, self.lens.front.surface)
 
     def with_source_scaled(self, share: float) -> Self:
         """Return the scene with the size of its source times `share`; 0 makes it a point or a parallel beam."""
@@ -501,7 +487,7 @@ def _doubts_of_goals(scene: Scene) -> Iterator[str]:
         faces, remedy = "two tailored faces", "set their weights, or remove a goal"
         if len(shaped) == 1:
             faces, remedy = "one tailored face", "a mirror has no second face, so set the weights"
-            if lens.dome is not None:
+            if not lens.back.chart.flat:
                 remedy = "a dome has no second face, so set the weights"
             elif "front" in lens.passes.faces:
                 front = f'lens.front = {{ kind = "bspline", z = {lens.front.z:g}, optimise = true }}'

@@ -42,7 +42,9 @@ class TailoringEffort:
 
     stage: Effort = Effort(rays=724, accuracy=0, witness=False, cells=1)  # rays for the RRMSD between the stages
     stage_pixels: int = 512  # pixels per side for which `stage` holds
-    fine: Effort = Effort(rays=2048, accuracy=0.01, witness=False, cells=1)  # scenes with accuracy or bounds, `Task.better`
+    fine: Effort = Effort(
+        rays=2048, accuracy=0.01, witness=False, cells=1
+    )  # rays with accuracy or bounds, and in `better`
     flux: Effort = Effort(rays=128, accuracy=1.0, witness=False, cells=1)  # rays for the flux on the target alone
     wavefront_tubes: int = 256  # flux tubes per side that measure the wavefront error between the stages
     coarsest_grid: int = COARSEST_GRID  # fewest cells per side of the transport map in a round of stage 1

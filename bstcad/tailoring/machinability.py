@@ -26,7 +26,6 @@ from bstcad.optics.numerics.reductions import total
 from bstcad.optics.surfaces import bspline
 from bstcad.optics.surfaces.bspline import BSplineSurface, Jet, Spans
 from bstcad.optics.surfaces.outlines import Outline
-from bstcad.optics.surfaces.radial import RadialSurface
 from bstcad.optics.surfaces.sampling import sample_rim
 from bstcad.runs.files import SceneError
 from bstcad.tailoring.clearance import PENALTY_MARGIN, QUARTER_RIM_POINTS, clearance
@@ -53,7 +52,7 @@ def place_back(lens: Lens, z: float, least: float, bounds: Bounds | None = None)
     With bounds, the minimum thickness at the rim and the maximum thickness are met too, the latter also by a plane
     below `z`.  If the bounds are incompatible, the thickness violates minimum and maximum by equal lengths.
     """
-    if isinstance(lens.back, RadialSurface):  # its vertex stays
+    if not lens.back.chart.flat:  # its vertex stays
         return lens
     x, y = thickness_points(lens)
     relative = lens.back.relative_sag_and_slope(x, y)[0]

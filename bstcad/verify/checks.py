@@ -20,7 +20,7 @@ import torch
 from bstcad.analysis.light import Blur, blur, margins, mount_losses, rrmsd_of_ripple
 from bstcad.analysis.shape import AT_BOUND, Extreme, describe, survey, survey_front
 from bstcad.cad import mesh as meshes
-from bstcad.optics.lens import domes, quadrature
+from bstcad.optics.lens import quadrature
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.passes import Face
 from bstcad.optics.receivers.goal import Goal, worst
@@ -229,7 +229,7 @@ def _mounted_lens(read: Future[Lens], bare: Lens, nominal: Nominal, path: Path) 
     flange = None if mount is None else mount.flange
     try:
         made = _result(read, path.with_name("part.step"))
-        outline = designed.outline if domes.is_dome(designed) else bare.outline  # a dome's is in the designed chart
+        outline = bare.back.chart.outline_in(designed.back.chart, bare.outline)
         lens = replace(_with_design_facts(made, designed), outline=outline)
         pairs = zip(("front", "back"), lens.apertures, designed.apertures, strict=True)
         checks = [_aperture_check(*each) for each in pairs]

@@ -95,7 +95,7 @@ def test_tables_lie_on_the_lens(outline):
 def test_normals_point_out_of_the_lens_and_stand_on_the_face(side):
     lens = wavy(RECTANGLE)
     face = getattr(lens, side)
-    found = table_of(exports.points_table(lens, face, 61))
+    found = table_of(exports.points_table(lens, face, lens.plan, 61))
     normal = np.array([found[f"normal_{axis}"] for axis in "xyz"])
     assert np.abs(np.linalg.norm(normal, axis=0) - 1).max() < 1e-11
     assert (normal[2] < 0).all() if side == "front" else (normal[2] > 0).all()

@@ -101,9 +101,8 @@ def as_built(made: Made, built: AsBuilt) -> tuple[Scene, float]:
     shift = 0.0
     if built.thickness is not None:
         shift = built.thickness - (lens.back_net.vertex_z - lens.front.z)
-        key = "lens.back.z" if scene.lens.dome is None else "lens.back.radius"
-        place = scene.lens.back.z if scene.lens.dome is None else scene.lens.dome.radius
-        changes[key] = place + shift
+        key = scene.lens.back.vertex_key
+        changes[key] = getattr(scene.lens.back, key.removeprefix("lens.back.")) + shift
     if built.index is not None:
         if not scene.lens.passes.enters:
             raise SceneError(f"{OPTION} index: light does not enter a mirror; leave it out")

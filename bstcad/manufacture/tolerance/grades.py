@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from bstcad.manufacture.tolerance.perturbations import Kind, Perturbation, Setup, form_error, kinds, ripple
-from bstcad.optics.lens import domes
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.trace.finish import Finish
 from bstcad.scene.errors import SceneError
@@ -187,7 +186,7 @@ def _face_errors(lens: Lens, table: Sequence[Tolerance]) -> Iterator[Perturbatio
         face = name.partition(".")[0]
         if values.get("grade") == NONE or face not in lens.optical_faces or not (by_name or face == "back"):
             continue
-        if face == "front" and domes.is_dome(lens):
+        if face == "front" and not lens.shares_outline:
             continue  # the front is nearly vertical at its rim, where no net of heights has its form
         grade, cost = GRADES[values.get("grade", DEFAULT_GRADE)], values.get("cost", 1.0)
         try:

@@ -14,7 +14,6 @@ from bstcad.optics.lens.interfaces import Interface
 from bstcad.optics.lens.passes import LENS, MIRROR, Face, Passes
 from bstcad.optics.surfaces.bspline import BSplineSurface, is_net, require_net
 from bstcad.optics.surfaces.outlines import EVERYWHERE, Outline
-from bstcad.optics.surfaces.radial import RadialSurface
 from bstcad.optics.surfaces.rays import Status
 from bstcad.optics.surfaces.sides import Sides
 from bstcad.optics.surfaces.surfaces import Surface, sag
@@ -179,7 +178,12 @@ class Lens:
     @cached_property
     def plan(self) -> Outline:
         """Outline of the lens seen along the axis (mm); a circle for a dome, whose `outline` is one of directions."""
-        return self.back.plan(self.outline) if isinstance(self.back, RadialSurface) else self.outline
+        return self.back.plan(self.outline)
+
+    @property
+    def shares_outline(self) -> bool:
+        """True if front and back end over one outline, in one chart; otherwise the lens stands on a base (base.py)."""
+        return self.front.chart == self.back.chart
 
     @property
     def like(self) -> Tensor:

@@ -23,7 +23,6 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.kernels.kernel_arguments import MAX_LIGHT_TABLES, beam
-from bstcad.optics.lens import domes
 from bstcad.optics.lens.interfaces import Interface, Loss, Reflect, Refract, cross, intersect
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.losses import REFLECTED
@@ -280,8 +279,7 @@ def _as_fractions(
     underside_lit = first.front.outline is not None and first.passes.sense > 0 and not first.before
     if underside_lit and splits_missed:
         stopped = sum(
-            part
-            * on_underside(source, lens.front.plain(), domes.opening(lens) if domes.is_dome(lens) else lens.outline)
+            part * on_underside(source, lens.front.plain(), lens.back.opening(lens.outline))
             for part, source, lens, _ in lights
         )
         flux[UNDERSIDE] = max(min(stopped, flux["missed the lens"]), 0.0)
