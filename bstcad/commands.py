@@ -340,6 +340,7 @@ def verify(
             order = _order(made, proof.shape, path)
             contents = _contents(made, proof, _left_out(made, proof))
             contents = replace(contents, order=order, judges=tuple(each.judge for each in judged))
+            contents = record.with_earlier_remarks(contents, path / "report.json")
             if place is None:
                 drawn.sheet(data_sheet.draw, _sheet(made, proof, contents.goals, proof.lights[0].picture, order=order))
             drawn.begin(draw_convergence, contents)
