@@ -1,4 +1,4 @@
-"""Choice, order and distribution of the tests: the daily suite, the thorough tests, and several processes.
+"""Choice of the tests that the daily suite runs, their order, and the processes that run them.
 
 Tests that are marked `thorough` are left to `make test-all`: their law is held by a shorter test every day, or each
 commit runs a share of their samples (`in_turns`).  `--in-turn 4` leaves one test of four, by the commit's hash.

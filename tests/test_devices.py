@@ -18,7 +18,7 @@ from bstcad.optics.surfaces import bspline
 from bstcad.optics.trace import tubes
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
-from bstcad.tailoring import stage2
+from bstcad.tailoring import effort as efforts
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Hooks
 from bstcad.tailoring.stage2 import Problem
@@ -51,7 +51,7 @@ QUICK = ("beam_shaper", "draft")
 @pytest.fixture(autouse=True)
 def _briefly_compared(monkeypatch):
     """Each design looks at float32 beside float64: by one evaluation here, which takes the way of all."""
-    monkeypatch.setattr(stage2, "COMPARED_EVALUATIONS", 1)
+    monkeypatch.setattr(efforts, "FULL", replace(efforts.FULL, compared_evaluations=1))
 
 
 BOUNDED = ("machinable_letters", "paper")  # the paper's procedure knows no bounds on the back

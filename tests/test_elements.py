@@ -200,7 +200,7 @@ def test_a_design_with_a_window_and_a_fold_mirror_is_proved(folder):
     simulated = " ".join(report["effects"]["simulated"])
     assert "a window before the lens, without loss" in simulated and "a mirror behind the lens" in simulated
     again = bstcad.open(folder)
-    assert again.lens.freeform == (3,) and len(again.lens.interfaces) == 5
+    assert again.lens.tailored_numbers == (3,) and len(again.lens.interfaces) == 5
     assert again.report.prescription["behind"][0]["tilt"] == [0.0, 20.0]
 
 

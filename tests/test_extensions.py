@@ -306,7 +306,7 @@ def test_an_emitter_of_its_own_answers_or_declines_in_a_sentence(scene):
 def test_changes_of_a_scene_keep_source_and_targets_of_its_own(scene):
     around = scene.model_copy(update={"targets": (OnCylinder(**dict(scene.target)),), "source": Oval(5.0, 8.0)})
     changed = around.changed({"target.z": 300.0, "lens.min_thickness": 0.5})
-    assert changed.target.screen.plane == Cylinder(300.0) and changed.lens.min_thickness == 0.5
+    assert changed.target.screen.receiver == Cylinder(300.0) and changed.lens.min_thickness == 0.5
     assert changed.source is around.source
     assert around.changed({"source": scene.source, "target": scene.target}) == scene
 

@@ -95,7 +95,7 @@ def test_the_dome_is_in_the_scene_and_in_the_step_file_of_its_design(dome):
 def test_tolerances_of_a_domed_lens_move_its_dome(dome):
     """A form error is a net in the dome's place, which keeps the outline; a larger lens has a larger outline."""
     _, nominal = read_nominal(dome.folder)
-    setup = perturbations.Setup(nominal.lens, nominal.channels, nominal.goals[0].receiver)
+    setup = perturbations.Setup(nominal.lens, nominal.channels, nominal.goals[0].screen)
     rough = perturbations.form_error(nominal.lens, 4.0, 0, "front").apply(setup, 0.0).lens
     assert rough.front.is_net and rough.apertures == nominal.lens.apertures
     x = torch.linspace(-8, 8, 101, dtype=torch.float64)

@@ -17,13 +17,16 @@ import scipy.fft
 import torch
 from torch import Tensor
 
-from bstcad.analysis.dome_shape import extremes, radial_thickness
+from bstcad.analysis.curvature import extremes
 from bstcad.optics.kernels import spline
+from bstcad.optics.lens.interfaces import intersect
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import QUARTERS, BSplineSurface, span_points, weights
-from bstcad.optics.surfaces.outlines import Outline
-from bstcad.optics.surfaces.radial import RadialSurface
+from bstcad.optics.surfaces.outlines import EVERYWHERE, Outline
+from bstcad.optics.surfaces.radial import RadialSurface, dot
+from bstcad.optics.surfaces.rays import Rays, Status
 from bstcad.optics.surfaces.sampling import sample_rim
+from bstcad.optics.surfaces.surfaces import points_on, sag
 
 GRID_POINTS = 1025  # points per side of the grid for thickness, and along a quarter of the rim
 HEIGHT_ROUNDING = 1e-13  # rounding of the heights, relative to the largest height
@@ -39,67 +42,67 @@ def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
     grid: points per side.  A radius is None if the back has no such curvature.  Keys front_… describe a tailored front,
     which is seen from outside, as the back is: valleys are concave.
     """
-    if isinstance(lens.back, RadialSurface):
-        return _describe_dome(lens, lens.back, grid)
     x, y = _points(lens.outline, grid)
-    front, back = _sags(lens, x, y)
-    thickness, (front_vertex, back_vertex) = back - front, _sags(lens, *torch.zeros(2, 1, dtype=torch.float64))
-    edge, flat = thickness[: 4 * grid], (x.numpy(), y.numpy())
-    of_front = _face_figures(lens.front_net, survey_front(lens), (*flat, front)) if lens.shapes("front") else {}
+    points = points_on(lens.back, x, y)
+    glass, [centre] = thickness(lens, points), thickness(lens, points_on(lens.back, [0.0], [0.0]))
+    of_front = {}
+    if lens.is_tailored("front"):
+        of_front = _face_figures(lens.front_net, survey_front(lens), points_on(lens.front, x, y))
+    (thinnest, thickest), (edge_thinnest, edge_thickest) = _range(glass), _range(glass[: 4 * grid])
     return {
-        "centre_thickness": float((back_vertex - front_vertex)[0]),
-        "edge_thickness_min": float(edge.min()),
-        "edge_thickness_max": float(edge.max()),
-        "thickness_min": float(thickness.min()),
-        "thickness_max": float(thickness.max()),
-        **_face_figures(lens.back_net, survey(lens), (*flat, back)),
+        "centre_thickness": float(centre),
+        "edge_thickness_min": edge_thinnest,
+        "edge_thickness_max": edge_thickest,
+        "thickness_min": thinnest,
+        "thickness_max": thickest,
+        **_face_figures(lens.back_net, survey(lens), points),
         **{f"front_{key}": value for key, value in of_front.items()},
     }
 
 
-def _describe_dome(lens: Lens, back: RadialSurface, grid: int) -> dict[str, float | None]:
-    """Return the figures of `describe` for a dome; thicknesses are along lines from its centre."""
-    x, y = _points(lens.outline, grid)
-    axis = torch.zeros(1, dtype=torch.float64)
-    thickness, (middle,) = radial_thickness(lens.front, back, x, y), radial_thickness(lens.front, back, axis, axis)
-    edge, known = thickness[: 4 * grid], thickness.nan_to_num(math.inf)
-    position = back.at(x, y).position
-    points = position[0].numpy(), position[1].numpy(), position[2].numpy() + float(back.z)
-    return {
-        "centre_thickness": float(middle),
-        "edge_thickness_min": float(edge.nan_to_num(math.inf).min()),
-        "edge_thickness_max": float(edge.nan_to_num(-math.inf).max()),
-        "thickness_min": float(known.min()),
-        "thickness_max": float(thickness.nan_to_num(-math.inf).max()),
-        **_face_figures(back, survey(lens), points),
-    }
-
-
-def _face_figures(net: BSplineSurface, bends: Survey, points: tuple[np.ndarray, ...]) -> dict[str, Any]:
-    """Return the figures of one freeform face; bends: its extremes; points: x, y and z (mm) of points all over it."""
+def _face_figures(net: BSplineSurface, bends: Survey, points: np.ndarray) -> dict[str, Any]:
+    """Return the figures of one freeform face; bends: its extremes; points: points (n, 3) (mm) all over it."""
     concave, convex = (bend.largest if bend.largest < MAX_RADIUS else None for bend in (bends.concave, bends.convex))
     octaves, waves = slope_octaves(net), ripple(net)
     top = octaves[-1] / octaves.sum() if octaves.sum() > 0 else 0.0
     return {
-        "sag_pv": float(np.ptp(points[2])),
+        "sag_pv": float(np.ptp(points[:, 2])),
         "slope_max_deg": bends.slope.largest,
         "radius_min_concave": concave,
         "radius_min_convex": convex,
-        "departure_best_sphere": departure(*points),
+        "departure_best_sphere": departure(*points.T),
         "slope_energy_top_octave": float(top),
         "ripple_height": waves.height,
         "ripple_slope": waves.slope,
     }
 
 
+def thickness(lens: Lens, points: np.ndarray) -> np.ndarray:
+    """Return the thickness (mm) at points (n, 3) of the back: along z, or along lines from the centre of its chart.
+
+    A front beside the centre, such as a plane below it, gives NaN where the line meets it behind the centre.
+    """
+    if lens.back.chart.flat:
+        x, y, z = points.T
+        return z - sag(lens.front, x, y)
+    position = torch.from_numpy(np.ascontiguousarray((points - (0.0, 0.0, lens.back.z)).T))
+    rho = torch.sqrt(dot(position, position))
+    status = torch.zeros(rho.shape, dtype=torch.uint8)
+    rays = Rays(torch.zeros_like(position), position / rho, torch.ones_like(rho), status, z=lens.back.z)
+    met, _ = intersect(lens.front.optical, rays, EVERYWHERE, Status.MISSED_FRONT)
+    at = torch.stack([*met.position[:2], met.above(lens.back.z)])
+    return torch.where(met.alive, rho - torch.sqrt(dot(at, at)), torch.full_like(rho, math.nan)).numpy()
+
+
+def _range(glass: np.ndarray) -> tuple[float, float]:
+    """Return the smallest and the largest of thicknesses, without those that are NaN."""
+    unknown = np.isnan(glass)
+    return float(np.where(unknown, math.inf, glass).min()), float(np.where(unknown, -math.inf, glass).max())
+
+
 def thickness_range(lens: Lens, edge: np.ndarray | None = None) -> tuple[float, float]:
-    """Return the minimum and maximum thickness (mm), along z or of a dome from its centre; edge: as in `heights`."""
-    if isinstance(lens.back, RadialSurface):
-        glass = radial_thickness(lens.front, lens.back, *_points(lens.outline, GRID_POINTS))
-        return float(glass.nan_to_num(math.inf).min()), float(glass.nan_to_num(-math.inf).max())
-    front, back = heights(lens, edge)
-    glass = back - front
-    return float(glass.min()), float(glass.max())
+    """Return the minimum and maximum `thickness` (mm); edge: as in `heights`."""
+    return _range(thickness(lens, points_on(lens.back, *_places(lens, edge))))
 
 
 def heights(lens: Lens, edge: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -107,14 +110,13 @@ def heights(lens: Lens, edge: np.ndarray | None = None) -> tuple[np.ndarray, np.
 
     edge: corners (n, 2) in mm of a polygon, once around, in place of the outline, for a lens that was cut smaller.
     """
-    if isinstance(lens.back, RadialSurface):
-        dome = lens.back.at(*_points(lens.outline, GRID_POINTS)).position[2].numpy() + float(lens.back.z)
-        return np.array([float(lens.front.around.z), float(lens.front.z)]), dome
-    return _sags(lens, *(_points(lens.outline, GRID_POINTS) if edge is None else _points_in(edge)))
+    x, y, z = points_on(lens.back, *_places(lens, edge)).T
+    return sag(lens.front, x, y), z
 
 
-def _sags(lens: Lens, x: Tensor, y: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    return lens.front.sag_and_slope(x, y)[0].numpy(), lens.back.sag_and_slope(x, y)[0].numpy()
+def _places(lens: Lens, edge: np.ndarray | None) -> tuple[Tensor, Tensor]:
+    """Return x and y (mm), in the back's chart, of points inside the outline, or inside an edge in a flat chart."""
+    return _points(lens.outline, GRID_POINTS) if edge is None or not lens.back.chart.flat else _points_in(edge)
 
 
 def _points(outline: Outline, n: int) -> tuple[Tensor, Tensor]:
@@ -270,10 +272,9 @@ def survey(lens: Lens, concave: float | None = None, convex: float | None = None
     lens = lens.plain()
     back = lens.back_net
     if isinstance(back, RadialSurface):
-        bends = extremes(lens, back)
         valley, ridge, steep = (
             Extreme(value, f"at ({', '.join(f'{p:.4g}' for p in place)}) mm", 0.0)
-            for value, place in (bends.valley, bends.ridge, bends.slope)
+            for value, place in extremes(back, lens.outline)
         )
         return Survey(_radius(valley), _radius(ridge), steep)
     x, y, along_x, along_y = _grid(back)

@@ -19,16 +19,16 @@ def svg(data: Mapping[str, Any]) -> str:
     targets = target if isinstance(target, list) else [target]
     if not all(isinstance(table, Mapping) for table in (lens, source, *targets)) or not targets:
         return ""
-    is_dome = value_at("back.kind", lens) == "radial"
+    dome = value_at("back.kind", lens) == "radial"
     front, wall = _number("front.z", lens), _number("z", targets[0])
-    back = _dome_z(lens) if is_dome else _number("back.z", lens)
+    back = _dome_z(lens) if dome else _number("back.z", lens)
     sizes = {"outline": _across(lens.get("outline")), "thickness": _between(front, back)}
     sizes |= {"width": _range(targets[0].get("x")), "height": _range(targets[0].get("y"))}
     kinds = {
         "mirror": is_mirror(data),
         "point": source.get("kind") != "collimated",
         "walls": len(targets),
-        "dome": is_dome,
+        "dome": dome,
     }
     template = environment().get_template("sketch.svg.j2")
     return template.render(distance=_between(back, wall), **sizes, **kinds)

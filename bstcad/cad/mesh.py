@@ -15,17 +15,15 @@ import math
 import re
 import zipfile
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
-import torch
 from numba import njit
 
-from bstcad.cad import dome_mesh
+from bstcad.cad.distances import WALL_NORMAL_Z, distances_of_facets, distances_of_points, normals_near
 from bstcad.cad.grids import (
     cell_corners,
     inward_diagonals,
@@ -35,11 +33,10 @@ from bstcad.cad.grids import (
     triangles_over,
     wall_triangles,
 )
-from bstcad.optics.lens import domes
+from bstcad.optics.lens.base import on_base
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.surfaces.bspline import is_net
 from bstcad.optics.surfaces.outlines import Circle, Outline
-from bstcad.optics.surfaces.surfaces import MIN_COS2, Recess, Surface, sag, sampled
+from bstcad.optics.surfaces.surfaces import Recess, Surface, points_on
 from bstcad.runs import files
 from bstcad.runs.kernel_cache import compiled_kernel
 from bstcad.scene.scene import FLOAT32_ROUNDING
@@ -50,8 +47,6 @@ MAX_TRIANGLES = 32_000_000  # largest number of triangles if a scene states a to
 GOAL_FRACTION = 0.95  # largest goal of the chordal error, relative to the tolerance: float32 rounding needs a margin
 STEP_MARGIN = 1.01  # ratio of tried to estimated cells per side, so that the next mesh meets the goal
 CELL_MARGIN = 1.1  # ratio of estimated to allowed cells per side above which no finer mesh is tried; estimates err
-WALL_NORMAL_Z = 1e-6  # largest |z| component of the unit normal of a facet of the wall
-MAX_FACET_SAMPLES = 100_000_000  # largest number of points at which the facets of a mesh are compared with the lens
 FACETS_PER_BLOCK = 1 << 15  # number of facets processed at a time, so that their corners stay in the cache
 
 
@@ -72,13 +67,11 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
     """Return the lens as a closed mesh of `cells` grid cells per side, an even number, which `fit_mesh` can choose."""
     if cells < 2 or cells % 2:
         raise ValueError(f"mesh: the number of cells per side is {cells}; give an even number of at least 2")
-    lens = domes.on_base(lens)
-    if domes.is_dome(lens):
-        return Mesh(*dome_mesh.dome_grid(lens, cells))
+    lens = on_base(lens)
     x, y = nodes(lens.outline, cells)
     grid = np.arange(x.size, dtype=np.int32).reshape(x.shape)
-    border, z = rim(grid), sag(lens.back, x, y)
-    back = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    border, points = rim(grid), points_on(lens.back, x, y)
+    back = points.reshape(-1, 3)
     if isinstance(lens.front, Recess):
         front, front_rim, front_faces = _recessed_front(lens.front, back[border], grid)
     elif _has_plane_front(lens):  # one fan of triangles covers a plane
@@ -88,11 +81,10 @@ def lens_mesh(lens: Lens, cells: int) -> Mesh:
         centre = np.full_like(front_rim, front_rim[-1] + 1)
         front_faces = np.stack([centre, np.roll(front_rim, -1), front_rim], axis=1)
     else:
-        low = sag(lens.front, x, y)
-        front = np.stack([x, y, low], axis=-1).reshape(-1, 3)
-        front_rim = border + x.size
-        front_faces = triangles_over(grid + x.size, _diagonals(lens.outline, lens.front, (x, y, low)))[:, ::-1]
-    back_faces = triangles_over(grid, _diagonals(lens.outline, lens.back, (x, y, z)))
+        low = points_on(lens.front, x, y)
+        front, front_rim = low.reshape(-1, 3), border + x.size
+        front_faces = triangles_over(grid + x.size, _diagonals(lens.outline, lens.front, (x, y), low))[:, ::-1]
+    back_faces = triangles_over(grid, _diagonals(lens.outline, lens.back, (x, y), points))
     triangles = [back_faces, front_faces, wall_triangles(front_rim, border)]
     return Mesh(np.concatenate([back, front]), np.concatenate(triangles, dtype=np.int32, casting="same_kind"))
 
@@ -103,31 +95,48 @@ def _recessed_front(front: Recess, around: np.ndarray, grid: np.ndarray) -> tupl
     around: vertices (k, 3) of the back's rim, below which the outer rim lies.  grid: indices of the back's nodes, which
     the new indices continue.  The grid over the front also has k rim nodes; the plane's triangles join the two rims.
     """
-    x, y = nodes(front.outline, len(grid) - 1)
-    z = sag(front.optical, x, y)
-    border = rim(grid)
-    z[np.unravel_index(border, grid.shape)] = front.around.z
-    dome, plane = np.stack([x, y, z], axis=-1).reshape(-1, 3), around.copy()
+    cells, border, plane = len(grid) - 1, rim(grid), around.copy()
     plane[:, 2] = front.around.z
     outer, inner = 2 * grid.size + np.arange(len(border)), border + grid.size
-    triangles = triangles_over(grid + grid.size, _diagonals(front.outline, front.optical, (x, y, z)))[:, ::-1]
-    return np.vstack([dome, plane]), outer, np.concatenate([triangles, wall_triangles(inner, outer)])
+    triangles = triangles_over(grid + grid.size, inward_diagonals(cells))[:, ::-1]
+    nodes_of_both = np.vstack([_inner_nodes(front, cells), plane])
+    return nodes_of_both, outer, np.concatenate([triangles, wall_triangles(inner, outer)])
 
 
-def _diagonals(outline: Outline, surface: Surface, points: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+def _inner_nodes(front: Recess, cells: int) -> np.ndarray:
+    """Return points (n, 3) of a conic inside its outline: x = u / w, y = v / w, w = 1 + K (u² + v²) / 4.
+
+    (u, v) is the projection from the conic's far vertex (patches.conic_net), in which a grid is even up to a steep rim.
+    """
+    (c, k), radius = front.conic(), float(front.outline.radius)
+    bend = (1 + k) * c * c
+    u, v = nodes(Circle(2 * radius / (1 + math.sqrt(1 - bend * radius * radius))), cells)
+    square = u * u + v * v
+    w = 1 + bend / 4 * square
+    points = np.stack([u / w, v / w, front.z + c / 2 * square / w], axis=-1)
+    points[[0, -1], :, 2] = points[:, [0, -1], 2] = front.around.z
+    return points.reshape(-1, 3)
+
+
+def _diagonals(
+    outline: Outline, surface: Surface, chart: tuple[np.ndarray, np.ndarray], points: np.ndarray
+) -> np.ndarray:
     """Choose the diagonal of each cell that is nearer to the face: True (n, n) for the diagonal from the first corner.
 
-    points: x, y and z of the nodes.  A diagonal along a ridge has at most half the error of a diagonal across it,
-    so that fewer triangles suffice.  On a disc, cells on the grid's diagonals are divided towards the centre, because
-    their outer corners lie on a circle and the other diagonal would make degenerate triangles.
+    chart: x and y of the nodes in the surface's chart; points: their positions (n + 1, n + 1, 3).  A diagonal along a
+    ridge has at most half the error of a diagonal across it, so that fewer triangles suffice.  On a disc, cells on the
+    grid's diagonals are divided towards the centre, because their outer corners lie on a circle and the other diagonal
+    would make degenerate triangles.
     """
-    cells = len(points[0]) - 1
+    cells = len(points) - 1
     inwards = inward_diagonals(cells)
     if surface.level:
         return inwards
-    (a, b, c, d), (e, f, g, h), (p, q, r, s) = map(cell_corners, points)
-    along = np.abs(sag(surface, (a + c) / 2, (e + g) / 2) - (p + r) / 2)
-    across = np.abs(sag(surface, (b + d) / 2, (f + h) / 2) - (q + s) / 2)
+    (a, b, c, d), (e, f, g, h), (p, q, r, s) = map(cell_corners, (*chart, points))
+    along, across = (
+        np.linalg.norm(points_on(surface, (x0 + x1) / 2, (y0 + y1) / 2) - (p0 + p1) / 2, axis=-1)
+        for x0, x1, y0, y1, p0, p1 in ((a, c, e, g, p, r), (b, d, f, h, q, s))
+    )
     if not outline.is_round:
         return along <= across
     return np.where(on_diagonals(cells), inwards, along <= across)
@@ -146,7 +155,7 @@ def fit_mesh(lens: Lens, tolerance: float, max_triangles: int | None = None) -> 
     If `max_triangles` (None: DEFAULT_MAX_TRIANGLES) do not suffice, the mesh is the finest with at most that many
     triangles, or at most DEFAULT_MAX_TRIANGLES if this is fewer.
     """
-    lens = domes.on_base(lens)
+    lens = on_base(lens)
     allowed = DEFAULT_MAX_TRIANGLES if max_triangles is None else max_triangles
     cells, last, goal = MIN_MESH_CELLS, max_cells(lens, allowed), chordal_error_goal(lens, tolerance)
     limit = CELL_MARGIN * last if allowed > DEFAULT_MAX_TRIANGLES else last
@@ -173,15 +182,14 @@ def chordal_error_goal(lens: Lens, tolerance: float) -> float:
 
 def largest_coordinate(lens: Lens) -> float:
     """Return an upper bound (mm) of the absolute coordinates of the lens's points."""
-    if domes.is_dome(lens):
-        return float(np.abs(lens.back_net.control_points()).max())
-    ends = [abs(face.z + height) for face in (lens.front, lens.back) for height in face.sags(lens.outline)]
-    return max(*lens.outline.half_extent, *ends)
+    faces = ((lens.front, lens.plan), (lens.back, lens.outline))
+    ends = [abs(face.z + height) for face, outline in faces for height in face.sags(outline)]
+    return max(*lens.plan.half_extent, *ends)
 
 
 def max_cells(lens: Lens, max_triangles: int | None = None) -> int:
     """Return the largest number of cells per side for at most `max_triangles` (None: DEFAULT_MAX_TRIANGLES)."""
-    lens = domes.on_base(lens)
+    lens = on_base(lens)
     faces, total = 2 if _has_plane_front(lens) else 4, DEFAULT_MAX_TRIANGLES if max_triangles is None else max_triangles
     # triangles per cell along one side of the grid: 8 of the wall, and 4 of the fan over a plane front or 8 of the
     # plane around a front
@@ -218,71 +226,22 @@ def volume_and_area(mesh: Mesh) -> tuple[float, float]:
 def chordal_error(mesh: Mesh, lens: Lens, enough: float = math.inf) -> float:
     """Return the largest distance (mm) between the lens and the facets, at points other than the facets' corners.
 
-    Since a net may bend in each knot span, facets are sampled twice per span (at most MAX_FACET_SAMPLES points in all).
     enough: error (mm) at which the search ends; the result is then a lower bound.
     """
-    if domes.is_dome(lens):
-        return dome_mesh.chordal_error(mesh.vertices, mesh.faces, domes.on_base(lens), enough)
-    max_parts = max(1, int((MAX_FACET_SAMPLES / 2 / max(len(mesh.faces), 1)) ** 0.5))
-    radius = float(lens.outline.radius) if isinstance(lens.outline, Circle) else 0.0
-    back, front = _face_numbers(lens.back), _face_numbers(lens.front)
-
-    def largest_error(faces: np.ndarray) -> float:
-        return _chordal_error(mesh.vertices, faces, max_parts, radius, back, front)
-
     error = 0.0
-    with ThreadPoolExecutor(torch.get_num_threads()) as threads:
-        for part in threads.map(largest_error, np.array_split(mesh.faces, 16)):
-            error = max(error, part)
-            if error >= enough:
-                break  # cancels the other parts
+    for part in distances_of_facets(mesh.vertices, mesh.faces, on_base(lens)):
+        error = max(error, part)
+        if error >= enough:
+            break
     return error
 
 
 def vertex_error(mesh: Mesh, lens: Lens) -> float:
-    """Return the largest distance (mm) of a vertex from the nearer face's tangent plane: |Δz| / sqrt(1 + |∇z|²).
-
-    The distance along z would contain the rounding of x and y, multiplied by |∇z|.
-    """
-    if domes.is_dome(lens):
-        return dome_mesh.vertex_error(mesh.vertices, domes.on_base(lens))
-    x, y, z = mesh.vertices.T
-
-    def off(face: Surface) -> np.ndarray:
-        height, p, q = sampled(face, x, y)
-        return np.abs(height - z) / np.sqrt(1 + p**2 + q**2)
-
-    return float(np.minimum(off(lens.back), off(lens.front)).max())
-
-
-def _face_numbers(surface: Surface) -> FaceNumbers:
-    face = surface.plain()
-    per_detail = 1 / float(face.detail)
-    if not is_net(face):
-        (c, k), no_net = face.conic(), (np.zeros((0, 0)), 0.0, 0.0, 0.0, 0.0)
-        ends2 = face.outline.radius**2 if face.outline else math.inf
-        return FaceNumbers(float(face.z), c, (1 + k) * c * c, MIN_COS2, ends2, per_detail, *no_net)
-    net = (face.heights.contiguous().numpy(), float(face.x[0]), float(face.y[0]), 1 / face.pitch[0], 1 / face.pitch[1])
-    return FaceNumbers(float(face.z), 0.0, 0.0, MIN_COS2, math.inf, per_detail, *net)
+    """Return the largest distance (mm) of a vertex from the nearest face."""
+    return float(distances_of_points(mesh.vertices, on_base(lens)).max())
 
 
 # ---- compiled kernels, for millions of triangles ---------------------------------------------------------------------
-
-
-class FaceNumbers(NamedTuple):
-    """A face as plain numbers: z = z0 + Σ B_i(u) B_j(v) h_ij over a net, or a surface of revolution."""
-
-    z: float  # z0 (mm)
-    curvature: float  # curvature c at the vertex (1/mm)
-    bend: float  # (1 + k) c² (1/mm²), k the conic constant
-    equator: float  # smallest 1 - (1 + k) c² r²: surfaces.MIN_COS2
-    ends2: float  # r² (mm²) of Surface.outline, outside of which the face is a plane; infinite: no outline
-    per_detail: float  # smooth parts per mm: 1 / Surface.detail
-    net: np.ndarray  # heights h of the control points, (m, n), mm; (0, 0): a surface of revolution
-    x: float  # x of the net's first corner (mm)
-    y: float  # y of the net's first corner (mm)
-    per_x: float  # control points per mm along x
-    per_y: float  # control points per mm along y
 
 
 @njit(inline="always")
@@ -302,75 +261,6 @@ def _corners_and_normals(vertices, faces):
                 corners[k, i, axis] = vertices[faces[k, i], axis]
         normals[k, 0], normals[k, 1], normals[k, 2] = _normal(corners[k, 0], corners[k, 1], corners[k, 2])
     return corners, normals
-
-
-@njit(inline="always")
-def _basis(u, m):
-    """Return (k, B_k, B_{k+1}, B_{k+2}) at u (pitches), m control points: bspline.basis, copied for numba's cache."""
-    if u < 1.5:
-        k, s = 0, 2.0 - math.sqrt(4.0 - 2.0 * u)
-    elif u > m - 2.5:
-        k, s = m - 3, math.sqrt(4.0 - 2.0 * (m - 1 - u)) - 1.0
-    else:
-        k = min(int(u - 0.5), m - 3)
-        s = u - 0.5 - k
-    low = (1.0 if k == 0 else 0.5) * (1.0 - s) * (1.0 - s)
-    high = (1.0 if k == m - 3 else 0.5) * s * s
-    return k, low, 1.0 - low - high, high
-
-
-@njit(inline="always")
-def _sag(face, x, y):
-    net = face.net
-    m, n = net.shape
-    if m == 0:
-        r2 = min(x * x + y * y, face.ends2)
-        return face.z + face.curvature * r2 / (1.0 + math.sqrt(max(1.0 - face.bend * r2, face.equator)))
-    i, a0, a1, a2 = _basis(min(max((x - face.x) * face.per_x, 0.0), m - 1.0), m)
-    j, b0, b1, b2 = _basis(min(max((y - face.y) * face.per_y, 0.0), n - 1.0), n)
-    h0 = b0 * net[i, j] + b1 * net[i, j + 1] + b2 * net[i, j + 2]
-    h1 = b0 * net[i + 1, j] + b1 * net[i + 1, j + 1] + b2 * net[i + 1, j + 2]
-    h2 = b0 * net[i + 2, j] + b1 * net[i + 2, j + 1] + b2 * net[i + 2, j + 2]
-    return face.z + (a0 * h0 + a1 * h1 + a2 * h2)
-
-
-@compiled_kernel()
-def _distance_from_face(a, b, c, parts, face):
-    """Return the largest distance along z (mm) of a face from the triangle a b c, with 2 * parts steps per edge."""
-    n = 2 * parts
-    worst = abs(_sag(face, (a[0] + b[0] + c[0]) / 3, (a[1] + b[1] + c[1]) / 3) - (a[2] + b[2] + c[2]) / 3)
-    for i in range(n):
-        for j in range(n + 1 - i):
-            p, q, r = i / n, j / n, (n - i - j) / n
-            if max(p, q, r) < 1.0:
-                x, y = p * a[0] + q * b[0] + r * c[0], p * a[1] + q * b[1] + r * c[1]
-                worst = max(worst, abs(_sag(face, x, y) - (p * a[2] + q * b[2] + r * c[2])))
-    return worst
-
-
-@compiled_kernel()
-def _chordal_error(vertices, faces, max_parts, radius, back, front):
-    """Return the largest distance (mm) of the lens from triangles, along the triangles' normals.
-
-    A triangle whose unit normal has |z| <= WALL_NORMAL_Z belongs to the wall: a cylinder of the given radius, or planes
-    (radius 0).  Edges and interior of a triangle on a face are sampled in two steps per `Surface.detail`, with at most
-    2 * max_parts steps per edge.  On a round wall only the middles of the edges are sampled.
-    """
-    worst = 0.0
-    for k in range(len(faces)):
-        a, b, c = vertices[faces[k, 0]], vertices[faces[k, 1]], vertices[faces[k, 2]]
-        n_x, n_y, n_z = _normal(a, b, c)
-        length = math.sqrt(n_x**2 + n_y**2 + n_z**2)
-        if abs(n_z) > WALL_NORMAL_Z * length:
-            p, q, s, t = b[0] - a[0], b[1] - a[1], c[0] - a[0], c[1] - a[1]
-            extent = max(abs(p), abs(q), abs(s), abs(t), abs(p - s), abs(q - t))
-            face = back if n_z > 0.0 else front
-            parts = min(max_parts, max(1, math.ceil(extent * face.per_detail)))
-            worst = max(worst, _distance_from_face(a, b, c, parts, face) * abs(n_z) / length)
-        elif radius > 0.0:
-            for x, y in ((a[0] + b[0], a[1] + b[1]), (b[0] + c[0], b[1] + c[1]), (c[0] + a[0], c[1] + a[1])):
-                worst = max(worst, abs(radius - math.hypot(x, y) / 2))
-    return worst
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------
@@ -569,7 +459,7 @@ def _glb(mesh: Mesh, lens: Lens, label: Label, off: float) -> bytes:
 
     A vertex on an edge of the lens is repeated with the normal of each face and each facet of the wall that meet there.
     """
-    lens = domes.on_base(lens)
+    lens = on_base(lens)
     import trimesh  # takes most of a second
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
@@ -585,7 +475,7 @@ def _glb(mesh: Mesh, lens: Lens, label: Label, off: float) -> bytes:
     for face, sense in ((lens.back, 1), (lens.front, -1)):
         used, renumbered = np.unique(mesh.faces[(sense * across[:, 2] > WALL_NORMAL_Z) & ~wall], return_inverse=True)
         vertices.append(mesh.vertices[used])
-        normals.append(sense * _upward_normals(face.optical, vertices[-1]))
+        normals.append(sense * normals_near(face.optical, vertices[-1]))
         faces.append(renumbered.reshape(-1, 3) + count)
         count += len(used)
     *colour, opacity = (int(label.colour[k : k + 2], 16) for k in (1, 3, 5, 7))  # red, green, blue
@@ -604,14 +494,6 @@ def _glb(mesh: Mesh, lens: Lens, label: Label, off: float) -> bytes:
     scene = trimesh.Scene()
     scene.add_geometry(solid, geom_name=label.name, node_name=label.name)
     return scene.export(file_type="glb", include_normals=True)
-
-
-def _upward_normals(surface: Surface, points: np.ndarray) -> np.ndarray:
-    if domes.is_radial(surface):
-        return dome_mesh.normals_on(surface.plain(), points)
-    _, z_x, z_y = sampled(surface, points[:, 0], points[:, 1])
-    normals = np.stack([-z_x, -z_y, np.ones_like(z_x)], axis=1)
-    return normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
 def _y_up(vectors: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ they loosen the edges or refit the faces, and a boolean with a net of 513 x 513 
 from __future__ import annotations
 
 import cmath
-import functools
 import math
 import numbers
 from collections.abc import Sequence
@@ -22,14 +21,14 @@ from OCP.gp import gp_Ax2d, gp_Dir2d, gp_Pnt2d
 from OCP.TopoDS import TopoDS_Face, TopoDS_Solid
 
 from bstcad.cad import patches, walls, wires
-from bstcad.cad.patches import Patch, back_patch, front_patch, level_patch
+from bstcad.cad.patches import FacePatch, back_patch, front_patch, level_patch
 from bstcad.cad.walls import MIN_WALL, NO_DRAFT, Draft, NamedFace, Rail, face_inside
 from bstcad.cad.wires import LoopPiece, RailCurve
-from bstcad.optics.lens import domes
+from bstcad.optics.lens.base import check_base, on_base
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.sides import as_pair, coarser
-from bstcad.optics.surfaces.surfaces import Plane, sag
+from bstcad.optics.surfaces.surfaces import Plane, points_on, sag
 from bstcad.scene.mount import parting
 
 if TYPE_CHECKING:
@@ -95,19 +94,17 @@ def lens_shape(
 
 
 def prepared(lens: Lens) -> Lens:
-    """Return the lens in float64 with the base of a dome (domes.on_base); ValueError if its faces cross."""
-    lens = domes.on_base(lens.plain())
+    """Return the lens in float64 on its base (base.on_base), if it has one; ValueError if its faces cross."""
+    lens = on_base(lens.plain())
     check_thickness(lens)
     return lens
 
 
 def rim_loop(lens: Lens) -> list[LoopPiece]:
     """Return the loop of the lens's outline, on which its walls stand, counterclockwise."""
-    if not domes.is_dome(lens):
+    if lens.shares_outline:
         return wires.outline_loop(lens.outline)
-    dome = domes.radial_back(lens)
-    points = functools.partial(domes.points_on, dome)
-    return wires.dome_loop(dome, domes.rim_radius(lens.outline), points, walls.RIM_TOLERANCE)
+    return wires.loop_on(lens.back_net, lens.outline, walls.RIM_TOLERANCE)
 
 
 def coarse_copy(lens: Lens, m: int) -> Lens:
@@ -135,10 +132,8 @@ def check_thickness(lens: Lens) -> None:
     The thickness must exceed MIN_WALL because of the tolerance of edges.  Since a spline lies nowhere below its lowest
     control point, most lenses need no sampling.  Others are sampled at three points per knot span in x and in y.
     """
-    if domes.is_dome(lens):
-        domes.check_dome(lens)
-        return
-    lowest, highest = lens.back.sags(lens.outline)[0], lens.front.sags(lens.outline)[1]
+    check_base(lens)
+    lowest, highest = lens.back.sags(lens.outline)[0], lens.front.sags(lens.plan)[1]
     if lens.back.z + lowest - (lens.front.z + highest) > MIN_WALL:
         return
     a, b = lens.outline.half_extent
@@ -148,11 +143,11 @@ def check_thickness(lens: Lens) -> None:
     )
     x, y = torch.meshgrid(*axes, indexing="ij")
     inside = lens.outline.contains(x, y)
-    points = x[inside].numpy(), y[inside].numpy()
-    thickness = sag(lens.back, *points) - sag(lens.front, *points)
+    x, y, z = points_on(lens.back, x[inside].numpy(), y[inside].numpy()).T
+    thickness = z - sag(lens.front, x, y)
     i = int(thickness.argmin())
     if not thickness[i] > MIN_WALL:
-        at = "({:g}, {:g}) mm".format(*(p[i] for p in points))
+        at = f"({x[i]:g}, {y[i]:g}) mm"
         raise ValueError(f"lens: its thickness is {thickness[i]:g} mm at {at}; move the front down")
 
 
@@ -161,7 +156,7 @@ def check_thickness(lens: Lens) -> None:
 
 def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[list[LoopPiece]]:
     """Return rim (trim None: the outline), counterclockwise, and holes, clockwise; ValueError if they bound no lens."""
-    if domes.is_dome(lens):
+    if not lens.shares_outline:
         if trim is not None or len(holes):
             raise ValueError("trim or holes: a dome keeps its own rim, the circle of its outline; omit trim and holes")
         return [rim_loop(lens)]
@@ -180,9 +175,9 @@ def cut_loops(lens: Lens, trim: cadquery.Wire | None, holes: Sequence) -> list[l
             f"trim or holes: {reason} near {position}; draw wires that do not cross themselves or each other, and the "
             "holes inside the rim"
         )
-    if (dome := lens.front.outline) and not shape.contains(wires.polygon(wires.outline_loop(dome))):
+    if (inner := lens.front.outline) and not shape.contains(wires.polygon(wires.outline_loop(inner))):
         raise ValueError(
-            f"trim or holes: a wire crosses the front, {dome.words}, or lies inside it; move the wire outside"
+            f"trim or holes: a wire crosses the front, {inner.words}, or lies inside it; move the wire outside"
         )
     correct = [shape.exterior.is_ccw, *(not hole.is_ccw for hole in shape.interiors)]
     return [loop if is_left else wires.reversed_loop(loop) for loop, is_left in zip(loops, correct, strict=True)]
@@ -209,7 +204,7 @@ def _hole_loop(name: str, hole: cadquery.Wire | Sequence[float]) -> list[LoopPie
 # ---- caps and walls ------------------------------------------------------------------------------------------------
 
 
-def cap(patch: Patch, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
+def cap(patch: FacePatch, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
     """Return the face on a patch, back (along: True) or front (False), inside the first rail and outside the others."""
     loops = [rail.along() if along else rail.against() for rail in rails]
     face = face_inside(patch.surface, patch.outward, *loops)
@@ -223,23 +218,23 @@ def front_caps(lens: Lens, rails: Sequence[Rail]) -> list[NamedFace]:
     """Return the front, and the plane around it if it has an outline, inside the first rail and outside the others."""
     if lens.front.outline is None:
         return [(cap(front_patch(lens), rails, along=False), "front")]
-    dome, rim = dome_cap(lens)
+    front, rim = optical_cap(lens)
     plane = level_patch(lens.front.around.z)
     around = face_inside(plane.surface, plane.outward, *(rail.against() for rail in rails), rim.along())
-    return [dome, (around, "underside")]
+    return [front, (around, "underside")]
 
 
-def dome_cap(lens: Lens) -> tuple[NamedFace, Rail]:
+def optical_cap(lens: Lens) -> tuple[NamedFace, Rail]:
     """Return the optical part of a front with its own outline, and its rim, counterclockwise."""
     assert lens.front.outline is not None
     rim = walls.rail_on(lens.front.optical, wires.outline_loop(lens.front.outline))
     return (cap(front_patch(lens), [rim], along=False), "front"), rim
 
 
-def image(patch: Patch, curve: RailCurve) -> Geom2d_Curve:
+def image(patch: FacePatch, curve: RailCurve) -> Geom2d_Curve:
     """Return the image in (u, v) of a curve on a patch: a line, circle or spline with the parameter of the curve."""
     piece, uv = curve.piece, patch.uv
-    located = piece if piece.rim is None else piece.rim.arc  # a dome's (u, v) follow from its chart
+    located = piece if piece.rim is None else piece.rim.arc  # (u, v) follow from the chart
     assert uv is not None  # a plane needs no image
     cubic = curve.knots if curve.knots is not None and len(curve.knots) == len(curve.poles) + 4 else None
     t = np.linspace(0.0, piece.end, IMAGE_SAMPLES) if cubic is None else np.unique(cubic)

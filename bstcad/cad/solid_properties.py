@@ -28,7 +28,7 @@ from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape
 
 from bstcad.cad import step_reading
 from bstcad.cad.step_reading import StepLens, parts_of
-from bstcad.optics.lens import domes, quadrature
+from bstcad.optics.lens import quadrature
 from bstcad.optics.lens.quadrature import (
     EDGE_PARTS,
     GAUSS_POINTS_PER_PART,
@@ -128,14 +128,14 @@ def _concatenate(parts: Iterator[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
 
 
 def _edge_over_net(edge: TopoDS_Edge, face: TopoDS_Face, net: BSplineSurface) -> tuple[np.ndarray, ...]:
-    """Return `_edge_in_space`; for a radial net x, y, dx and dy are those of its chart, from the edge in (u, v)."""
-    if not domes.is_radial(net):
+    """Return x, y, dx and dy of an edge in the net's chart; if it is not flat, they follow from the edge in (u, v)."""
+    if net.chart.flat:
         return _edge_in_space(edge)
     curve = BRepAdaptor_Curve2d(edge, face)
     t, weight = _gauss_points(edge, [curve, BRepAdaptor_Curve(edge)], over_net=True)
     u, v, du, dv = _evaluate(curve, t, gp_Pnt2d(), gp_Vec2d())
     x, y = step_reading.chart_coordinates(net, np.stack([u, v], axis=1))
-    pitch_x, pitch_y = net.pitch  # x(u) is linear outside the end spans, which the rim of a dome does not reach
+    pitch_x, pitch_y = net.pitch  # x(u) is linear outside the end spans, which the rim does not reach
     return x, y, pitch_x * weight * du, pitch_y * weight * dv
 
 

@@ -37,7 +37,6 @@ from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from bstcad.cad import patches
 from bstcad.cad.radial_nets import radial_surface
-from bstcad.optics.lens import domes
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import BSplineSurface, knots, position
 from bstcad.optics.surfaces.outlines import Circle, Outline, Rectangle, Rounded
@@ -97,7 +96,7 @@ class StepLens:
     @property
     def clear(self) -> tuple[Outline, Outline]:
         """Clear apertures of front and back, from the edges of the two faces; see `clear_apertures`."""
-        if domes.is_radial(self.back):
+        if self.front.chart != self.back.chart:
             return self.front.outline or Circle(_farthest(self.faces[0])), self.outline
         front, back = clear_apertures(*map(outer_edge, self.faces))
         return self.front.outline or front, back
@@ -238,7 +237,7 @@ def _lens_in(solid: TopoDS_Solid) -> StepLens:
         others = [face for face in others if not _is_level(face[1], front.around.z)]
     walls = [surface for _, surface in others]
     outline, edge = _outline_of_walls(walls), None
-    if domes.is_radial(back_surface):
+    if not back_surface.chart.flat:
         outline = _outline_in_chart(back_face, back_surface)
         edge = (
             None if all(wall.GetType() == Kind.GeomAbs_SurfaceOfExtrusion for wall in walls) else outer_edge(back_face)
@@ -282,7 +281,7 @@ def freeform_surface(face: TopoDS_Face) -> BSplineSurface:
     """Return the surface of a face, heights from its vertex; ValueError unless its net is as bstcad writes nets."""
     surface = BRepAdaptor_Surface(face)
     found = _uniform_net(surface, patches.net_of(surface.BSpline()))
-    return found if domes.is_radial(found) else found.from_vertex()
+    return found.from_vertex() if found.chart.flat else found
 
 
 def _uniform_net(surface: BRepAdaptor_Surface, net: np.ndarray) -> BSplineSurface:
@@ -449,26 +448,20 @@ def _radius(wall: BRepAdaptor_Surface) -> float:
     return wall.Cylinder().Radius() if off <= AXIAL_TOLERANCE else math.inf
 
 
-def _outline_in_chart(face: TopoDS_Face, dome: BSplineSurface) -> Circle:
-    """Return the circle about the axis of a dome's chart on which the outer edge of its face lies."""
-    x, y = chart_points(face, dome, np.linspace(0.0, 1.0, POINTS_PER_EDGE))
+def _outline_in_chart(face: TopoDS_Face, net: BSplineSurface) -> Circle:
+    """Return the circle about the axis of a net's chart on which the outer edge of its face lies."""
+    edges = map(TopoDS.Edge_s, parts_of(face, TopAbs_EDGE))
+    curves, fractions = (BRepAdaptor_Curve2d(edge, face) for edge in edges), np.linspace(0.0, 1.0, POINTS_PER_EDGE)
+    x, y = chart_coordinates(net, np.concatenate([_curve_points(curve, fractions) for curve in curves]))
     radius = np.hypot(x, y)
     if not np.ptp(radius) <= CIRCLE_TOLERANCE:
         raise ValueError(f"the back's edge is {np.ptp(radius):.2g} mm off a circle in the chart; correct the edge")
     return Circle(round(float(radius.mean()), APERTURE_DECIMALS))
 
 
-def chart_points(face: TopoDS_Face, dome: BSplineSurface, fractions: np.ndarray) -> np.ndarray:
-    """Return x and y (2, n) (mm) in a dome's chart of points at fractions of each edge of its face."""
-    edges = map(TopoDS.Edge_s, parts_of(face, TopAbs_EDGE))
-    curves = (BRepAdaptor_Curve2d(edge, face) for edge in edges)
-    uv = np.concatenate([_curve_points(curve, fractions) for curve in curves])
-    return chart_coordinates(dome, uv)
-
-
-def chart_coordinates(dome: BSplineSurface, uv: np.ndarray) -> np.ndarray:
+def chart_coordinates(net: BSplineSurface, uv: np.ndarray) -> np.ndarray:
     """Return x and y (2, n) (mm) of the chart at parameters (u, v), (n, 2), of the net."""
-    axes = zip(uv.T, dome.shape, dome.pitch, (dome.x, dome.y), strict=True)
+    axes = zip(uv.T, net.shape, net.pitch, (net.x, net.y), strict=True)
     return np.stack([low + pitch * position(torch.from_numpy(t.copy()), m).numpy() for t, m, pitch, (low, _) in axes])
 
 
@@ -531,7 +524,7 @@ def points_on_edges(solid: TopoDS_Shape) -> np.ndarray:
 def edge_deviations(shape: TopoDS_Shape, lens: Lens) -> tuple[tuple[float, str], tuple[float, str]]:
     """Return (largest distance (mm), place) of edges from the faces that they bound, and the same from the wall.
 
-    A dome has no other wall than its faces; the second distance is then infinite.
+    The wall of a lens on a base is no wall of its outline; the second distance is then infinite.
     """
     spans = max(max(lens.back_net.shape) - 2, math.ceil(2 * max(lens.outline.half_extent) / lens.front.detail))
     fractions = np.linspace(0.0, 1.0, POINTS_PER_SPAN * spans + 1)
@@ -541,7 +534,7 @@ def edge_deviations(shape: TopoDS_Shape, lens: Lens) -> tuple[tuple[float, str],
             points = _curve_points(BRepAdaptor_Curve(each), fractions)
             distance = np.linalg.norm(points - _curve_points(BRepAdaptor_Curve(each, face), fractions), axis=1)
             from_faces.append(_largest(distance, points))
-            if not domes.is_dome(lens):
+            if lens.shares_outline:
                 from_wall.append(_largest(_distance_from_wall(points, lens), points))
     nothing = (float("inf"), "no edge")
     return max(from_faces, default=nothing), max(from_wall, default=nothing)
@@ -566,6 +559,6 @@ def _distance_from_wall(points: np.ndarray, lens: Lens) -> np.ndarray:
     x, y, z = points.T
     outside = np.maximum(z - sag(lens.back, x, y), sag(lens.front.around, x, y) - z)
     off = np.maximum(np.abs(lens.outline.depth(x, y)), outside)
-    if (dome := lens.front.outline) is None:
+    if (edge := lens.front.outline) is None:
         return off
-    return np.minimum(off, np.hypot(dome.depth(x, y), z - lens.front.around.z))  # distance from the edge of the front
+    return np.minimum(off, np.hypot(edge.depth(x, y), z - lens.front.around.z))  # distance from the edge of the front

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from OCP.TopoDS import TopoDS_Solid
 
 from bstcad.cad import patches, solid_properties, step_writing, walls, wires
-from bstcad.cad.patches import Patch
+from bstcad.cad.patches import FacePatch
 from bstcad.cad.solid import cap, prepared
 from bstcad.cad.tiling import Cell, Side, Tiling
 from bstcad.cad.wires import LoopPiece
-from bstcad.optics.lens import domes
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.quadrature import MassProperties
 from bstcad.optics.surfaces.bspline import is_net
@@ -47,7 +46,7 @@ def tiles_of(lens: Lens, tiling: Tiling) -> Iterator[Tile]:
 
     ValueError in one sentence if the lens is a dome, if its front has an outline of its own, or if a tile is a sliver.
     """
-    if domes.is_dome(lens):
+    if not lens.back.chart.flat:
         raise ValueError("tiles: the back of a dome is not cut into tiles; use lens.step")
     if lens.front.outline is not None:
         raise ValueError("tiles: the front ends in an outline of its own and is not cut into tiles; use lens.step")
@@ -68,7 +67,7 @@ def tile_shape(lens: Lens, cell: Cell) -> tuple[TopoDS_Solid, tuple[str, ...]]:
     return walls.solid_of([back, front, *built], INVALID_TILE.format(cell.name)), ("back", "front", *names)
 
 
-def _patch(lens: Lens, face: Surface, cell: Cell) -> Patch:
+def _patch(lens: Lens, face: Surface, cell: Cell) -> FacePatch:
     if is_net(face):
         return patches.part_of_net(face, *cell.extent, outward=face is lens.back)
     return patches.front_patch(lens)

@@ -17,7 +17,8 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from bstcad.optics.surfaces.bspline import BSplineSurface, is_net
 from bstcad.optics.surfaces.outlines import Circle, Outline
-from bstcad.optics.surfaces.surfaces import Surface
+from bstcad.optics.surfaces.radial import circle_radius
+from bstcad.optics.surfaces.surfaces import Surface, points_on
 
 if TYPE_CHECKING:
     import cadquery
@@ -32,12 +33,9 @@ MIN_BREAK_DISTANCE = 1e-7  # smallest distance of two breaks, relative to the le
 ONE_SIDED_SLOPE = np.array([-25, 48, -36, 16, -3]) / 12  # weights of 5 values (spacing 1) for the slope at the first
 CROSSING_BISECTIONS = 50  # number of bisections, which leave only rounding errors
 
-DOME_DEGREE = 3  # degree of the spline along the rim of a dome
+RIM_DEGREE = 3  # degree of the spline along the rim of a face in a chart
 
 Locus = Callable[[np.ndarray], np.ndarray]  # function of t (n,) that returns points (n, k)
-PointsOnDome = Callable[
-    [np.ndarray, np.ndarray], np.ndarray
-]  # function of chart coordinates that returns points (n, 3)
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ class LoopPiece:
     centre: tuple[float, float] | None = None  # centre of a circle (mm); None: not a circle
     turn: int = 0  # direction on a circle: +1 counterclockwise, -1 clockwise; 0: not a circle
     straight: bool = False  # True for a line
-    rim: DomeRim | None = None  # curve in space for a piece of a dome's rim; None: the curve follows from (x, y)
+    rim: FaceRim | None = None  # curve in space over an outline in a chart; None: the curve follows from (x, y)
 
     @property
     def is_line_or_arc(self) -> bool:
@@ -67,44 +65,44 @@ class LoopPiece:
 
 
 @dataclass(frozen=True)
-class DomeRim:
-    """A piece of the rim of a dome in space, a spline with the parameter t of the piece."""
+class FaceRim:
+    """A piece of the rim of a face in space, a spline with the parameter t of the piece."""
 
-    arc: LoopPiece  # piece of the circle in the dome's chart over which the rim lies, with the same t
+    arc: LoopPiece  # piece of the circle in the face's chart over which the rim lies, with the same t
     poles: np.ndarray  # control points, (n, 3), mm
     knots: np.ndarray  # full knot vector
 
     def heights(self, t: np.ndarray) -> np.ndarray:
         """Return z (mm) of the rim at t (n,)."""
-        return BSpline(self.knots, self.poles[:, 2], DOME_DEGREE)(t)
+        return BSpline(self.knots, self.poles[:, 2], RIM_DEGREE)(t)
 
     def curve_on(self, piece: LoopPiece, surface: Surface) -> RailCurve:
-        """Return the rim itself on a dome, or its projection along z onto a plane z = const."""
+        """Return the rim itself on its face, or its projection along z onto a plane z = const."""
         poles = self.poles.copy()
         if surface.level:
             poles[:, 2] = surface.z
         return RailCurve(piece, poles, self.knots)
 
 
-def dome_loop(dome: BSplineSurface, radius: float, points: PointsOnDome, tolerance: float) -> list[LoopPiece]:
-    """Return the rim of a dome over the circle of a radius (mm) in its chart, counterclockwise, in two halves.
+def loop_on(face: BSplineSurface, outline: Outline, tolerance: float) -> list[LoopPiece]:
+    """Return the rim of a face over a circle in its chart, counterclockwise, in two halves.
 
-    points: function that returns the points (n, 3) of the dome at (x, y) of the chart (mm).  The rim is a piecewise
-    cubic within a tolerance (mm) of the exact curve; the wall below it and its lower edge share its poles and knots.
+    The rim is a piecewise cubic within a tolerance (mm) of the exact curve; the wall below it and its lower edge share
+    its poles and knots.
     """
 
     def piece(arc: LoopPiece) -> LoopPiece:
-        poles, knots = fit_spline(lambda t: points(*arc.points(t).T), breaks(dome, arc), tolerance)
-        curve = BSpline(knots, poles[:, :2], DOME_DEGREE)
+        poles, knots = fit_spline(lambda t: points_on(face, *arc.points(t).T), breaks(face, arc), tolerance)
+        curve = BSpline(knots, poles[:, :2], RIM_DEGREE)
         slope = curve.derivative()
 
         def left(t: np.ndarray) -> np.ndarray:
             along = slope(t)
             return along[:, ::-1] * (-1, 1) / np.linalg.norm(along, axis=1)[:, None]
 
-        return LoopPiece(curve, left, arc.end, rim=DomeRim(arc, poles, knots))
+        return LoopPiece(curve, left, arc.end, rim=FaceRim(arc, poles, knots))
 
-    return [piece(arc) for arc in circle(0.0, 0.0, radius)]
+    return [piece(arc) for arc in circle(0.0, 0.0, circle_radius(outline))]
 
 
 def outline_loop(outline: Outline) -> list[LoopPiece]:

@@ -14,15 +14,10 @@ def vertex(lens: Lens) -> float:
     return float(sag(lens.back, 0.0, 0.0))
 
 
-def vertex_key(scene: Scene) -> str:
-    """Return the key that determines the position of the back's vertex; a dome has no lens.back.z."""
-    return "lens.back.radius" if scene.lens.dome else "lens.back.z"
-
-
 def scene_text(scene: Scene, lens: Lens) -> str:
     """Return the text of scene.toml in a design's folder, with a note if the back was moved."""
     drawn = scene.lens.back.z - scene.lens.front.z
     if not abs(vertex(lens) - scene.lens.back.z) > MIN_NOTED_SHIFT * drawn:
         return scene.toml()
-    note = f"the vertex of the back is at z = {vertex(lens)!r} mm; it started at {vertex_key(scene)} below"
+    note = f"the vertex of the back is at z = {vertex(lens)!r} mm; it started at {scene.lens.back.vertex_key} below"
     return f"# as designed, {note}\n{scene.toml()}"

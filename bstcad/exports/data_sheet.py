@@ -31,7 +31,6 @@ from bstcad.exports.part_views import (
 )
 from bstcad.figures.drawing import GREY, styled
 from bstcad.figures.light_figures import View, brightest, srgb_grey
-from bstcad.optics.lens import domes
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.report.goal_figures import GoalFigures, Photometry
@@ -85,9 +84,9 @@ class DataSheet:
 
     @cached_property
     def apertures(self) -> dict[str, Outline | None]:
-        """Clear aperture that the light needs on each face; None: the whole face."""
+        """Clear aperture (x, y) that the light needs on each face; None: the whole face, as on a face in a chart."""
         found = needed_apertures(self.scene.light, self.lens)
-        return found | {"back": None} if domes.is_dome(self.lens) else found  # the back's are coordinates of its chart
+        return found | {face: None for face, surface in self.lens.optical_faces.items() if not surface.chart.flat}
 
     @property
     def tables(self) -> dict[str, Rows]:

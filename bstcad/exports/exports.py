@@ -27,11 +27,12 @@ from bstcad.exports.grid_sag import MAX_POINTS, MIN_POINTS, GridLight, GridSag, 
 from bstcad.exports.heightmap import HeightMap, default_pixels
 from bstcad.exports.tile_files import joints, tile_files
 from bstcad.exports.toolpath_files import toolpath_files
-from bstcad.optics.lens import domes
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import is_net
+from bstcad.optics.surfaces.charts import SphereChart
 from bstcad.optics.surfaces.outlines import Circle, Outline
-from bstcad.optics.surfaces.surfaces import Surface, sag
+from bstcad.optics.surfaces.radial import RadialSurface, circle_radius
+from bstcad.optics.surfaces.surfaces import Surface, points_and_normals, sag
 from bstcad.photometry import eulumdat, ies, intensity_files, tm25
 from bstcad.photometry.intensity import Intensity, Luminaire
 from bstcad.report.units import environment, paragraphs
@@ -111,7 +112,7 @@ def export(
         raise ValueError(f"points = {points} is not possible; give a number from {MIN_POINTS} to {MAX_POINTS}")
     lens, found = lens.plain(), Exported([], [], {})
     for complaint in export_complaints(
-        kinds, domes.is_dome(lens), lens.passes.index_before, front_ends=lens.front.outline is not None
+        kinds, not lens.back.chart.flat, lens.passes.index_before, front_ends=lens.front.outline is not None
     ):  # fmt: skip
         raise ValueError(complaint)
     cells = tiling.cells(lens.plan) if "tiles" in kinds else ()
@@ -157,18 +158,17 @@ def _files(
         raise ValueError(f"'{kind}' needs the light of a scene; export it from the folder of a design")
     count = min(max(lens.back_net.shape), MAX_POINTS) if points is None else points
     match kind:
-        case "sag" if domes.is_dome(lens):
+        case "sag" if isinstance(lens.back.chart, SphereChart):
             yield "sag-polar.csv", polar_table(lens, count)
-        case "points" if domes.is_dome(lens):
-            yield "points-front.csv", points_table(lens, lens.front.optical, count, lens.apertures[0])
-            yield "points-back.csv", dome_points_table(lens, count)
         case "sag":
             yield "sag.csv", sag_table(lens, count)
             yield from _sidecar("sag", lens, count, light)
         case "points":
-            yield "points-front.csv", points_table(lens, lens.front, count)
-            yield "points-back.csv", points_table(lens, lens.back, count)
-            yield from _sidecar("points", lens, count, light)
+            front = (lens.front, lens.plan) if lens.shares_outline else (lens.front.optical, lens.apertures[0])
+            yield "points-front.csv", points_table(lens, *front, count)
+            yield "points-back.csv", points_table(lens, lens.back, lens.outline, count)
+            if lens.back.chart.flat:
+                yield from _sidecar("points", lens, count, light)
         case "zemax":  # a front that is not a net has no grid; its numbers are in prescription.txt
             for name, face in (("zemax-back", lens.back), ("zemax-front", lens.front)):
                 if is_net(face):
@@ -259,40 +259,33 @@ def sag_table(lens: Lens, points: int) -> str:
     return _csv(x_mm=x, y_mm=y, front_z_mm=sag(lens.front, x, y), back_z_mm=sag(lens.back, x, y))
 
 
-def points_table(lens: Lens, face: Surface, points: int, outline: Outline | None = None) -> str:
-    """Return a CSV table of x, y, z and the unit normal, out of the lens, of a face on the grid of `sag_table`.
+def points_table(lens: Lens, face: Surface, outline: Outline, points: int) -> str:
+    """Return a CSV table of x, y, z and the unit normal, out of the lens, of a face on a grid of its chart.
 
-    outline: outline of the grid; None: that of the lens.
+    outline: outline in the chart; points: number of points along its wider side.
     """
-    x, y = _inside(outline or lens.plan, points)
-    z, z_x, z_y = (t.numpy() for t in face.plain().sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
-    length = np.sqrt(1 + z_x * z_x + z_y * z_y) * (1.0 if face is lens.back else -1.0)
-    return _csv(x_mm=x, y_mm=y, z_mm=z, normal_x=-z_x / length, normal_y=-z_y / length, normal_z=1 / length)
+    place, normal = points_and_normals(face, *_inside(outline, points))
+    return _csv(**_columns(place, (normal if face is lens.back else -normal) + 0.0))  # 0 in place of -0
 
 
 def polar_table(lens: Lens, points: int) -> str:
-    """Return a CSV table of a dome's back over directions from its centre: distance (mm), point (mm) and unit normal.
+    """Return a CSV table of a radial back over directions from its centre: distance (mm), point (mm) and unit normal.
 
     Directions have the angle θ (degrees) from +z and the azimuth ψ (degrees) from +x towards +y; normals point out of
     the lens.  There are (points + 1) // 2 rings of equal spacing from the axis to the half angle.
     """
-    dome = domes.radial_back(lens)
-    half = dome.chart.angle(domes.rim_radius(lens.outline), dome.radius)
+    back = lens.back.plain()
+    assert isinstance(back, RadialSurface)  # the only surface in a chart of directions
+    half = back.chart.angle(circle_radius(lens.outline), back.radius)
     theta = np.append(0.0, np.repeat(np.linspace(0.0, half, (points + 1) // 2)[1:], 2 * points))
     psi = np.append(0.0, np.tile(np.arange(2 * points) * (math.pi / points), (points + 1) // 2 - 1))
-    place, normal = domes.towards(dome, theta, psi)
+    place, normal = back.towards(theta, psi)
     angles = {"angle_deg": np.degrees(theta), "azimuth_deg": np.degrees(psi)}
-    distance = np.linalg.norm(place - (0.0, 0.0, dome.z), axis=1)
-    return _csv(**angles, distance_mm=distance, **_points_and_normals(place, normal))
+    distance = np.linalg.norm(place - (0.0, 0.0, back.z), axis=1)
+    return _csv(**angles, distance_mm=distance, **_columns(place, normal))
 
 
-def dome_points_table(lens: Lens, points: int) -> str:
-    """Return a CSV table of points and unit normals, out of the lens, of a dome's back on a grid of its chart."""
-    place, normal = domes.points_and_normals(domes.radial_back(lens), *_inside(lens.outline, points))
-    return _csv(**_points_and_normals(place, normal))
-
-
-def _points_and_normals(place: np.ndarray, normal: np.ndarray) -> dict[str, np.ndarray]:
+def _columns(place: np.ndarray, normal: np.ndarray) -> dict[str, np.ndarray]:
     """Return the columns of a table of points (n, 3) and unit normals (n, 3)."""
     names = ("x_mm", "y_mm", "z_mm", "normal_x", "normal_y", "normal_z")
     return dict(zip(names, (*place.T, *normal.T), strict=True))

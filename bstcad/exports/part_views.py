@@ -22,10 +22,9 @@ from scipy.optimize import brentq
 
 from bstcad.exports.exports import across, pitch_radius
 from bstcad.figures.drawing import BLUE, GLASS, GREY, STYLE, VERMILION, round_up
-from bstcad.optics.lens import domes
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle, Outline
-from bstcad.optics.surfaces.surfaces import Surface, sag
+from bstcad.optics.surfaces.surfaces import Surface, points_and_normals, sag
 from bstcad.report.units import mm, number
 from bstcad.scene.mount import Flange, Mount
 
@@ -149,7 +148,7 @@ class Paper:
         centre = end + 0.4 * size + half
         self.line([(x, y - half / 2), (end, y - half), (end, y + half), (x, y + half / 2), (x, y - half / 2)], 0.3)
         for radius in (half / 2, half):
-            self.line(closed(Circle(radius)) + (centre, y), 0.3)
+            self.line(Circle(radius).around() + (centre, y), 0.3)
         self.axis((x - 1, y), (end + 1, y))
         self.axis((centre - half - 1, y), (centre + half + 1, y))
         self.axis((centre, y - half - 1), (centre, y + half + 1))
@@ -206,14 +205,6 @@ def broken(text: str, size: float, room: float, bold: bool = False) -> list[str]
     return lines
 
 
-def closed(outline: Outline) -> np.ndarray:
-    """Return points (n, 2) (mm) around an outline, with the first point again at the end."""
-    (a, b, r2), turn = outline.limits, np.linspace(0, 2 * np.pi, 361)
-    cos, sin, r = np.cos(turn), np.sin(turn), math.sqrt(r2)
-    points = np.stack([np.sign(cos) * a + r * cos, np.sign(sin + 1e-12) * b + r * sin], axis=1)
-    return np.concatenate([points, points[:1]])
-
-
 # --- a part cut along a plane through its axis ------------------------------------------------------------------------
 
 
@@ -246,14 +237,8 @@ def profile(lens: Lens, mount: Mount, upright: bool, origin: float = 0.0) -> Cro
     def height(surface: Surface, u: np.ndarray) -> np.ndarray:
         return (sag(surface, 0.0 * u, u) if upright else sag(surface, u, 0.0 * u)) - origin
 
-    if domes.is_dome(lens):
-        along, back = domes.section(lens, upright, SECTION_POINTS)
-        back, half = back - origin, float(min(-along[0], along[-1]))
-        rims = along[[0, -1]]
-    else:
-        half = mount.rim_of(lens.plan).outline.half_extent[upright]
-        along = np.linspace(-half, half, SECTION_POINTS)
-        back, rims = height(lens.back, along), np.array([-half, half])
+    along, back = lens.back.section(lens.outline, upright, SECTION_POINTS)
+    back, half, rims = back - origin, float(min(-along[0], along[-1])), along[[0, -1]]
     top = mount.top(lens) - origin if mount.draft or mount.bevel else math.inf
     walls = [
         _wall(lambda u, s=sense: float(height(lens.front, np.float64(s * u))), min(z, top), sense * rim, mount)
@@ -339,7 +324,7 @@ class Views:
     @cached_property
     def edge(self) -> np.ndarray:
         """Points (n, 2) around the lens as seen along the axis (mm)."""
-        return domes.silhouette(self.lens) if domes.is_dome(self.lens) else closed(self.rim)
+        return self.lens.back.silhouette(self.lens.outline)
 
     @property
     def outermost(self) -> Outline:
@@ -417,7 +402,7 @@ def _plan(paper: Paper, views: Views, at: PaperFrame) -> None:
     step = _contours(paper, views, at)
     paper.line(at(views.edge), THICK, zorder=5)
     if views.used is not None:
-        paper.line(at(closed(views.used)), 0.25, color=VERMILION, linestyle=(0, (6, 2, 1, 2, 1, 2)), zorder=4)
+        paper.line(at(views.used.around()), 0.25, color=VERMILION, linestyle=(0, (6, 2, 1, 2, 1, 2)), zorder=4)
         paper.text(x, y - b - 20.5, "\u2013 \u00b7\u00b7 \u2013  clear aperture", NOTES, ha="center", color=VERMILION)
     if corner := getattr(outer, "corner_radius", 0.0):
         inset = at.scale * corner * (1 - 0.5**0.5)
@@ -435,7 +420,8 @@ def _plan(paper: Paper, views: Views, at: PaperFrame) -> None:
             paper.arrow(middle + 4.2 * seen, seen)
             paper.text(*(middle - 2.2 * seen), letter, weight="bold", ha="center", va="center_baseline")
     if outer.is_round:
-        within = "within " * (domes.is_dome(views.lens) and views.mount.flange is None)  # a dome's edge is no circle
+        is_circle = views.mount.flange is not None or np.ptp(np.hypot(*views.edge.T)) <= EQUAL_DIMENSIONS
+        within = "" if is_circle else "within "
         paper.dimension((x - a, x + a), y - b - 12, (y, y), f"{within}\u00d8{mm(2 * outer.radius)}")
     else:
         paper.dimension((x - a, x + a), y - b - 12, (y - b, y - b), mm(outer.width))
@@ -450,18 +436,18 @@ def _draw_flange(paper: Paper, views: Views, flange: Flange, at: PaperFrame) -> 
     """Draw the flange and its holes around the lens, with notes on the sizes of rim and holes."""
     outer = views.outermost
     over, under = (at.y + sense * (at.scale * outer.half_extent[1] + 6.2) for sense in (1, -1))  # y of notes
-    paper.line(at(closed(outer)), THICK, zorder=5)
+    paper.line(at(outer.around()), THICK, zorder=5)
     lean = math.tan(math.radians(flange.draft))
     if inset := flange.thickness * lean + flange.bevel * (1 - lean):
-        paper.line(at(closed(outer.inset(inset))), 0.25, zorder=5)  # edge of the upper face
+        paper.line(at(outer.inset(inset).around()), 0.25, zorder=5)  # edge of the upper face
     u, v = views.rim.half_extent
     part = 0.5**0.5 if views.rim.is_round else 0.5
     tip = at((-part * u, part * v))
     paper.leader(tip, (min(at.x - 6.5, tip[0]), over), f"lens {across(views.rim)}", -1)
     if radius := pitch_radius(views.mount):
-        paper.line(at(closed(Circle(radius))), linestyle=CHAIN, color=GREY, zorder=1.5)
+        paper.line(at(Circle(radius).around()), linestyle=CHAIN, color=GREY, zorder=1.5)
     for x, y, diameter in flange.all_holes():
-        paper.line(at(closed(Circle(diameter / 2)) + (x, y)), THICK, zorder=5)
+        paper.line(at(Circle(diameter / 2).around() + (x, y)), THICK, zorder=5)
         for ahead in (diameter / 2 + 1.5 / at.scale) * np.stack([RIGHT, UP]):
             paper.line(at([(x, y) - ahead, (x, y) + ahead]), color=GREY, zorder=1.5)
 
@@ -506,16 +492,12 @@ def _contours(paper: Paper, views: Views, at: PaperFrame) -> str:
 
 
 def _heights(views: Views) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return x, y and z (mm) of the back on a grid inside the rim; z is NaN outside and where a dome overhangs."""
-    if domes.is_dome(views.lens):
-        dome, radius = domes.radial_back(views.lens), domes.rim_radius(views.lens.outline)
-        r, turn = np.linspace(0.0, radius, CONTOUR_POINTS // 2), np.linspace(0.0, 2 * math.pi, CONTOUR_POINTS)
-        chart = r[:, None] * np.cos(turn), r[:, None] * np.sin(turn)
-        points, normals = domes.points_and_normals(dome, *chart)
-        return points[..., 0], points[..., 1], np.where(normals[..., 2] > 0, points[..., 2] - views.origin, np.nan)
-    x, y = np.meshgrid(*(np.linspace(-end, end, CONTOUR_POINTS) for end in views.rim.half_extent))
-    z = sag(views.lens.back, x, y) - views.origin
-    return x, y, np.where(views.rim.depth(x, y) >= 0, z, np.nan)
+    """Return x, y and z (mm) of the back on a grid of its chart; z is NaN outside the rim and where it overhangs."""
+    outline = views.lens.outline
+    chart = np.meshgrid(*(np.linspace(-end, end, CONTOUR_POINTS) for end in outline.half_extent))
+    points, normals = points_and_normals(views.lens.back, *chart)
+    x, y, z = np.moveaxis(points, -1, 0)
+    return x, y, np.where((outline.depth(*chart) >= 0) & (normals[..., 2] > 0), z - views.origin, np.nan)
 
 
 # --- the sections -----------------------------------------------------------------------------------------------------

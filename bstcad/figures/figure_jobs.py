@@ -21,17 +21,16 @@ from bstcad.analysis.shape import MAX_RADIUS, Survey, least_squares, survey, sur
 from bstcad.cad import mesh as meshes
 from bstcad.designs.course import CurvePoint, StageRecord
 from bstcad.figures import light_figures, photometric_figures, rendering
-from bstcad.figures.dome_figures import ANGLE_LABELS, dome_maps, in_angles
 from bstcad.figures.drawing import BLUE, GLASS, GREY, VERMILION, footnote, new_figure, png, round_up, steps, styled
 from bstcad.figures.light_figures import View, plain_ticks
-from bstcad.figures.rendering import LightPath
+from bstcad.figures.rendering import RayPath
 from bstcad.figures.wavefront_figure import wavefront_map
-from bstcad.optics.lens import domes
+from bstcad.optics.lens.base import on_base
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.receivers.irradiance import Screen
-from bstcad.optics.receivers.receivers import LevelPlane
-from bstcad.optics.surfaces.surfaces import Surface, sag
+from bstcad.optics.surfaces.charts import HEIGHTS, Chart
+from bstcad.optics.surfaces.surfaces import sag
 from bstcad.optics.trace.measure import Light, SpectralLine
 from bstcad.optics.trace.wavefront_error import WavefrontError
 from bstcad.report.record import Contents
@@ -48,6 +47,7 @@ CELLS, LIGHT_PATH_CELLS = 320, 200  # mesh cells per axis in the 3-D picture, an
 RAYS = 28  # rays per axis in the view with rays
 MILLIONTHS = 1e6  # factor from a fraction to millionths
 MAP_POINTS = 401  # samples of a surface map along each axis
+EDGE_ROUNDING = 1e-9  # relative distance beyond the outline up to which a point of a map counts as inside
 ROUNDING = 1e-6  # relative variation below which a map has no contour lines
 
 Pngs = dict[str, bytes]  # pictures by name
@@ -126,26 +126,21 @@ class NoPictures(Pictures):
 def draw_lens(source: Emitter, lens: Lens, screens: Sequence[Screen], view: View) -> Pngs:
     """Return maps of the back and of a tailored front, and a side view of the lens; `view` is not used."""
     screens = [drawn(screen, lens) for screen in screens]
-    farthest = max(screens, key=lambda screen: screen.plane.throw(0.0))
+    farthest = max(screens, key=lambda screen: screen.receiver.throw(0.0))
     of_front = {}
-    if lens.shapes("front"):
+    if lens.is_tailored("front"):
         of_front["surface_front"] = png(surface_maps(lens, survey_front(lens), face="front"))
     return {
-        "surface": png((dome_maps if domes.is_dome(lens) else surface_maps)(lens, survey(lens))),
+        "surface": png(surface_maps(lens, survey(lens))),
         **of_front,
-        "side_view": png(side_view(lens, fan(source, lens, farthest.plane), screens)),
+        "side_view": png(side_view(lens, fan(source, lens, farthest.receiver), screens)),
     }
 
 
 def draw_transport(source: Emitter, lens: Lens, screen: Screen, view: View) -> Pngs:
     """Return the picture of the transport map from the lens to a screen."""
-    grid, image = ray_map(source, lens, screen.plane)
-    dome = domes.is_dome(lens)
-    return {
-        numbered("transport", view.number): png(
-            transport_map(in_angles(lens, grid) if dome else grid, image, view, dome)
-        )
-    }
+    grid, image = ray_map(source, lens, screen.receiver)
+    return {numbered("transport", view.number): png(transport_map(grid, image, view, lens.back.chart))}
 
 
 def draw_light(target: np.ndarray, light: Light, lines: Sequence[SpectralLine], view: View) -> Pngs:
@@ -181,61 +176,89 @@ def draw_convergence(report: Contents, view: View) -> Pngs:
 
 @styled
 def surface_maps(lens: Lens, found: Survey, face: str = "back") -> Figure:
-    """Draw maps of sag, slope angle and mean curvature of a freeform face inside the outline.
+    """Draw maps of h, slope angle and mean curvature of a freeform face inside the outline, over its chart.
 
     found: extreme values of the face, which the samples of the maps may miss.  face: "back" or "front".
 
     The best-fit plane is subtracted from the sag if the PV of the plane exceeds the PV of the residual, else the mean.
     """
-    x, y, sag, slope_x, slope_y = _sample(lens, getattr(lens, face))
-    columns = np.stack([np.ones_like(sag), *np.meshgrid(x, y)], axis=-1)
-    known = np.isfinite(sag)
-    plane = np.where(known, columns @ least_squares(columns[known], sag[known]), np.nan)
-    tilted = np.nanmax(plane) - np.nanmin(plane) > np.nanmax(sag - plane) - np.nanmin(sag - plane)
-    height = sag - plane if tilted else sag - np.nanmean(sag)
-    pv = float(np.nanmax(height) - np.nanmin(height))
-    scale, unit = (1.0, "mm") if pv >= 0.5 else (1e3, "µm")
-    slope = np.degrees(np.arctan(np.hypot(slope_x, slope_y)))
-    (z_xy, z_xx), z_yy = np.gradient(slope_x, y, x), np.gradient(slope_y, y, axis=0)
-    across = (1 + slope_y**2) * z_xx - 2 * slope_x * slope_y * z_xy + (1 + slope_x**2) * z_yy
-    bend = 0.5 * across / (1 + slope_x**2 + slope_y**2) ** 1.5  # 1/mm
+    surface = getattr(lens, face).plain()
+    chart = surface.chart
+    ends = chart.drawn(np.diag(lens.outline.half_extent)).max(axis=0)
+    x, y = (np.linspace(-end, end, MAP_POINTS) for end in ends)
+    places = np.moveaxis(chart.from_drawn(np.stack(np.meshgrid(x, y), axis=-1)), -1, 0)
+    of_x, of_y = (torch.from_numpy(np.ascontiguousarray(p)) for p in places)
+    shown = lens.outline.contains(of_x / (1 + EDGE_ROUNDING), of_y / (1 + EDGE_ROUNDING)).numpy()
+    patch = surface.at(of_x, of_y)
+    height, heading, (scale, unit) = _height_map(chart, np.where(shown, chart.coordinates(patch.position)[2], np.nan))
+    normal = patch.normal.numpy()
+    normal = normal / np.sqrt((normal * normal).sum(0))
+    slope = np.where(shown, np.degrees(np.arctan2(np.hypot(normal[0], normal[1]), normal[2])), np.nan)
+    bend = mean_curvature(patch.along_x.numpy(), patch.along_y.numpy(), normal, (of_x.numpy(), of_y.numpy()))
+    bend = np.where(shown, bend, np.nan)
     edge = round_up(float(np.nanpercentile(np.abs(bend), 99.0)))
 
     figure = new_figure(11.0, 3.7, layout="compressed")
     panels = figure.subplots(1, 3, sharey=True)
     place = {"extent": (x[0], x[-1], y[0], y[-1]), "origin": "lower", "interpolation_stage": "data"}
-    panels[0].set_ylabel("y (mm)")
-    heading = f"Sag{', best plane removed' if tilted else ''}: PV {scale * pv:.3g} {unit}"
+    panels[0].set_ylabel(chart.labels[1])
     maps = (
         (scale * height, unit, heading),
         (slope, "degrees", f"Slope: up to {found.slope.largest:.3g}°"),
-        (bend, "1/mm", "Mean curvature (seen from +z: + hollow, − dome)"),
+        (bend, "1/mm", f"Mean curvature ({'seen from +z: ' if chart.flat else ''}+ hollow, − bulge)"),
     )
     for axes, (values, label, title) in zip(panels, maps, strict=True):
         signed = axes is panels[2]
         shades = {"cmap": steps("PuOr", 82), "vmin": -edge, "vmax": edge} if signed else {"cmap": steps("cividis", 82)}
         map_image = axes.imshow(values, **place, **shades)
-        axes.set(xlabel="x (mm)", title=title)
+        axes.set(xlabel=chart.labels[0], title=title)
         axes.spines[:].set_visible(False)
         extend = "both" if signed else "neither"
         bar = figure.colorbar(map_image, ax=axes, label=label, fraction=0.046, pad=0.03, extend=extend)
         if not signed and np.nanmax(values) - np.nanmin(values) > ROUNDING * (1 + np.nanmax(np.abs(values))):
             bar.add_lines(axes.contour(x, y, values, 10, colors="white", linewidths=0.35))
+    if overhangs := found.slope.largest > 90.0:
+        panels[1].contour(x, y, slope, [90.0], colors=VERMILION, linewidths=1.2)
     radii = (("concave", found.concave), ("convex", found.convex))
     radii = (f"{n}, {quantity(r.largest, 'mm')} {r.where}" for n, r in radii if r.largest < MAX_RADIUS)
-    footnote(figure, f"Smallest radii of curvature, seen from outside: {'; '.join(radii) or 'none: the face is flat'}.")
+    radii = f"Smallest radii of curvature, seen from outside: {'; '.join(radii) or 'none: the face is flat'}."
+    footnote(figure, radii + (" Beyond the red line, at 90°, the face overhangs." if overhangs else ""))
     return figure
 
 
-def _sample(lens: Lens, face: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return x (n,), y (n,) and sag (mm), ∂z/∂x, ∂z/∂y (n, n) of a face, row 0 = y min, NaN outside the outline."""
-    reach_x, reach_y = lens.plan.half_extent
-    x = torch.linspace(-reach_x, reach_x, MAP_POINTS, dtype=torch.float64)
-    y = torch.linspace(-reach_y, reach_y, MAP_POINTS, dtype=torch.float64)
-    grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
-    inside = lens.plan.contains(grid_x, grid_y)
-    maps = (torch.where(inside, part, torch.nan) for part in face.plain().sag_and_slope(grid_x, grid_y))
-    return tuple(part.detach().numpy() for part in (x, y, *maps))
+def _height_map(chart: Chart, h: np.ndarray) -> tuple[np.ndarray, str, tuple[float, str]]:
+    """Return a map (r, c) of h (mm) to draw, its heading, and the scale and name of its unit; h: NaN outside."""
+    if not chart.flat:
+        return h + chart.offset, f"{chart.distance}: PV {np.nanmax(h) - np.nanmin(h):.3g} mm", (1.0, "mm")
+    columns = np.stack([np.ones_like(h), *np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in h.shape[::-1]))], axis=-1)
+    known = np.isfinite(h)
+    plane = np.where(known, columns @ least_squares(columns[known], h[known]), np.nan)
+    tilted = np.nanmax(plane) - np.nanmin(plane) > np.nanmax(h - plane) - np.nanmin(h - plane)
+    height = h - plane if tilted else h - np.nanmean(h)
+    pv = float(np.nanmax(height) - np.nanmin(height))
+    scale, unit = (1.0, "mm") if pv >= 0.5 else (1e3, "µm")
+    heading = f"{chart.distance}{', best plane removed' if tilted else ''}: PV {scale * pv:.3g} {unit}"
+    return height, heading, (scale, unit)
+
+
+def mean_curvature(
+    along_x: np.ndarray, along_y: np.ndarray, normal: np.ndarray, chart: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """Return the mean curvature (1/mm), (r, c), from tangents and unit normals (3, r, c) on a grid of a chart.
+
+    H = (l G - 2 m F + k E) / (2 (E G - F²)),  l = -n_x · S_x,  2 m = -n_x · S_y - n_y · S_x,  k = -n_y · S_y, with the
+    first fundamental form E, F, G (do Carmo 1976, section 3.3); H > 0 in a hollow, as seen from the side of n.
+    chart: x and y (r, c) of the points in the chart (mm).  The derivatives of the normal are central differences along
+    the grid, turned into those along x and y.
+    """
+    (x_v, x_u), (y_v, y_u) = (np.gradient(part) for part in chart)
+    det = x_u * y_v - x_v * y_u
+    n_v, n_u = (np.stack(part) for part in zip(*(np.gradient(part) for part in normal), strict=True))
+    n_x, n_y = (n_u * y_v - n_v * y_u) / det, (n_v * x_u - n_u * x_v) / det
+    e, f, g = (along_x**2).sum(0), (along_x * along_y).sum(0), (along_y**2).sum(0)
+    l, k = -(n_x * along_x).sum(0), -(n_y * along_y).sum(0)  # noqa: E741 - the names of the second fundamental form
+    m = -((n_x * along_y).sum(0) + (n_y * along_x).sum(0)) / 2
+    return (l * g - 2 * m * f + k * e) / (2 * (e * g - f * f))
 
 
 @styled
@@ -262,12 +285,12 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
     close.set(title=f"{lens.passes.optic.capitalize()}, cut along y = 0", aspect="equal")
     whole.set_title("Whole path, source to target (axes at different scales)")
     several = len(screens) > 1
-    visible = [screen for screen in screens if several or not screen.plane.is_level]
+    visible = [screen for screen in screens if several or not screen.receiver.is_level]
     for screen in visible:
         edges = corners(screen)
         whole.fill(edges[:, 2], edges[:, 0], facecolor="none", edgecolor=GREY, linewidth=1.0, gid="screen")
     if visible:
-        tilt = visible[0].plane.tilt
+        tilt = visible[0].receiver.tilt
         one = f"Grey: the target, its plane tilted by {tilt_words(tilt)}." if tilt else "Grey: the target."
         footnote(figure, "Grey: the targets." if several else one)
     return figure
@@ -275,28 +298,21 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
 
 def _section(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     """Return x and z (mm) around the section of a lens at y = 0."""
-    lens = domes.on_base(lens.plain())
-    if domes.is_dome(lens):
-        along, back = domes.section(lens, upright=False, count=MAP_POINTS)
-        x = np.linspace(along[0], along[-1], MAP_POINTS)
-    else:
-        reach = lens.plan.half_extent[0]
-        x = along = np.linspace(-reach, reach, MAP_POINTS)
-        back = sag(lens.back, x, 0.0 * x)
+    lens = on_base(lens.plain())
+    along, back = lens.back.section(lens.outline, upright=False, count=MAP_POINTS)
+    x = np.linspace(along[0], along[-1], MAP_POINTS)
     return np.concatenate([x, along[::-1]]), np.concatenate([sag(lens.front, x, 0.0 * x), back[::-1]])
 
 
 @styled
-def transport_map(source: np.ndarray, image: np.ndarray, view: View, dome: bool = False) -> Figure:
-    """Draw lines of a grid `source` (k, k, 2) on the first vertex's plane (mm), and `image` (k, k, 2) on the target.
+def transport_map(source: np.ndarray, image: np.ndarray, view: View, chart: Chart = HEIGHTS) -> Figure:
+    """Draw lines of a grid `source` (k, k, 2) (mm) in a chart, and `image` (k, k, 2) on the target.
 
-    dome: True if the grid is over directions from the centre of a dome, in degrees (dome_figures.in_angles).
+    The chart of heights shows the grid on the first vertex's plane.
     """
     figure, where = new_figure(8.2, 3.9, layout="compressed"), "front of the lens" if view.optic == "lens" else "mirror"
-    grid = (f"Grid on the {where}", source, LevelPlane(0.0).labels)
-    if dome:
-        grid = ("Grid of directions from the centre of the dome", source, ANGLE_LABELS)
-    sides = (grid, ("Its image on the target", image, view.labels))
+    title = f"Grid on the {where}" if chart.flat else "Grid of directions from the centre of the back"
+    sides = ((title, chart.drawn(source), chart.labels), ("Its image on the target", image, view.labels))
     for axes, (title, points, (x, y)) in zip(figure.subplots(1, 2), sides, strict=True):
         for lines, colour in ((points, BLUE), (points.swapaxes(0, 1), VERMILION)):
             axes.plot(lines[..., 0].T, lines[..., 1].T, color=colour, linewidth=0.6)
@@ -337,7 +353,7 @@ def convergence(history: Sequence[CurvePoint], stages: Sequence[StageRecord], no
     axes.set_xlim(0.0, last)
     for end in ends[1:]:
         axes.axvline(end, color=GREY, linewidth=0.6, linestyle=":")
-    parts = zip((stage.name.partition(",")[0] for stage in stages), ends, ends[1:], strict=False)
+    parts = zip((stage.stage for stage in stages), ends, ends[1:], strict=False)
     for name, rounds in groupby(parts, key=itemgetter(0)):
         (_, start, end), *others = rounds
         end = others[-1][2] if others else end
@@ -352,19 +368,19 @@ def convergence(history: Sequence[CurvePoint], stages: Sequence[StageRecord], no
 # --- a lens at work ---------------------------------------------------------------------------------------------------
 
 
-def light_path_of(scene: Scene, lens: Lens, pictures: Sequence[tuple[np.ndarray, np.ndarray]]) -> LightPath | None:
+def light_path_of(scene: Scene, lens: Lens, pictures: Sequence[tuple[np.ndarray, np.ndarray]]) -> RayPath | None:
     """Return lens, rays and pictures for `bstcad show`; None if no light reaches the furthest target.
 
     pictures: (target, irradiance) of each target of the scene, (rows, columns) each.
     """
     source, wanted_screens = scene.light.central, [target.screen for target in scene.targets]
     screens = [drawn(screen, lens) for screen in wanted_screens]
-    rays, flux = bundle(source, lens, max(screens, key=lambda screen: screen.plane.throw(0.0)).plane, RAYS)
+    rays, flux = bundle(source, lens, max(screens, key=lambda screen: screen.receiver.throw(0.0)).receiver, RAYS)
     if not len(rays):
         return None
     mesh = meshes.lens_mesh(lens, LIGHT_PATH_CELLS)
     of = "from the centre of the source" if scene.source.extent is not None else "from the source"
-    return LightPath(
+    return RayPath(
         vertices=mesh.vertices,
         faces=mesh.faces,
         rays=rays,
@@ -383,18 +399,18 @@ def _sizes(screens: Sequence[Screen]) -> str:
     """Return the sizes and positions of the targets in words."""
     sizes = (
         f"{number(x[1] - x[0])} × {number(y[1] - y[0])} {plane.unit} at {plane.position_text()}"
-        for plane, x, y in ((screen.plane, screen.x, screen.y) for screen in screens)
+        for plane, x, y in ((screen.receiver, screen.x, screen.y) for screen in screens)
     )
     return f"Target{'s' * (len(screens) > 1)} {', '.join(sizes)}"
 
 
 def drawn(screen: Screen, lens: Lens) -> Screen:
     """Return the screen as pictures show it: directions at a distance of a few lens widths."""
-    place = screen.plane.drawn(2 * max(lens.plan.half_extent), lens.back.z)
-    return screen if place == screen.plane else replace(screen, surface=place)
+    place = screen.receiver.drawn(2 * max(lens.plan.half_extent), lens.back.z)
+    return screen if place == screen.receiver else replace(screen, surface=place)
 
 
 def corners(screen: Screen) -> np.ndarray:
     """Return the corners of a screen in space (4, 3), mm, in order around it from x min, y min."""
-    around = [screen.plane.point(x, y) for y, x in product(screen.y, screen.x)]
+    around = [screen.receiver.point(x, y) for y, x in product(screen.y, screen.x)]
     return np.array(around)[[0, 1, 3, 2]]

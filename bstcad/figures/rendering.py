@@ -61,7 +61,7 @@ FINE, COARSE = 256, 64  # cells per axis of a net, and of a surface without knot
 MAX_MODEL_RAYS = 200  # largest number of rays in the model
 POSITION_DECIMALS, FLUX_DECIMALS = 4, 3  # decimals of a position (mm), and of a relative flux
 STEPS = 65535  # largest 16-bit integer: a range of values has this number of steps
-MIN_DOME_COSINE = 0.02  # smallest n_z of the normals of a dome, which are stated as slopes; steeper parts look upright
+MIN_COSINE = 0.02  # smallest n_z of normals, which are stated as slopes; steeper parts look upright
 MIN_RANGE = 1e-9  # lower bound of a range, for values that are all equal (mm, or a slope)
 
 
@@ -79,7 +79,7 @@ def lens_picture(mesh: Mesh) -> bytes | None:
         return picture.read_bytes() if done and picture.exists() else None
 
 
-def draw(path: LightPath, picture: Path | None) -> bool:
+def draw(path: RayPath, picture: Path | None) -> bool:
     """Draw into the PNG `picture`, or if None in a window until it closes; False: this machine cannot draw in 3-D."""
     given = vars(path).items()
     arrays = {name: np.asarray(value) for name, value in given if not isinstance(value, tuple)}
@@ -126,7 +126,7 @@ def main(arrays: str, picture: str) -> None:
         return
     for name in [name for name in values if " " in name]:  # elements of a tuple, in their order
         values[name.split()[0]] = (*values.get(name.split()[0], ()), values.pop(name))
-    plotter = plotter_of(LightPath(**values), off_screen=bool(picture))
+    plotter = plotter_of(RayPath(**values), off_screen=bool(picture))
     if picture:
         plotter.screenshot(picture)
     else:
@@ -170,7 +170,7 @@ def _add_lights(plotter: Any, lights: Iterable[tuple[Any, float]], centre: Any) 
 
 
 @dataclass(frozen=True, eq=False)
-class LightPath:
+class RayPath:
     """Solid, rays coloured by their flux, and screens with their pictures; lengths in mm."""
 
     vertices: np.ndarray  # vertices of the lens, (n, 3)
@@ -186,7 +186,7 @@ class LightPath:
     words: str  # caption of one or two lines
 
 
-def plotter_of(path: LightPath, off_screen: bool) -> Any:
+def plotter_of(path: RayPath, off_screen: bool) -> Any:
     """Return a pyvista plotter with two views: the lens close up at the left, the whole path at the right, to scale."""
     import pyvista
 
@@ -228,7 +228,7 @@ def _add_text(plotter: Any, words: str, place: tuple[float, float], size: int, c
     plotter.add_text(words, position=place, viewport=True, font_size=size, color=colour, font_file=str(font))
 
 
-def _close_rays(path: LightPath) -> np.ndarray:
+def _close_rays(path: RayPath) -> np.ndarray:
     """Return every RAY_STEP-th ray, cut to RAY_REACH diagonals of the lens before its first and after its last face."""
     reach = RAY_REACH * np.linalg.norm(np.ptp(path.vertices, axis=0))
     rays = path.rays[::RAY_STEP].copy()
@@ -239,7 +239,7 @@ def _close_rays(path: LightPath) -> np.ndarray:
     return rays
 
 
-def _add_lens(plotter: Any, solid: Any, path: LightPath) -> None:
+def _add_lens(plotter: Any, solid: Any, path: RayPath) -> None:
     """Add the solid of transparent glass or of metal, two lights, and a sphere at a point source."""
     import pyvista
 
@@ -286,7 +286,7 @@ def _add_screen(plotter: Any, screen: np.ndarray, picture: np.ndarray, opacity: 
     plotter.add_mesh(border, color=SOFT, line_width=1.5, lighting=False)
 
 
-def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarray, filled: float) -> None:
+def _frame(plotter: Any, points: np.ndarray, path: RayPath, towards: np.ndarray, filled: float) -> None:
     """Look from direction `towards` (`_clear_of_screen`), y up; the points fill the fraction `filled` of the view."""
     towards = _clear_of_screen(path, towards)
     right = np.cross([0.0, 1.0, 0.0], towards)
@@ -310,7 +310,7 @@ def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarra
     plotter.reset_camera_clipping_range()
 
 
-def _clear_of_screen(path: LightPath, towards: np.ndarray) -> np.ndarray:
+def _clear_of_screen(path: RayPath, towards: np.ndarray) -> np.ndarray:
     """Return `towards` as a unit vector; the sign of x is such that the first screen does not cover the lens."""
     offset = path.screens[0][:, 0].mean() - path.vertices[:, 0].mean()
     return towards * [-1 if offset > 0 else 1, 1, 1] / np.linalg.norm(towards)
@@ -319,7 +319,7 @@ def _clear_of_screen(path: LightPath, towards: np.ndarray) -> np.ndarray:
 # --- the model that a reader can rotate -------------------------------------------------------------------------------
 
 
-def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> str:
+def turnable(lens: Lens, path: RayPath | None = None, cells: int = FINE) -> str:
     """Return the JSON for solid_view.js: the faces in mm, the lamps that shade them, and the rays of `path`.
 
     cells: cells of a net per axis, even; fewer for a preview that is sent often (256: 0.9 MB, 96: 0.2 MB).
@@ -333,22 +333,26 @@ def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> st
     the front and z of the back around the rim.  A path adds the keys of `_light`.
     """
     from bstcad.cad.grids import nodes, rim
-    from bstcad.optics.lens import domes
-    from bstcad.optics.surfaces.surfaces import sampled
+    from bstcad.optics.lens.base import on_base
+    from bstcad.optics.surfaces.surfaces import points_and_normals, points_on, sag
+
+    def on_face(surface: Surface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return x, y, z (mm), ∂z/∂x and ∂z/∂y of a face at nodes (x, y) (mm) of its chart, (5, rows, columns)."""
+        points, normals = points_and_normals(surface, x, y)
+        slopes = -normals[..., :2] / np.maximum(normals[..., 2:], MIN_COSINE)
+        return np.moveaxis(np.concatenate([points, slopes], axis=-1), -1, 0)
 
     def at_nodes(surface: Surface) -> np.ndarray:
-        """Return x, y, z (mm), ∂z/∂x and ∂z/∂y of a face at its nodes, (5, cells + 1, cells + 1)."""
-        if dome is not None and surface is lens.back:
-            points, normals = domes.points_and_normals(dome, *nodes(lens.outline, cells))
-            slopes = -normals[..., :2] / np.maximum(normals[..., 2:], MIN_DOME_COSINE)
-            return np.moveaxis(np.concatenate([points, slopes], axis=-1), -1, 0)
-        if dome is not None and surface.outline is None:  # a plane front, which ends below the rim of the dome
-            x, y = nodes(lens.outline, COARSE)
-            r = np.hypot(x, y) / domes.rim_radius(lens.outline)
-            x, y = r * below_rim(np.stack([x, y]) / np.maximum(r, 1e-12))
-            return np.stack([x, y, *sampled(surface, x, y)])
-        x, y = nodes(surface.outline or lens.outline, min(COARSE, cells) if math.isinf(surface.detail) else cells)
-        return np.stack([x, y, *sampled(surface.optical, x, y)])
+        """Return the values of `on_face` at the nodes of a face inside its outline, or inside the rim of the lens."""
+        smooth = min(COARSE, cells) if math.isinf(surface.detail) else cells
+        if surface.outline is not None:
+            return on_face(surface.optical, *nodes(surface.outline, smooth))
+        x, y = nodes(lens.outline, smooth)
+        if surface.chart != lens.back.chart:  # a plane front, which ends below the rim: rings between axis and rim
+            k = np.abs(np.linspace(-1.0, 1.0, smooth + 1))
+            ring = np.maximum(k[:, None], k)
+            x, y = ring * below_rim(np.stack([x, y]) / np.maximum(ring, 1e-12))
+        return on_face(surface, x, y)
 
     def on_rim(outline: Outline, cells: int) -> np.ndarray:
         """Return x and y (mm) of the nodes once around an outline, (2, 4 cells)."""
@@ -361,24 +365,18 @@ def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> st
         begin, end = on_rim(inner, COARSE)[:, None], below_rim(on_rim(lens.outline, COARSE))[:, None]
         places = begin + np.linspace(0, 1, COARSE + 1)[:, None] * (end - begin)
         for k in range(4):
-            x, y = places[:, :, np.arange(k * COARSE, (k + 1) * COARSE + 1) % (4 * COARSE)]
-            yield np.stack([x, y, *sampled(plane, x, y)])
+            yield on_face(plane, *places[:, :, np.arange(k * COARSE, (k + 1) * COARSE + 1) % (4 * COARSE)])
 
     def below_rim(places: np.ndarray) -> np.ndarray:
-        """Return x and y (2, …) (mm) of the rim; places: in the outline, which a dome has in its chart."""
-        return places if dome is None else np.moveaxis(domes.points_on(dome, *places)[..., :2], -1, 0)
+        """Return x and y (2, …) (mm) in space of places (2, …) (mm) on the rim in the back's chart."""
+        return np.moveaxis(points_on(lens.back, *places)[..., :2], -1, 0)
 
-    lens = domes.on_base(lens.plain())
-    dome = domes.radial_back(lens) if domes.is_dome(lens) else None
+    lens = on_base(lens.plain())
     faces = [at_nodes(lens.back), at_nodes(lens.front)]
     if lens.front.outline is not None:
         faces += around(lens.front.around, lens.front.outline)
-    x, y = on_rim(lens.outline, cells)
-    if dome is None:
-        high = sampled(lens.back, x, y)[0]
-    else:
-        x, y, high = domes.points_on(dome, x, y).T
-    wall = np.stack([x, y, sampled(lens.front, x, y)[0], high])
+    x, y, high = points_on(lens.back, *on_rim(lens.outline, cells)).T
+    wall = np.stack([x, y, sag(lens.front, x, y), high])
     places = np.concatenate([*(face[:3].reshape(3, -1) for face in faces), wall[:3], wall[[0, 1, 3]]], axis=1)
     if not np.isfinite(places).all():
         return ""
@@ -398,7 +396,7 @@ def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> st
     return json.dumps(shape | lit | FINISH | {"values": numbers} | light)
 
 
-def _light(path: LightPath) -> dict[str, Any]:
+def _light(path: RayPath) -> dict[str, Any]:
     """Return a light path as JSON values; positions in mm.
 
     rays: at most MAX_MODEL_RAYS rays, each with its points from the source to the furthest screen.  flux: flux of each

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bstcad.analysis.shape import MAX_RADIUS, describe, heights, survey_front, thickness_range
-from bstcad.designs.as_designed import vertex, vertex_key
-from bstcad.optics.lens import domes, passes, quadrature
+from bstcad.designs.as_designed import vertex
+from bstcad.optics.lens import passes, quadrature
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.media import density
 from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface
@@ -82,9 +82,9 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "back": _face("bspline", vertex(lens), {}),
         "reflects": lens.reflects,  # True for a mirror
         "net": _net(lens.back_net),
-        **({"front_net": _net(lens.front_net), "front_asked": scene.lens.front.z} if lens.shapes("front") else {}),
+        **({"front_net": _net(lens.front_net), "front_asked": scene.lens.front.z} if lens.is_tailored("front") else {}),
         "back_asked": scene.lens.back.z,  # position of the back's vertex in the scene
-        **({"back_key": vertex_key(scene)} if scene.lens.dome else {}),  # key of this position, if not lens.back.z
+        **({} if scene.lens.back.chart.flat else {"back_key": scene.lens.back.vertex_key}),  # if not lens.back.z
         "centre_thickness": shape["centre_thickness"],
         "edge_thickness": (shape["edge_thickness_min"], shape["edge_thickness_max"]),
         "volume": shape["volume"],  # mm³
@@ -259,9 +259,7 @@ def part(
 
 def _corners(lens: Lens, whole: WholePart | None) -> tuple[Point, Point]:
     """Return the smallest and the largest x, y and z (mm) of a part."""
-    half = np.array(lens.plan.half_extent)
-    bare = domes.silhouette(lens) if domes.is_dome(lens) else np.array([-half, half])
-    edge = bare if whole is None else whole.edge
+    edge = lens.back.silhouette(lens.outline) if whole is None else whole.edge
     faces = np.concatenate(heights(lens, None if whole is None else edge))
     low, high = np.array([*edge.min(0), faces.min()]), np.array([*edge.max(0), faces.max()])
     if whole is not None:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import ConfigDict, Field
 
 from bstcad.optics.lens.media import refractive_index
 from bstcad.optics.lens.passes import LENS, MIRROR, SECOND_SURFACE, Face, Passes
+from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.surfaces.charts import HEIGHTS, Chart
 from bstcad.optics.surfaces.key import Key
-from bstcad.optics.surfaces.outlines import Circle, Rectangle
+from bstcad.optics.surfaces.outlines import Circle, Outline, Rectangle
 from bstcad.optics.surfaces.sides import Sides, as_pair, coarser, in_proportion, simplified
 from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.runs.files import HEIGHT_EXPORTS, PATHS, TOOL_RADII
@@ -38,6 +40,10 @@ from bstcad.scene.schema import (
     Record,
     leaving_out,
 )
+from bstcad.tailoring.settings import Bounds
+
+if TYPE_CHECKING:
+    from bstcad.optics.surfaces.bspline import BSplineSurface
 
 INDICES = (1.01, 5.0)  # range of the refractive index
 INDEX_OFFSETS = (-0.05, 0.05)  # range of the index of a melt minus that of its material
@@ -66,7 +72,28 @@ class Back(Record):
     reflect: Annotated[bool, Key("A mirror: light comes along -z and goes back along +z.")] = False
     optimise: Annotated[bool, Key("Tailor the back; if false it stays flat.", example=False)] = True
 
+    chart: ClassVar[Chart] = HEIGHTS  # chart of the face
+    vertex_key: ClassVar[str] = "lens.back.z"  # key of the position of the vertex
+    extent_key: ClassVar[str] = "lens.outline"  # key of the extent of the face
+    fewest_points: ClassVar[int] = 0  # smallest number of control points per side of a net that bstcad chooses
+
     written = leaving_out(optimise=True)
+
+    def lit(self, outline: Outline) -> Outline:
+        """Return the outline of the face in its chart; outline: of the lens."""
+        return outline
+
+    def flat(self, sides: Sides, half_extent: tuple[float, float]) -> BSplineSurface:
+        """Return the face before tailoring; half_extent: of its net in the chart (mm)."""
+        from bstcad.optics.surfaces.bspline import BSplineSurface  # loads numba, which a scene alone does not need
+
+        half_x, half_y = half_extent
+        heights = torch.zeros(as_pair(sides), dtype=torch.float64)
+        return BSplineSurface(self.z, heights, (-half_x, half_x), (-half_y, half_y))
+
+    def light(self, source: Emitter, front: Surface) -> Emitter:
+        """Return the light of a source as the face needs it: by the points of planes."""
+        return source
 
     @property
     def net(self) -> Sides:
@@ -102,21 +129,6 @@ def export_complaints(
 
 
 AnyBack = Annotated[Back | RadialBack, Field(discriminator="kind")]
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Bounds on tailored faces everywhere inside the outline; a field that is None is no bound.
-
-    A tool cuts the back from +z and the front from -z; for the tool a valley is concave and a ridge convex.
-    """
-
-    concave: float | None = None  # maximum curvature of a valley, 1/mm
-    convex: float | None = None  # maximum curvature of a ridge, 1/mm
-    slope: float | None = None  # maximum |∇z|
-    thinnest: float = 0.0  # minimum thickness along z, mm
-    thickest: float | None = None  # maximum thickness along z, mm
-    edge: float | None = None  # minimum thickness along the rim, mm
 
 
 def _outline_unless_dome(node: dict[str, Any]) -> None:
@@ -167,7 +179,7 @@ class LensBlank(Record):
 
     def require_heights(self, what: str) -> None:
         """Raise SceneError for a dome, with which the command or option `what` is not possible."""
-        if self.dome is not None:
+        if not self.back.chart.flat:
             raise SceneError(f"{what}: is not possible for a dome yet; use lens.step, lens.stl and the report")
 
     @property
@@ -299,7 +311,7 @@ class LensBlank(Record):
         if not self.back.optimise and not self.front.is_tailored:
             tailored = f'lens.front = {{ kind = "bspline", z = {self.front.z:g}, optimise = true }}'
             yield f"lens.back.optimise: false leaves no face to tailor; write {tailored}, or remove this key"
-        steepest = MAX_RECESS_SLOPE if self.dome is None else MAX_DOME_SLOPE
+        steepest = MAX_RECESS_SLOPE if self.back.chart.flat else MAX_DOME_SLOPE
         yield from (f"lens.front.{complaint}" for complaint in self.front.complaints(self.outline, steepest))
         (lowest, highest), thinnest, thickest = self.front_sags, self.min_thickness, self.max_thickness
         rim = "thinnest point" if self.front.surface.is_net else "rim"

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.light.sphere_light import SphereLight, light_angle
 from bstcad.optics.surfaces.charts import SphereChart
 from bstcad.optics.surfaces.key import Key
-from bstcad.optics.surfaces.outlines import Circle
-from bstcad.optics.surfaces.sides import Sides
+from bstcad.optics.surfaces.outlines import Circle, Outline
+from bstcad.optics.surfaces.sides import Sides, as_pair
 from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.scene.errors import SceneError
 from bstcad.scene.schema import COORDINATES, LENGTHS, NET_SIZES, Record
+
+if TYPE_CHECKING:
+    from bstcad.optics.surfaces.bspline import BSplineSurface
 
 DOME_HALF_ANGLE = 85.0  # degrees; default of lens.back.half_angle
 DOME_MARGIN = 1e-6  # relative margin of the outline of a dome's front beyond the half angle
@@ -38,6 +41,9 @@ class RadialBack(Record):
 
     reflect: ClassVar[bool] = False
     optimise: ClassVar[bool] = True
+    vertex_key: ClassVar[str] = "lens.back.radius"  # key of the position of the vertex
+    extent_key: ClassVar[str] = "lens.back.half_angle"  # key of the extent of the face
+    fewest_points: ClassVar[int] = MIN_DOME_POINTS  # smallest number of control points per side that bstcad chooses
 
     @property
     def z(self) -> float:
@@ -61,10 +67,15 @@ class RadialBack(Record):
         """Chart of the sphere through the vertex."""
         return SphereChart(self.radius)
 
-    @property
-    def lit(self) -> Circle:
-        """Disc of the chart up to the half angle."""
+    def lit(self, outline: Outline) -> Circle:
+        """Return the disc of the chart up to the half angle; outline: of the lens, which follows from it."""
         return Circle(self.chart.length(math.radians(self.half_angle)))
+
+    def flat(self, sides: Sides, half_extent: tuple[float, float]) -> BSplineSurface:
+        """Return the sphere about the centre as a net; half_extent: of the net in the chart (mm)."""
+        from bstcad.optics.surfaces.radial import RadialSurface  # loads numba, which a scene alone does not need
+
+        return RadialSurface.sphere(self.centre[2], self.radius, half_extent, as_pair(sides))
 
     def light(self, source: Emitter, front: Surface) -> SphereLight:
         """Return the light of a lamp behind a front by the points of the dome's sphere."""

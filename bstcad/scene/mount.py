@@ -18,6 +18,7 @@ from bstcad.optics.surfaces.key import Key
 from bstcad.optics.surfaces.outlines import STRICT, Circle, Outline, Rectangle, Rounded
 from bstcad.optics.surfaces.surfaces import Surface, sag, sampled
 from bstcad.scene.blank import LensBlank
+from bstcad.scene.dome_back import RadialBack
 from bstcad.scene.schema import COORDINATES, LENGTHS, Record
 
 MAX_DRAFT = 30.0  # degrees; largest draft angle of the walls of a lens
@@ -87,7 +88,7 @@ def _is_date(text: str) -> bool:
         return False
 
 
-class Round(Record):
+class CircleRim(Record):
     """A circle about the axis of the lens."""
 
     shape: Annotated[Literal["circle"], Key("A circle about the axis.")]
@@ -115,7 +116,7 @@ class Box(Record):
         return Rounded(*size, corner_radius=r) if r else Rectangle(*size)
 
 
-Shape: TypeAlias = Annotated[Round | Box, Field(discriminator="shape")]
+Shape: TypeAlias = Annotated[CircleRim | Box, Field(discriminator="shape")]
 
 
 class Screws(Record):
@@ -173,12 +174,12 @@ class Mount(Record):
         assert self.flange is not None  # otherwise `complaints` has refused the scene
         return self.flange.z
 
-    def rim_of(self, outline: Outline) -> Round | Box:
+    def rim_of(self, outline: Outline) -> CircleRim | Box:
         """Return the rim that a lens with this outline has in the part."""
         if self.rim is not None:
             return self.rim
         if isinstance(outline, Circle):
-            return Round(shape="circle", diameter=2 * outline.radius)
+            return CircleRim(shape="circle", diameter=2 * outline.radius)
         return Box(shape="rectangle", width=outline.width, height=outline.height)
 
     def clear(self, lens: Lens) -> tuple[Outline, Outline] | None:
@@ -258,8 +259,8 @@ def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
         if shape is not None and not shape.corner_radius < (half := min(shape.outline.half_extent)):
             size = f"{shape.corner_radius:g} mm is not less than {half:g} mm, half the width"
             yield f"mount.{key}.corner_radius: {size}; make it smaller"
-    if lens.dome is not None:
-        yield from _dome_complaints(mount, lens)
+    if (dome := lens.dome) is not None:
+        yield from _dome_complaints(mount, dome)
     rim = mount.rim_of(lens.outline)
     if (lens.outline.depth(*rim.outline.rim_points()) < -1e-9).any():
         yield "mount.rim: extends past lens.outline; make it smaller, or the lens larger"
@@ -273,13 +274,12 @@ def complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
         yield from _flange_complaints(mount.flange, lens, rim)
 
 
-def _dome_complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
+def _dome_complaints(mount: Mount, dome: RadialBack) -> Iterator[str]:
     """Yield complaints about a mount of a dome, whose rim and wall stay as they are and whose light leaves sideways."""
     can = "a dome can have mount.datum and mount.flange"
     for key in (key for key in ("rim", "draft", "bevel") if getattr(mount, key)):
         yield f"mount.{key}: a dome keeps its own rim and its low wall; remove this key; {can}"
-    dome, flange = lens.dome, mount.flange
-    if dome is None or flange is None:
+    if (flange := mount.flange) is None:
         return
     rim, upper = dome.rim_z, flange.z + flange.thickness
     if not upper < rim:
@@ -287,7 +287,7 @@ def _dome_complaints(mount: Mount, lens: LensBlank) -> Iterator[str]:
         yield f"mount.flange.thickness: {above}, where light leaves; make the flange thinner, or move it down"
 
 
-def _wall_complaints(mount: Mount, lens: LensBlank, rim: Round | Box) -> Iterator[str]:
+def _wall_complaints(mount: Mount, lens: LensBlank, rim: CircleRim | Box) -> Iterator[str]:
     """Yield complaints about draft and bevel of the lens's own walls, below its back or its flange."""
     key, tangent = "mount.draft" if mount.draft else "mount.bevel", math.tan(math.radians(mount.draft))
     top, above, remedy = lens.back.z, "back", "move the back up"
@@ -315,7 +315,7 @@ def _wall_complaints(mount: Mount, lens: LensBlank, rim: Round | Box) -> Iterato
         yield f"{key}: draft and bevel remove {taken:.3g} mm, and the axis is {half:g} mm away; make them smaller"
 
 
-def _depth(shape: Round | Box, x: float, y: float) -> float:
+def _depth(shape: CircleRim | Box, x: float, y: float) -> float:
     """Return the distance (mm) of a point (x, y) inside the shape from the shape's edge; negative outside."""
     return float(shape.outline.depth(np.array(x), np.array(y)))
 
@@ -328,14 +328,14 @@ def _steepest_descent(front: Surface, rim: Outline) -> float:
     return -float((z_x * m_x + z_y * m_y).min())
 
 
-def _corner_complaints(key: str, shape: Round | Box, taken: float) -> Iterator[str]:
+def _corner_complaints(key: str, shape: CircleRim | Box, taken: float) -> Iterator[str]:
     """Yield complaints about a corner radius not above `taken`, the width (mm) that draft and bevel remove."""
     if 0 < shape.corner_radius <= taken:
         size = f"{shape.corner_radius:g} mm is too small, as draft and bevel remove {taken:.3g} mm"
         yield f"{key}.corner_radius: {size}; make it larger, or 0"
 
 
-def _flange_complaints(flange: Flange, lens: LensBlank, rim: Round | Box) -> Iterator[str]:
+def _flange_complaints(flange: Flange, lens: LensBlank, rim: CircleRim | Box) -> Iterator[str]:
     """Yield complaints: a flange too thin for its bevels, or above or below the lens's wall; holes that do not fit."""
     key, upper = "mount.flange", flange.z + flange.thickness
     taken = flange.bevel + flange.thickness * math.tan(math.radians(flange.draft))

@@ -11,31 +11,38 @@ import datetime
 import json
 import math
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 import tomli_w
-import torch
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_serializer, model_validator
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.channels import Channel, Draw, channels_of, drawn_channels, given_channels, merge_wavelengths
+from bstcad.optics.light.channels import (
+    Channel,
+    SourceSampler,
+    channels_of,
+    drawn_channels,
+    given_channels,
+    merge_wavelengths,
+)
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.light.wavefront import MAX_RAY_ANGLE, PlaneWave, Wave, ZernikeWave
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.surfaces.key import Key
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.optics.surfaces.rays import Status
-from bstcad.optics.surfaces.sides import Sides, as_pair
+from bstcad.optics.surfaces.sides import Sides
 from bstcad.runs import files
 from bstcad.scene import effects, elements, lighting, mount, picture, quality, scene_file
 from bstcad.scene.accept import Accept
 from bstcad.scene.beam import Collimated, of_beam
 from bstcad.scene.blank import LensBlank, export_complaints
-from bstcad.scene.dome_back import RadialBack, complete, forget_outlines
+from bstcad.scene.dome_back import complete, forget_outlines
 from bstcad.scene.dotted_keys import OUTLINES, override, tables_at
 from bstcad.scene.effects import Effects
 from bstcad.scene.elements import Around, Elements, LightPath
@@ -45,16 +52,16 @@ from bstcad.scene.lamp import Point
 from bstcad.scene.moulding import CAVITY, MISSING, Moulding
 from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture
-from bstcad.scene.quality import VERIFICATION_DRAW, VERIFICATION_POINTS, Tailoring, Tolerance
-from bstcad.scene.schema import FILE, FileContent, Record, contents, of_model
+from bstcad.scene.quality import VERIFICATION_POINTS, VERIFICATION_SET, Tailoring, Tolerance
+from bstcad.scene.schema import FileContent, Record, contents, of_model
 from bstcad.scene.target import FAR_Z, AngularTarget, Target, Targets, coplanar_complaints
+from bstcad.tailoring.settings import SEARCH_RANGE
 
 if TYPE_CHECKING:
     from bstcad.optics.trace.measure import GhostTracer
 
 MESH_TOLERANCE = 1e-3  # mm; default maximum distance of mesh facets from a lens up to 100 mm wide
 IMAGE_KEY = re.compile(r"target(\[\d+\])?\.image|source\.profile\.image")  # dotted keys of images
-SEARCH_RANGE = 0.999  # fraction of the possible range of a front's sag at the rim that tailoring searches
 FLOAT32_ROUNDING = 2.0**-24  # largest relative rounding error of a coordinate in float32
 FINEST_MESH = 4 * FLOAT32_ROUNDING  # smallest tolerance of a mesh, as a fraction of the largest coordinate
 
@@ -117,7 +124,7 @@ class Scene(Record):
         yield from lighting.encapsulant_complaints(source, lens, self._of_dome)
         ends = getattr(lens.front, "outline", None) is not None
         of_export = export_complaints(
-            self.output.export, lens.dome is not None, lens.passes.index_before, front_ends=ends,
+            self.output.export, not lens.back.chart.flat, lens.passes.index_before, front_ends=ends,
             tool_radius=None if lens.mould else lens.tool_radius,
         )  # fmt: skip
         yield from (f"output.export: {complaint}" for complaint in of_export)
@@ -141,7 +148,7 @@ class Scene(Record):
             yield from self._of_targets(lambda target: target.unfaced(lens))
         if len(self.targets) > 1 or self.wavefront is not None:
             for key, target in zip(self.target_keys, self.targets, strict=True):
-                if target.screen.plane.frame is None:
+                if target.screen.receiver.frame is None:
                     several = "several targets, or a wavefront, need targets on planes"
                     yield f"{key}: {several}; make it a plane, or keep one target without a wavefront"
         yield from coplanar_complaints(self.targets)
@@ -211,7 +218,7 @@ class Scene(Record):
                 target.screen,
                 target.irradiance(),
                 target.weight,
-                draw=target.irradiance,
+                cell_picture=target.irradiance,
                 is_shape=target.photo is None and target.text is None,
             )
             for key, target in pairs
@@ -307,58 +314,45 @@ class Scene(Record):
         finest net to which `net` will be refined (default: `net`), whose spans determine how far the nets extend past
         the rim.
         """
-        from bstcad.optics.surfaces.bspline import BSplineSurface  # loads numba, which a scene alone does not need
-
-        if self.lens.dome is not None:
-            return self.assembled(self._flat_dome(self.lens.dome, net, as_wide_as or net))
-        half_x, half_y = net_extent(self.lens.outline, as_wide_as or net)
-        heights = torch.zeros(as_pair(net), dtype=torch.float64)
-        back = BSplineSurface(self.lens.back.z, heights, (-half_x, half_x), (-half_y, half_y))
-        front, outline, passes = self.lens.flat_front(net, as_wide_as), self.lens.outline, self.lens.passes
-        return self.assembled(Lens(front, back, outline, self.index, own_passes=passes))
-
-    def _flat_dome(self, dome: RadialBack, net: Sides, as_wide_as: Sides) -> Lens:
-        """Return a lens with a sphere about the centre as its back; its outline is the lit disc of the back's chart."""
-        from bstcad.optics.surfaces.radial import RadialSurface
-
-        back = RadialSurface.sphere(dome.centre[2], dome.radius, net_extent(dome.lit, as_wide_as), as_pair(net))
-        front, passes = self.lens.flat_front(net, as_wide_as), self.lens.passes
-        clear = (front.outline or self.lens.outline, dome.lit)
-        return Lens(front, back, dome.lit, self.index, clear=clear, own_passes=passes)
+        blank, passes = self.lens, self.lens.passes
+        outline, front = blank.back.lit(blank.outline), blank.flat_front(net, as_wide_as)
+        back = blank.back.flat(net, net_extent(outline, as_wide_as or net))
+        clear = None if back.chart.flat else (front.outline or blank.outline, outline)
+        return self.assembled(Lens(front, back, outline, self.index, clear=clear, own_passes=passes))
 
     def assembled(self, lens: Lens) -> Lens:
         """Return the lens with the scene's windows, mirrors and mount, and with its tailored faces marked."""
         before, behind = self.around(self.source.main_wavelength) or ((), ())
-        return self.as_mounted(replace(lens, before=before, behind=behind).shaping(*self.lens.tailored_faces))
+        return self.as_mounted(replace(lens, before=before, behind=behind).with_tailored(*self.lens.tailored_faces))
 
     def as_mounted(self, lens: Lens) -> Lens:
         """Return the lens with the clear apertures that the mount leaves; the mount of a dome cuts nothing."""
-        if self.mount is None or self.lens.dome is not None:
+        if self.mount is None or not self.lens.back.chart.flat:
             return lens
         return replace(lens, clear=self.mount.clear(lens))
 
-    def channels(self, points: int | None = None, draw: int = 0) -> tuple[Channel, ...]:
+    def channels(self, points: int | None = None, number: int = 0) -> tuple[Channel, ...]:
         """Return the light as a weighted sum of channels; a point source of one wavelength is one channel.
 
         points: number of points of an extended source, divided among its lines (default: tailoring.source_points).
-        draw: number of the point set; other numbers give other points.
+        number: number of the point set; other numbers give other points.
         """
         if points is None:
             points = self.tailoring.points_of_source
-        return self._with_losses(channels_of(self.light, self.lens.index_at, points, draw))
+        return self._with_losses(channels_of(self.light, self.lens.index_at, points, number))
 
     def verification_channels(self) -> tuple[Channel, ...]:
         """Return the channels of a verification: an extended source has other points than in tailoring."""
-        return self.channels(VERIFICATION_POINTS, VERIFICATION_DRAW)
+        return self.channels(VERIFICATION_POINTS, VERIFICATION_SET)
 
     @property
-    def draw(self) -> Draw | None:
+    def sampler(self) -> SourceSampler | None:
         """Function of (points, seed) that samples the channels of an extended source; None for other sources."""
         if (bundles := given_channels(self.source, self.lens.index_at)) is not None:
-            return Draw(lambda points, seed: self._with_losses(bundles(seed)), bundles.largest_side)
+            return SourceSampler(lambda points, seed: self._with_losses(bundles(seed)), bundles.largest_side)
         if self.source.extent is None:
             return None
-        return Draw(
+        return SourceSampler(
             lambda points, seed: self._with_losses(drawn_channels(self.light, self.lens.index_at, points, seed))
         )
 
@@ -372,7 +366,7 @@ class Scene(Record):
     @property
     def light(self) -> Emitter:
         """The source, which a dome needs by the points of a sphere about its centre instead of by points of planes."""
-        return self.source if self.lens.dome is None else self.lens.dome.light(self.source, self.lens.front.surface)
+        return self.lens.back.light(self.source, self.lens.front.surface)
 
     def with_source_scaled(self, share: float) -> Self:
         """Return the scene with the size of its source times `share`; 0 makes it a point or a parallel beam."""
@@ -439,12 +433,12 @@ class Scene(Record):
 
     def toml(self) -> str:
         """Return the text of a file from which an equal scene is loaded; images have the file names of their copies."""
-        unused = set() if self.source.extent else {"source_points"}
+        unused = {"seed"} if self.source.extent else {"seed", "source_points"}
         optic = f"refractive index {self.index:.6g}" if self.lens.passes.enters else f"a {self.optic}"
         comment = f"# {optic}; quality {self.tailoring.quality}"
         if self.lens.back.control_points is not None:  # the settings depend on them
-            knobs = self.tailoring.resolved(self.lens.back.net).model_dump(exclude={"quality", "seed"} | unused)
-            comment += ": " + ", ".join(f"{key} {value}" for key, value in knobs.items())
+            settings = asdict(self.tailoring.resolved(self.lens.back.net))
+            comment += ": " + ", ".join(f"{key} {value}" for key, value in settings.items() if key not in unused)
         return f"{comment}\n" + tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
 
 
@@ -493,7 +487,7 @@ def _doubts_of_goals(scene: Scene) -> Iterator[str]:
         faces, remedy = "two tailored faces", "set their weights, or remove a goal"
         if len(shaped) == 1:
             faces, remedy = "one tailored face", "a mirror has no second face, so set the weights"
-            if lens.dome is not None:
+            if not lens.back.chart.flat:
                 remedy = "a dome has no second face, so set the weights"
             elif "front" in lens.passes.faces:
                 front = f'lens.front = {{ kind = "bspline", z = {lens.front.z:g}, optimise = true }}'
@@ -635,4 +629,4 @@ def _image(values: np.ndarray, key: str) -> Picture:
 
 
 if __name__ == "__main__":
-    FILE.write_text(json.dumps(of_model(Scene), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    sys.stdout.buffer.write(json.dumps(of_model(Scene), indent=1, ensure_ascii=False).encode() + b"\n")

@@ -21,12 +21,11 @@ from bstcad.analysis.shape import thickness_range
 from bstcad.cad import mounting, solid_properties, step_reading
 from bstcad.cad.solid_properties import WholePart
 from bstcad.cad.step_reading import StatedFace, StatedSolid, StepLens
-from bstcad.optics.lens import domes
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.passes import LENS, Passes
 from bstcad.optics.lens.quadrature import MassProperties
 from bstcad.optics.surfaces.bspline import BSplineSurface, is_net
-from bstcad.optics.surfaces.surfaces import Surface, sampled
+from bstcad.optics.surfaces.surfaces import Surface, points_and_normals
 from bstcad.runs import processes
 from bstcad.scene.mount import Mount, Part
 from bstcad.step_text import part21
@@ -89,7 +88,7 @@ def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, .
         *_face_checks(reread.stated, reread),
         *_edge_checks(reread, nominal),
         *_form_checks(reread, nominal.back_net, form, points),
-        *(_form_checks(reread, nominal.front_net, form, points, of="front") if nominal.shapes("front") else ()),
+        *(_form_checks(reread, nominal.front_net, form, points, of="front") if nominal.is_tailored("front") else ()),
         *_front_checks(reread.front, nominal, form),
     )
 
@@ -177,7 +176,7 @@ def _edge_checks(reread: StepLens, lens: Lens, bare: bool = True) -> Iterator[Ch
     (faces, on_face), (wall, on_wall) = step_reading.edge_deviations(reread.shape, lens)
     name = "solid: distance of edges from the faces they bound"
     yield Check.at_most(name, faces, GAP_TOLERANCE, unit="mm", where=on_face, id="edges-off-faces")
-    if bare and not domes.is_dome(lens):
+    if bare and lens.shares_outline:
         name = "solid: distance of edges from the wall of the lens"
         yield Check.at_most(name, wall, GAP_TOLERANCE, unit="mm", where=on_wall, id="edges-off-wall")
 
@@ -193,18 +192,12 @@ def _form_checks(
     points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(count, dtype=torch.float64)
     x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (face.x, face.y), strict=True))
     in_file = getattr(reread, of)
-    if domes.is_radial(face) != domes.is_radial(in_file):
+    if in_file.kind != face.kind:
         yield Check.true(form, False, f"the file's {of} is no {face.kind} surface as designed", id="form")
         return
-    if domes.is_radial(face):
-        scale = in_file.x[1] / face.x[1]  # coordinates of a chart are proportional to the radius of its sphere
-        found, normals = step_reading.sample(reread, scale * x.numpy(), scale * y.numpy(), of=of)
-        place, wanted = domes.points_and_normals(face.plain(), x.numpy(), y.numpy())
-    else:
-        found, normals = step_reading.sample(reread, x.numpy(), y.numpy(), of=of)
-        z, z_x, z_y = sampled(face, *found[:, :2].T)
-        place, wanted = np.stack([x.numpy(), y.numpy(), z], axis=1), np.stack([-z_x, -z_y, np.ones_like(z)], axis=1)
-        wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
+    scale = 1.0 if face.chart.flat else in_file.x[1] / face.x[1]  # a chart is read with another radius
+    found, normals = step_reading.sample(reread, scale * x.numpy(), scale * y.numpy(), of=of)
+    place, wanted = points_and_normals(face, x.numpy(), y.numpy())
     off = np.abs(found - place).max(axis=1)
     turned = np.linalg.norm(normals - wanted, axis=1)
     j, k = int(off.argmax()), int(turned.argmax())
@@ -273,9 +266,10 @@ def lens_of_part(folder: Path, designed: Lens, mount: Mount) -> Lens:
     text_checks.check_size(_part(path, _stamp(path))[0], designed, PART_FILE)
     reread, up = _lens_in_part(path, _stamp(path)), mount.origin(designed.front_vertex)
     front, back, clear = reread.front, reread.back, reread.clear
-    if domes.is_dome(designed):
-        back, aperture = domes.in_chart_of(domes.radial_back(designed), back, clear[1])
-        clear = designed.apertures[0] if front.level else clear[0], aperture  # no edge bounds the light on a plane
+    chart, rim = designed.back.chart, clear[1]
+    back, rim = back.in_chart(chart), back.chart.outline_in(chart, rim)
+    bounded = designed.shares_outline or not front.level  # no edge bounds the light on the plane of a base
+    clear = clear[0] if bounded else designed.apertures[0], rim
     front, back = front.moved(front.z + up), back.moved(back.z + up)
     return replace(designed, front=front, back=back, clear=clear, losses=None)
 
@@ -301,7 +295,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
     down = np.array([0.0, 0.0, mount.origin(lens.front_vertex)])
     net = lens.back_net.control_points() - down
     of_front = []
-    if lens.shapes("front"):
+    if lens.is_tailored("front"):
         name, read = f"{PART_FILE}: deviation of the control points of the front", text_checks.net_of_front(text)
         of_front.append(net_check(name, read, lens.front_net.control_points() - down, id="control-points"))
     properties = _properties(path, _stamp(path)) if text.properties.of_shape else None

@@ -9,16 +9,17 @@ import pytest
 import torch
 
 from bstcad.analysis.shape import survey
-from bstcad.cad import dome_mesh, mesh, mounting, solid, solid_properties, step_reading, step_writing
+from bstcad.cad import distances, mesh, mounting, solid, solid_properties, step_reading, step_writing
 from bstcad.cad.radial_nets import radial_surface
 from bstcad.cad.walls import Draft
-from bstcad.optics.lens import domes, quadrature
+from bstcad.optics.lens import quadrature
+from bstcad.optics.lens.base import on_base
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.charts import SphereChart
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.radial import RadialSurface
 from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere
-from bstcad.scene.mount import Flange, Mount, Part, Round
+from bstcad.scene.mount import CircleRim, Flange, Mount, Part
 from bstcad.step_text import part21
 from bstcad.verify import step_checks
 from tests.cad.test_trimming import uses, worst_gap
@@ -55,15 +56,15 @@ CASES = {
 def test_the_file_has_the_design_s_control_points_and_a_closed_solid(name, tmp_path):
     lens, path = CASES[name], tmp_path / "dome.step"
     step_writing.write_lens(lens, path, "dome")
-    net, on_base = lens.back.control_points(), domes.on_base(lens)
+    net, based = lens.back.control_points(), on_base(lens)
     text, reread = part21.read_lens(path), step_reading.read(path)
     assert np.abs(text.surface.control_points - net).max() < 1e-11
     assert np.abs(reread.control_points - net).max() < 1e-11
     assert np.abs(reread.back.control_points() - net).max() < 1e-11
     assert reread.back.kind == "radial" and reread.back.z == pytest.approx(lens.back.z, abs=1e-9)
-    assert text.closed and text.faces == (5 if on_base.front.outline else 4)
+    assert text.closed and text.faces == (5 if based.front.outline else 4)
     assert reread.front.conic() == pytest.approx(lens.front.conic(), abs=1e-9)
-    assert [check.name for check in step_checks.check(path, on_base, 1e-9, 100) if not check.passed] == []
+    assert [check.name for check in step_checks.check(path, based, 1e-9, 100) if not check.passed] == []
     stated, found = quadrature.of_lens(lens), solid_properties.of_solid(reread.shape)
     assert text.properties.volumes == pytest.approx([stated.volume], rel=1e-12)
     assert found.volume == pytest.approx(stated.volume, rel=2e-9)
@@ -74,7 +75,7 @@ def test_the_file_has_the_design_s_control_points_and_a_closed_solid(name, tmp_p
 
 
 def _rim(lens):
-    return domes.rim_of(lens)
+    return lens.back.rim(lens.outline)
 
 
 def test_each_edge_is_shared_by_two_faces_that_meet_in_it():
@@ -105,7 +106,7 @@ def test_occ_s_own_volume_of_the_faces_divided_at_their_knots_is_the_solid_s():
 
 def test_equal_distances_make_a_spherical_shell():
     """The volume against that of caps and a cylinder; a net differs from a sphere by its pitch squared."""
-    base = domes.on_base(dome(wave=0.0)).front
+    base = on_base(dome(wave=0.0)).front
     rim, high = R * math.sin(math.radians(85)), R * math.cos(math.radians(85))
     wanted = cap(rim, R - high) + math.pi * rim**2 * (high - base.around.z)
     wanted -= cap(base.outline.radius, INNER - base.around.z)
@@ -157,17 +158,16 @@ def test_an_upright_facet_of_a_steep_dome_is_no_wall():
     vertices = np.array(
         [[r, 0.0, height - 0.05], [r * math.cos(turn), r * math.sin(turn), height], [r, 0.0, height + 0.05]]
     )
-    found = dome_mesh.chordal_error(vertices, np.array([[0, 1, 2]]), domes.on_base(lens), math.inf)
-    assert found < 0.02
+    found = mesh.Mesh(vertices, np.array([[0, 1, 2]], np.int32))
+    assert mesh.chordal_error(found, lens) < 0.02
 
 
 def test_a_flange_adds_its_volume_alone():
     lens, high = dome(), 0.3
-    on_base = domes.on_base(lens)
-    z = on_base.front.around.z
-    body = mounting.body(Flange(outline=Round(shape="circle", diameter=36.0), z=z, thickness=high))
+    z = on_base(lens).front.around.z
+    body = mounting.body(Flange(outline=CircleRim(shape="circle", diameter=36.0), z=z, thickness=high))
     part = mounting.mounted(body, [mounting.PlacedLens(lens)])
-    x, y, _ = domes.rim_of(lens).T  # trapezoids of a periodic curve
+    x, y, _ = lens.back.rim(lens.outline).T  # trapezoids of a periodic curve
     inside = (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2
     wanted = quadrature.of_lens(lens).volume + (math.pi * 18.0**2 - inside) * high
     assert part.solid.isValid() and Counter(part.faces)["flange"] == 3
@@ -213,10 +213,10 @@ def test_a_dome_keeps_its_own_rim():
 
 def test_a_part_is_read_back_in_the_chart_of_its_design(tmp_path):
     """A flange in the base plane, and one whose lower face lies below it: apertures, net and a closed solid."""
-    lens = domes.on_base(dome(half=80.0, m=25), 0.5)
+    lens = on_base(dome(half=80.0, m=25), 0.5)
     lens = replace(lens, clear=(lens.front.outline, lens.outline))
     for z in (0.5, -0.4):
-        plate = Flange(outline=Round(shape="circle", diameter=40.0), z=z, thickness=1.2 if z < 0 else 0.9)
+        plate = Flange(outline=CircleRim(shape="circle", diameter=40.0), z=z, thickness=1.2 if z < 0 else 0.9)
         mount = Mount(datum="flange", flange=plate)
         mounting.write_if_it_fits(lens, mount, tmp_path / "part.step", "dome", Part())
         found = step_checks.lens_of_part(tmp_path, lens, mount)
@@ -226,7 +226,8 @@ def test_a_part_is_read_back_in_the_chart_of_its_design(tmp_path):
         assert found.apertures[1].radius == pytest.approx(lens.outline.radius, abs=1e-8)
         assert np.abs(found.back.control_points() - lens.back.control_points()).max() < 1e-11
         assert [c.name for c in step_checks.check_part(tmp_path, lens, mount, Part()) if not c.passed] == []
-        assert domes.opening(found).radius == pytest.approx(domes.opening(lens).radius, abs=1e-9)
+        openings = (each.back.opening(each.outline).radius for each in (found, lens))
+        assert next(openings) == pytest.approx(next(openings), abs=1e-9)
 
 
 def offset_sphere(radius, height, half, m=97):
@@ -255,10 +256,10 @@ def test_the_curvature_and_the_overhang_of_a_sphere_are_known(height):
 @pytest.mark.parametrize("upright", [False, True])
 def test_a_section_lies_on_the_dome_and_ends_on_its_rim(upright):
     lens = CASES["below the horizon"]
-    u, z = domes.section(lens, upright, 201)
+    u, z = lens.back.section(lens.outline, upright, 201)
     points = np.stack([0 * u, u, z] if upright else [u, 0 * u, z], axis=1)
-    assert dome_mesh.distance_from_dome(lens.back, points).max() < 1e-10
-    rim = domes.rim_of(lens)
+    assert distances.distances_of_points(points, lens).max() < 1e-10
+    rim = lens.back.rim(lens.outline)
     assert max(np.linalg.norm(rim - point, axis=1).min() for point in points[[0, -1]]) < 0.1
-    edge, reach = domes.silhouette(lens), np.hypot(*mesh.lens_mesh(lens, 64).vertices[:, :2].T).max()
+    edge, reach = lens.back.silhouette(lens.outline), np.hypot(*mesh.lens_mesh(lens, 64).vertices[:, :2].T).max()
     assert np.hypot(*edge.T).max() == pytest.approx(reach, rel=1e-3) and (edge[0] == pytest.approx(edge[-1]))

@@ -37,7 +37,7 @@ from bstcad.report import prescription
 from bstcad.report.goal_figures import figures_of
 from bstcad.report.prescription import measured, order_of
 from bstcad.report.units import mm
-from bstcad.scene.mount import Box, Flange, Mount, Round, Screws
+from bstcad.scene.mount import Box, CircleRim, Flange, Mount, Screws
 from bstcad.scene.scene import load
 from tests import suite
 from tests.conftest import DISK
@@ -247,7 +247,7 @@ def test_the_table_of_the_part_has_every_hole_at_its_place():
         outline=Box(shape="rectangle", width=26.0, height=24.5, corner_radius=3.0), z=15.5, thickness=1.5,
         screws=Screws(count=4, diameter=2.2, circle=28.0), holes=((1, 11, 0.9), (-1, 11, 0.9), (0, -11, 2)),
     )  # fmt: skip
-    mount = Mount(datum="flange", rim=Round(shape="circle", diameter=15.0), bevel=0.15, flange=flange)
+    mount = Mount(datum="flange", rim=CircleRim(shape="circle", diameter=15.0), bevel=0.15, flange=flange)
     made = sheet("a flange")
     scene, order = made.scene.model_copy(update={"mount": mount}), replace(made.order, origin=mount.origin(15.0))
     rows = replace(made, scene=scene, order=order).tables["The part, as in part.step"]

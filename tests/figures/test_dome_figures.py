@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.cad import dome_mesh, mesh
+from bstcad.cad import distances, mesh
 from bstcad.exports import exports
-from bstcad.figures import dome_figures, rendering
-from bstcad.optics.lens import domes
+from bstcad.figures import figure_jobs, rendering
+from bstcad.optics.lens.base import on_base
 from bstcad.report import prescription
 from tests.cad.test_dome import CASES, dome, offset_sphere
 
@@ -35,8 +35,8 @@ def test_the_polar_table_holds_points_of_the_dome_and_their_normals(lens, tmp_pa
     assert table[:, 0].max() == pytest.approx(85.0) and len(table) == 1 + 16 * 66
     back = np.loadtxt(tmp_path / "points-back.csv", delimiter=",", skiprows=1)
     for place, normal in ((points, normals), (back[:, :3], back[:, 3:])):
-        assert dome_mesh.distance_from_dome(lens.back, place).max() < 1e-9
-        np.testing.assert_allclose(dome_mesh.normals_on(lens.back, place), normal, rtol=0, atol=1e-9)
+        assert distances.distances_of_points(place, lens).max() < 1e-9
+        np.testing.assert_allclose(distances.normals_near(lens.back, place), normal, rtol=0, atol=1e-9)
     front = np.loadtxt(tmp_path / "points-front.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(np.linalg.norm(front[:, :3], axis=1), 8.0, atol=1e-9)
     np.testing.assert_allclose(front[:, 3:], -front[:, :3] / 8.0, atol=1e-9)  # out of the lens, towards the lamp
@@ -56,7 +56,7 @@ def test_the_mean_curvature_over_directions_is_that_of_a_sphere():
     x, y = np.meshgrid(line, line)
     patch = back.at(*(torch.from_numpy(part.copy()) for part in (x, y)))
     normal = patch.normal.numpy()
-    found = dome_figures.mean_curvature(
+    found = figure_jobs.mean_curvature(
         patch.along_x.numpy(), patch.along_y.numpy(), normal / np.sqrt((normal**2).sum(0)), (x, y)
     )
     rough = max(back.pitch) / 12.0  # the curvature of a spline of degree 2 jumps at the knots
@@ -65,9 +65,10 @@ def test_the_mean_curvature_over_directions_is_that_of_a_sphere():
 
 def test_coordinates_of_the_chart_become_angles():
     lens = dome()
-    places = np.array([[0.0, 0.0], [lens.outline.radius, 0.0], [0.0, -30.0]])
+    chart, places = lens.back.chart, np.array([[0.0, 0.0], [lens.outline.radius, 0.0], [0.0, -30.0]])
     expected = [[0.0, 0.0], [85.0, 0.0], [0.0, -math.degrees(2 * math.atan(1.0))]]
-    np.testing.assert_allclose(dome_figures.in_angles(lens, places), expected, atol=1e-9)
+    np.testing.assert_allclose(chart.drawn(places), expected, atol=1e-9)
+    np.testing.assert_allclose(chart.from_drawn(chart.drawn(places)), places, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["sphere", "plane", "below the horizon"])
@@ -75,7 +76,7 @@ def test_the_model_of_the_report_has_the_extent_of_the_solid(name):
     """Nothing lies outside the part: no plane around the dome, no part of a chart."""
     lens = CASES[name]
     model = json.loads(rendering.turnable(lens, cells=64))
-    vertices = mesh.lens_mesh(domes.on_base(lens), 64).vertices
+    vertices = mesh.lens_mesh(on_base(lens), 64).vertices
     np.testing.assert_allclose(model["low"], vertices.min(0), atol=1e-3)
     np.testing.assert_allclose(model["size"], np.ptp(vertices, axis=0), atol=2e-3)
 
@@ -85,7 +86,7 @@ def test_the_outer_size_is_that_of_the_solid_which_may_be_oblong_and_wider_than_
     oblong = dome(half=78.0)
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, 25), np.linspace(-1.0, 1.0, 25), indexing="ij")
     oblong = replace(oblong, back=replace(oblong.back, heights=torch.from_numpy(3.0 * x**2 - 5.0 * y**2)))
-    lens = domes.on_base({"oblong": oblong, **CASES}[name])
+    lens = on_base({"oblong": oblong, **CASES}[name])
     vertices = mesh.lens_mesh(lens, 96).vertices
     low, high = prescription._corners(lens, None)
     np.testing.assert_allclose(low, vertices.min(0), atol=5e-3)  # mm, the chords of the mesh

@@ -24,8 +24,8 @@ from bstcad.designs import pipeline
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.wavefront import SphericalWave
 from bstcad.optics.numerics import ops
 from bstcad.optics.receivers.goal import Goal
@@ -48,7 +48,7 @@ from tests.conftest import DISK, SMALL
 from tests.tracing import launch, simulated, simulated_plain
 
 ROOT = Path(__file__).parent.parent.parent
-SOURCE = Point(position=(1.0, -2.0, 0.0), profile="uniform", half_angle=35.0)
+SOURCE = PointSource(position=(1.0, -2.0, 0.0), profile="uniform", half_angle=35.0)
 GAUSSIAN = {"profile": "gaussian", "half_angle_1e2": 30.0}
 SCREEN = Screen(300.0, (-70.0, 90.0), (-80.0, 60.0), 192)  # 36 864 pixels: torch shares sums of more than 32 768
 FURTHER = replace(SCREEN, z=600.0, x=(-150.0, 170.0), y=(-160.0, 140.0))
@@ -75,7 +75,7 @@ def of_two_faces(dtype) -> dict[str, torch.Tensor]:
     """Merit and gradients of two nets for two pictures of lossy light, and for a wave beside them."""
     back = lens(dtype).back
     front = replace(back, z=15.0, heights=-0.1 * back.heights.flip(0, 1))
-    held = Lens(front, back, Circle(10.0), 1.5, shaped=(0, 1))
+    held = Lens(front, back, Circle(10.0), 1.5, tailored=(0, 1))
     light = (Channel(SOURCE, held.index, losses=Losses(FresnelLoss(587.6), AbsorptionLoss(0.01))),)
     goals = [Goal("target", screen, target().numpy(), weight) for screen, weight in ((SCREEN, 1.0), (FURTHER, 2.0))]
     found = {}
@@ -119,7 +119,7 @@ def everything() -> dict[str, torch.Tensor]:
     back = lens().back
     x, y = sampling.grid(Rectangle(20.0, 20.0), 300)
     flat = (p.reshape(-1) for p in (x, y, 0.3 * torch.sqrt(1.5 + x / 7), 0.001 * x * y, x * x))  # no polynomial
-    beam = Collimated(Circle(12.0), profile="gaussian", radius_1e2=9.0)
+    beam = CollimatedSource(Circle(12.0), profile="gaussian", radius_1e2=9.0)
     rays = tubes.rays_to(SOURCE, lens(), *tubes.corners(Circle(9.0), 300))
     return image_and_gradient() | {
         "a polynomial and a fit": fit_slopes(back, *flat, Fit(degree=3)).heights,

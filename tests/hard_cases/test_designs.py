@@ -18,7 +18,7 @@ from bstcad.designs.pipeline import design
 from bstcad.optics.trace.measure import Effort
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
-from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT
+from bstcad.verify.nominal import DEFAULT_RRMSD_LIMIT
 from tests import suite
 from tests.conftest import draws_nothing
 from tests.hard_cases.designs import DESIGNS, overrides

@@ -22,6 +22,7 @@ from bstcad.planning.prediction import (
 )
 from bstcad.scene.scene import load
 from bstcad.scene.target import MIN_PIXELS
+from bstcad.tailoring import effort as efforts
 from tests import suite
 
 NET, PIXELS = "lens.back.control_points", "target.pixels"
@@ -34,7 +35,7 @@ def tiny(monkeypatch):
     """Pilots that take a second or so."""
     for name, value in TINY.items():
         monkeypatch.setattr(prediction, name, value)
-    monkeypatch.setattr("bstcad.tailoring.run.FINE_EFFORT", Effort(128, accuracy=0.0, witness=False))
+    monkeypatch.setattr(efforts, "FULL", replace(efforts.FULL, fine=Effort(128, accuracy=0.0, witness=False)))
 
 
 def pilot(scene, *, slower=1.0, factor=4.0):

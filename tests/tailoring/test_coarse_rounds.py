@@ -43,7 +43,7 @@ def near():
 def rrmsd(made):
     """RRMSD by rays of its own."""
     [goal] = made.goals
-    return measure(made.lens, made.scene.channels(), goal.receiver, goal.picture, Effort(512, witness=False)).rrmsd
+    return measure(made.lens, made.scene.channels(), goal.screen, goal.picture, Effort(512, witness=False)).rrmsd
 
 
 def names(made):
@@ -75,7 +75,7 @@ def test_a_stage_hands_on_its_best_lens(monkeypatch):
     """A stage that ends with a round on 32 pixels, by which a letter on 64 pixels gets worse."""
 
     def steps(task, lens, state=None):
-        coarse, [(tubes, evaluations)] = stage2.coarse_rounds(task, lens), stage2.sheet_sizes(task.knobs)
+        coarse, [(tubes, evaluations)] = stage2.coarse_rounds(task, lens), stage2.sheet_sizes(task.settings)
         return stage2.run_rounds((*coarse, stage2.TubeRound(task, tubes, evaluations), *coarse[-1:]), lens, state)
 
     monkeypatch.setitem(pipeline.PROCEDURES, "least-squares", ("stage 1", stage1.steps, steps))

@@ -19,7 +19,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.sphere_light import SphereLight
 from bstcad.optics.receivers.directions import Directions
 from bstcad.optics.receivers.goal import Goal
@@ -87,7 +87,7 @@ def interpolated(rho, m):
 
 def light(profile):
     """Return the lamp over the chart."""
-    return SphereLight(Point((0.0, 0.0, 0.0), profile=profile, half_angle=math.degrees(CONE)), 0.0, CHART, CONE)
+    return SphereLight(PointSource((0.0, 0.0, 0.0), profile=profile, half_angle=math.degrees(CONE)), 0.0, CHART, CONE)
 
 
 def lens_of(dome):
@@ -109,7 +109,7 @@ def disc(pixels, parts=16):
 def error_of_picture(lens, profile, rays, pixels=24):
     """Return the RRMSD of the light of rays x rays rays from an even disc."""
     goal = disc(pixels)
-    made, *_ = trace.simulate_plain([(1.0, light(profile), lens, 1)], [goal.receiver], rays)
+    made, *_ = trace.simulate_plain([(1.0, light(profile), lens, 1)], [goal.screen], rays)
     off = (made.box / made.box.sum()).numpy() - goal.picture
     return math.sqrt((off**2).sum() / (goal.picture**2).sum()), made.flux
 
@@ -136,7 +136,7 @@ def by_rounds(profile, m, plan):
     """Return the lens after rounds of stage 1 from a sphere; plan: cells of the transport map and fit of each."""
     goal, lens, source = disc(256), lens_of(flat_dome(m)), light(profile)
     per_degree = RIM / math.degrees(DISC)
-    slopes = SimpleNamespace(face_points=tuple(p * per_degree for p in slope_map.pixel_corners(goal.receiver)))
+    slopes = SimpleNamespace(face_points=tuple(p * per_degree for p in slope_map.pixel_corners(goal.screen)))
     for cells, fit in plan:
         window = slope_map.lit_window(source, lens)
         grid = slope_map.square_grid(source, lens, window, cells)

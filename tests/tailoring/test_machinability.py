@@ -17,10 +17,10 @@ from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
 from bstcad.report import record
-from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.tailoring.machinability import RELIEF_RESERVE, enforce_bounds, excess, place_back
+from bstcad.tailoring.settings import Bounds
 from tests import lenses, suite
 from tests.conftest import DISK, SMALL, quick_effort
 

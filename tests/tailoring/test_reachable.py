@@ -11,7 +11,7 @@ from bstcad import cli
 from bstcad.designs.pipeline import design, reachable_part
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.optics.surfaces.surfaces import Plane
@@ -151,7 +151,7 @@ def test_the_pull_is_zero_up_to_its_angle_and_falls_with_its_gradient():
         slope = math.tan(math.asin(math.sin(math.radians(leaving)) / index))
         heights = (slope * x)[:, None].expand(9, 9).contiguous()
         lens = Lens(Plane(0.0), BSplineSurface(9.0, heights, (-2.0, 2.0), (-2.0, 2.0)), square, index)
-        pull = Grazing.of(Edge(Channel(Collimated(square), index), most), lens)
+        pull = Grazing.of(Edge(Channel(CollimatedSource(square), index), most), lens)
         value, gradient, worst = pull(heights)
         if u < 0:
             assert value == 0 and not gradient.any() and worst < 0

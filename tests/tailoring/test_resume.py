@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from bstcad.designs.pipeline import DesignState, design
 from bstcad.optics.trace.measure import Effort
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
+from bstcad.tailoring import effort as efforts
 from bstcad.tailoring.minimise import AdamState, Best, LbfgsState, adam, lbfgs, minimise
 from bstcad.tailoring.run import Hooks
 from tests import domes, suite, two_faces
@@ -44,7 +45,7 @@ SCENES = {
 @pytest.fixture(autouse=True)
 def _few_rays(monkeypatch):
     """Scenes with bounds are rated by few rays; the law is one of bits, whatever the rays."""
-    monkeypatch.setattr("bstcad.tailoring.run.FINE_EFFORT", Effort(128, accuracy=0.0, witness=False))
+    monkeypatch.setattr(efforts, "FULL", replace(efforts.FULL, fine=Effort(128, accuracy=0.0, witness=False)))
 
 
 QUICK = (

@@ -20,7 +20,7 @@ from bstcad.designs.pipeline import design as design_of
 from bstcad.optics.lens.interfaces import cross
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
@@ -72,7 +72,7 @@ def test_the_light_is_that_of_rays_through_the_faces_of_the_part(design, name, t
         assert np.abs(measured.depth(*designed.rim_points())).max() < 1e-4
     around, screen = polygons(tmp_path / "part.step"), replace(design.scene.target.screen, pixels=8)
     wide = found.apertures[0].half_extent[0] < 0.98 * found.apertures[1].half_extent[0]
-    for source in (design.scene.source, Collimated(Rectangle(9.0, 7.0))):
+    for source in (design.scene.source, CollimatedSource(Rectangle(9.0, 7.0))):
         light = measure(found, [Channel(source, lens.index)], screen, np.ones(screen.shape), Effort(512, accuracy=0))
         seen = independent(source, lens, around, screen)
         assert light.flux["on target"] == pytest.approx(seen.sum(), rel=1.5e-3)
@@ -122,7 +122,7 @@ def independent(source, lens, around, screen, count=1 << 17):
     for interface, polygon in zip(lens.unbounded().interfaces, around, strict=True):
         rays = cross(rays, interface).rays
         flux *= inside(polygon, rays.position[:2].numpy())
-    x, y, _ = screen.plane.to(rays).position.numpy()
+    x, y, _ = screen.receiver.to(rays).position.numpy()
     seen, _, _ = np.histogram2d(y, x, bins=screen.shape, range=(screen.y, screen.x), weights=flux)
     return seen[::-1]
 
@@ -152,7 +152,7 @@ def test_what_a_flange_stands_in_the_way_of():
     """Parallel light at 20 degrees through a plate: its beam is what three circles, each shifted on, have in common."""
     clear = Circle(5.0), Circle(5.0)
     lens = Lens(Plane(15.0), net(m=9, half=9.0), Rectangle(16.0, 16.0), 1.5, clear=clear)
-    light = [Channel(Collimated(Rectangle(30.0, 30.0), tilt=(0.0, 20.0)), 1.5)]
+    light = [Channel(CollimatedSource(Rectangle(30.0, 30.0), tilt=(0.0, 20.0)), 1.5)]
     outside, glass = math.tan(math.radians(20)), math.tan(math.asin(math.sin(math.radians(20)) / 1.5))
 
     def common(shift):

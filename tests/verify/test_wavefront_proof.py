@@ -16,6 +16,7 @@ from bstcad.optics.light.wavefront import ZernikeWave
 from bstcad.optics.trace.wavefront_error import wavefront_error
 from bstcad.report import record, report
 from bstcad.verify import checks
+from bstcad.verify.nominal import Nominal
 from tests import suite
 from tests.conftest import flat_pictures, proofs, quick_effort
 from tests.two_faces import CHANGES, made_of, scene_of
@@ -94,7 +95,7 @@ def test_a_wave_that_no_light_meets_fails_and_has_no_figures(one):
 def test_a_flat_plate_leaves_parallel_light_parallel():
     """A plain lens: parallel light through level faces has no error but rounding."""
     made = made_of(scene_of(**ONE), front=0.0, back=0.0)
-    error, found = judged(made.lens, checks.Nominal(made.scene, made.lens, made.goals), wavefront=1e-6)
+    error, found = judged(made.lens, Nominal(made.scene, made.lens, made.goals), wavefront=1e-6)
     assert found[RMS].passed and found[FLOOR].passed
     assert error.without_piston.rms < 1e-8 and error.angle_max < 1e-6
 
@@ -103,7 +104,7 @@ def test_a_mounted_lens_is_measured_as_it_is_made(tmp_path):
     """The rim of the mount cuts away light that the bare lens lets through."""
     made = made_of(scene_of(**ONE, mount={"datum": "front", "rim": {"shape": "circle", "diameter": 6.4}}))
     folders.write_geometry(made, tmp_path)()
-    proof = checks.verify(tmp_path, checks.Nominal(made.scene, made.lens, made.goals), effort=quick_effort())
+    proof = checks.verify(tmp_path, Nominal(made.scene, made.lens, made.goals), effort=quick_effort())
     bare = wavefront_error(made.scene.source, replace(made.lens, clear=None), made.scene.wavefront)
     cut = wavefront_error(made.scene.source, made.lens, made.scene.wavefront)
     assert proof.wavefront.flux == pytest.approx(cut.flux, abs=1e-4) and proof.wavefront.flux < 0.95 * bare.flux
@@ -112,7 +113,7 @@ def test_a_mounted_lens_is_measured_as_it_is_made(tmp_path):
 def test_waves_are_those_of_the_main_line():
     source = CHANGES["source"] | {"wavelength": [[633.0, 1.0], [520.0, 3.0], [450.0, 1.0]]}
     made = made_of(scene_of(**ONE, source=source))
-    heaviest = checks.Nominal(made.scene, made.lens, made.goals).heaviest
+    heaviest = Nominal(made.scene, made.lens, made.goals).heaviest
     assert heaviest.source == made.scene.source.central and heaviest.source.wavelength == 520.0
 
 

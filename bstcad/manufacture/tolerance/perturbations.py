@@ -18,7 +18,6 @@ from scipy import fft
 from scipy.ndimage import fourier_gaussian
 from scipy.stats import norm
 
-from bstcad.optics.lens import domes
 from bstcad.optics.lens.interfaces import Interface
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.media import refractive_index
@@ -26,9 +25,8 @@ from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.bspline import BSplineSurface, interpolating_net, is_net
-from bstcad.optics.surfaces.motion import Motion
+from bstcad.optics.surfaces.motion import Motion, along_axis
 from bstcad.optics.surfaces.outlines import Outline
-from bstcad.optics.surfaces.radial import RadialSurface
 from bstcad.optics.surfaces.rays import Vector
 from bstcad.optics.surfaces.sides import size_text
 from bstcad.optics.surfaces.surfaces import Surface
@@ -121,6 +119,7 @@ class Kind:
     words: str  # name in reports
     unit: str  # unit of its amounts; "" for a ratio
     apply: Callable[[Setup, float], Setup]  # function (setup, amount) -> setup with this error added
+    moves: bool = False  # True if a part moves; errors of shape act before motions
 
 
 @dataclass(frozen=True)
@@ -167,8 +166,7 @@ def draws(perturbations: Sequence[Perturbation], uniform: np.ndarray) -> np.ndar
 def perturb(setup: Setup, perturbations: Sequence[Perturbation], amounts: Sequence[float]) -> Setup:
     """Apply amounts (n,), in the order of the perturbations, to a setup; errors of shape come before motions."""
     pairs = [(p.kind, float(a)) for p, a in zip(perturbations, amounts, strict=True) if a]
-    motions = ("lens.decentre", "lens.tilt", "lens.axial", "lens.clocking", "source.", "screen.", "front.decentre")
-    for kind, amount in sorted(pairs, key=lambda pair: pair[0].name.startswith(motions)):
+    for kind, amount in sorted(pairs, key=lambda pair: pair[0].moves):
         setup = kind.apply(setup, amount)
     return setup
 
@@ -198,7 +196,7 @@ def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
 
 def _motions(setup: Setup) -> Iterator[Kind]:
     sources, without_effect = [channel.source for channel in setup.channels], {"source.clocking"}
-    if setup.screen.plane.chart:  # directions, which a shift does not change
+    if setup.screen.receiver.goniometer:  # directions, which a shift does not change
         without_effect |= {"screen.decentre_x", "screen.decentre_y", "screen.axial"}
     if all(source.is_shift_invariant for source in sources):
         without_effect.add("source.axial")  # a shift of collimated light along the axis has no effect
@@ -208,26 +206,21 @@ def _motions(setup: Setup) -> Iterator[Kind]:
         name = setup.lens.passes.optic if part == "lens" else part
         for error, words, axis, turns in MOTIONS:
             if f"{part}.{error}" not in without_effect:
-                moves = partial(_move_part, part, axis, turns)
-                yield Kind(f"{part}.{error}", words.format(name), "deg" if turns else "mm", moves)
+                move = partial(_move_part, part, axis, turns)
+                yield Kind(f"{part}.{error}", words.format(name), "deg" if turns else "mm", move, moves=True)
 
 
 def _move_part(part: str, axis: int, turns: bool, setup: Setup, by: float) -> Setup:
-    amounts = _along(axis, by)
+    amounts = along_axis(axis, by)
     return setup.moved(part, Motion.of(turn=amounts, about=setup.pivot(part)) if turns else Motion.of(shift=amounts))
-
-
-def _along(axis: int, amount: float) -> Vector:
-    """Return the vector with the component `amount` along an axis (0 to 2), else zeros."""
-    return (amount, 0.0, 0.0) if axis == 0 else (0.0, amount, 0.0) if axis == 1 else (0.0, 0.0, amount)
 
 
 def _shapes(setup: Setup, material: str | None) -> Iterator[Kind]:
     optic, refracts = setup.lens.passes.optic, setup.lens.passes.enters
     if refracts:
         yield Kind("lens.thickness", f"thickness of the {optic}", "mm", _change_thickness)
-        yield Kind("lens.index", "refractive index", "", lambda setup, by: setup.with_indices(lambda n: n + by))
-        if not domes.is_dome(setup.lens):  # whose front is nearly vertical at its rim
+        yield Kind("lens.index", "refractive index", "", lambda s, by: s.with_indices(lambda n: n + by))
+        if setup.lens.shares_outline:  # the front of another lens is nearly vertical at its rim
             yield Kind("lens.front_power", "sag of the front at its rim", "mm", _change_front_power)
     yield Kind("lens.scale", f"scale of the {optic} (shrinkage)", "", lambda s, by: s.with_lens_scaled(1 + by))
     if material in THERMAL_COEFFICIENTS and refracts:
@@ -278,10 +271,10 @@ def _change_wavelength(material: str, setup: Setup, by: float) -> Setup:
 def _lights(setup: Setup) -> Iterator[Kind]:
     sources = [channel.source for channel in setup.channels]
     if any(source.with_wider_cone(0.0) for source in sources):
-        yield Kind("source.angle", "width of the source's cone, relative", "", _change_cone)
+        yield Kind("source.angle", "width of the source's cone, relative", "", _change_cone, moves=True)
     extended = len({source.place for source in sources}) > 1
     if extended and all(source.moved_away(0.0, source.place) for source in sources):
-        yield Kind("source.size", "size of the source, relative", "", _change_size)
+        yield Kind("source.size", "size of the source, relative", "", _change_size, moves=True)
 
 
 def _change_cone(setup: Setup, by: float) -> Setup:
@@ -302,47 +295,23 @@ def _alignments(lens: Lens) -> Iterator[Kind]:
         yield Kind(f"lens.wedge_{name}", words, "deg", partial(_tilt_back, axis))
         if not lens.front.level:
             words = f"decentre of the front in {name} relative to the back"
-            yield Kind(f"front.decentre_{name}", words, "mm", partial(_decentre_front, axis))
+            yield Kind(f"front.decentre_{name}", words, "mm", partial(_decentre_front, axis), moves=True)
 
 
 def _decentre_front(axis: int, setup: Setup, by: float) -> Setup:
     """Shift the front and the rim of the lens by `by` mm along an axis (0: x, 1: y); the back stays fixed in the room.
 
     A lens is traced in the frame of its front.  Therefore the back is shifted inversely, and the whole lens moves with
-    the front.  The net of the back is extended linearly to reach the rim; inside, the face does not change.
+    the front.
     """
-    back, shift = setup.lens.back_net, Motion.of(shift=_along(axis, by))
-    if domes.is_radial(back):
-        return replace(setup, lens=setup.lens.with_back(back.carried(shift.inverse))).moved("lens", shift)
-    (low, high), pitch = (back.x, back.y)[axis], back.pitch[axis]
-    missing = setup.lens.outline.half_extent[axis] + abs(by) - min(-low, high)
-    more = max(0, math.ceil(missing / pitch))
-    heights = np.pad(back.heights, [(more * (k == axis),) * 2 for k in (0, 1)], "reflect", reflect_type="odd")
-    ends = low - more * pitch - by, high + more * pitch - by
-    x, y = (back.x, ends) if axis else (ends, back.y)
-    fixed = replace(back, heights=torch.from_numpy(heights), x=x, y=y)
-    return replace(setup, lens=setup.lens.with_back(fixed)).moved("lens", shift)
+    lens = setup.lens
+    back = lens.back_net.shifted(axis, -by, lens.outline.half_extent[axis])
+    return replace(setup, lens=lens.with_back(back)).moved("lens", Motion.of(shift=along_axis(axis, by)))
 
 
 def _tilt_back(axis: int, setup: Setup, by: float) -> Setup:
-    """Rotate the back by `by` degrees about an axis (0: x, 1: y) through its vertex v; all other parts stay fixed.
-
-    A point p = v + (x, y, ζ) of the rotated face was at v + q before the rotation R, with q = Rᵀ (p - v).  In place of
-    the face of height h, its tangent plane at (x, y) is used: q_z = h - h(v) + ∇h · ((q_x, q_y) - (x, y)), linear in ζ.
-    The error of this is curvature · (angle · sag)², 1 nm at a tenth of a degree.  A dome is found by its distances.
-    """
-    back = setup.lens.back_net
-    if domes.is_radial(back):
-        motion = Motion.of(turn=_along(axis, by), about=(0.0, 0.0, back.vertex_z))
-        return replace(setup, lens=setup.lens.with_back(back.carried(motion)))
-    turn = Motion.of(turn=_along(axis, by)).inverse.rotation.tolist()
-    x, y = _control_points(back)
-    h, h_x, h_y = back.relative_sag_and_slope(x, y)
-    vertex = float(back.from_vertex().z) - back.z
-    level = [row[0] * x + row[1] * y for row in turn]  # q for ζ = 0
-    rise = h - vertex + h_x * (level[0] - x) + h_y * (level[1] - y) - level[2]
-    along = turn[2][2] - h_x * turn[0][2] - h_y * turn[1][2]
-    return replace(setup, lens=setup.lens.with_back(_add_heights(back, (vertex + rise / along - h).numpy())))
+    """Rotate the back by `by` degrees about an axis (0: x, 1: y) through its vertex; all other parts stay fixed."""
+    return replace(setup, lens=setup.lens.with_back(setup.lens.back_net.tilted(axis, by)))
 
 
 # --- errors of the form of a face, as heights of its control net ------------------------------------------------------
@@ -354,7 +323,7 @@ FRONT_SEED_OFFSET = 100  # offset of the seeds for the form of the front, so tha
 FACE_NET = 513  # control points per side of the net that replaces a plane or a conic with a form error
 FACE_MARGIN = 6  # number of control points of the FACE_NET net outside a round outline, on each side
 FACE_REACH = 1.03  # radius / rim radius up to which the net follows the face: its level part must not affect the rim
-SPHERE_WAVES = 512  # number of plane waves in a random field on a sphere
+FIELD_WAVES = 512  # number of plane waves in a random field on a curved chart
 CELLS_PER_PERIOD = 4.0  # minimum number of control cells in a correlation length or a period
 
 
@@ -375,11 +344,8 @@ def ripple(lens: Lens, period: float, pattern: Literal["raster", "spiral"]) -> K
     """
     back = lens.back_net
     _require_resolution(back, period, "a ripple's period")
-    x, y = (np.linspace(*side, m) for side, m in zip((back.x, back.y), back.shape, strict=True))
-    s = np.broadcast_to(x[:, None], (len(x), len(y))) if pattern == "raster" else np.hypot(x[:, None], y[None, :])
-    if domes.is_radial(back):
-        d_x, d_y, d_z = back.directions.numpy()
-        s = back.radius * np.arctan2(d_x if pattern == "raster" else np.hypot(d_x, d_y), d_z)
+    along_x, from_axis = back.chart.arcs(*(p.numpy() for p in back.places))
+    s = along_x if pattern == "raster" else from_axis
     field = _normalise(np.sin(2 * np.pi * s / period), inside_outline(lens.outline, back))
     words = f"{pattern} ripple of the back, period {period:g} mm"
     return Kind("back.ripple", words, "mm RMS", partial(_add_form, "back", field))
@@ -392,8 +358,8 @@ def random_field(surface: BSplineSurface, correlation_length: float, seed: int, 
     by √2.  On a dome r is the length of the chord.  Raises ValueError if the net is too coarse.
     """
     _require_resolution(surface, correlation_length, "a correlation length")
-    if domes.is_radial(surface):
-        return _normalise(_field_on_sphere(surface, correlation_length, seed), where)
+    if not surface.chart.flat:
+        return _normalise(_field_of_waves(surface, correlation_length, seed), where)
     cells = [correlation_length / 2 / pitch for pitch in surface.pitch]
     margin = [int(np.ceil(4 * c)) for c in cells]
     shape = [m + 2 * k for m, k in zip(surface.shape, margin, strict=True)]  # the margin avoids effects of the boundary
@@ -403,23 +369,24 @@ def random_field(surface: BSplineSurface, correlation_length: float, seed: int, 
     return _normalise(noise[inner], where)
 
 
-def _field_on_sphere(dome: RadialSurface, correlation_length: float, seed: int) -> np.ndarray:
-    """Return a random field (m, n) on the sphere of a dome, a sum of waves cos(k · p + φ) at the points p = R d.
+def _field_of_waves(surface: BSplineSurface, correlation_length: float, seed: int) -> np.ndarray:
+    """Return a random field (m, n), a sum of waves cos(k · p + φ) at the points p of the chart's surface h = 0.
 
     Wave vectors k with the standard deviation √2 / correlation_length in each component give the covariance
     exp(-(r / correlation_length)²), r the length of the chord (Rahimi and Recht 2007, "Random features").
     """
     chance = np.random.default_rng(seed)
-    waves = math.sqrt(2) / correlation_length * chance.standard_normal((SPHERE_WAVES, 3))
-    points, field = dome.radius * dome.directions.numpy(), np.zeros(dome.shape)
-    for (k_x, k_y, k_z), phase in zip(waves.tolist(), (2 * np.pi * chance.random(SPHERE_WAVES)).tolist(), strict=True):
+    waves = math.sqrt(2) / correlation_length * chance.standard_normal((FIELD_WAVES, 3))
+    x, y = surface.places
+    points, field = surface.chart.point(x, y, torch.zeros_like(x)).numpy(), np.zeros(surface.shape)
+    for (k_x, k_y, k_z), phase in zip(waves.tolist(), (2 * np.pi * chance.random(FIELD_WAVES)).tolist(), strict=True):
         field += np.cos(k_x * points[0] + k_y * points[1] + k_z * points[2] + phase)
     return field
 
 
 def inside_outline(outline: Outline, net: BSplineSurface) -> np.ndarray:
     """Return a mask (m, n) of the control points of a face inside the outline."""
-    return outline.contains(*_control_points(net)).numpy()
+    return outline.contains(*net.places).numpy()
 
 
 def as_net(face: Surface, outline: Outline) -> BSplineSurface:
@@ -434,7 +401,7 @@ def as_net(face: Surface, outline: Outline) -> BSplineSurface:
     half_x, half_y = (half * wide for half in outline.half_extent)
     heights = torch.zeros((FACE_NET, FACE_NET), dtype=torch.float64)
     level = BSplineSurface(face.z, heights, (-half_x, half_x), (-half_y, half_y))
-    x, y = _control_points(level)
+    x, y = level.places
     rim, r = math.hypot(*outline.farthest), torch.hypot(x, y)
     edge = torch.full((1,), FACE_REACH * rim, dtype=torch.float64)
     rim = FACE_REACH * rim if bool(face.reaches(edge, torch.zeros_like(edge))) else rim
@@ -460,14 +427,6 @@ def _net(lens: Lens, face: str) -> tuple[BSplineSurface, Outline]:
 
 def _add_heights(net: BSplineSurface, heights: np.ndarray) -> BSplineSurface:
     return replace(net, heights=net.heights + torch.from_numpy(heights).to(net.heights))
-
-
-def _control_points(net: BSplineSurface) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return x and y (m, n) of the control points (mm)."""
-    ends = zip((net.x, net.y), net.shape, strict=True)
-    x, y = (torch.linspace(*side, m, dtype=torch.float64) for side, m in ends)
-    x, y = torch.meshgrid(x, y, indexing="ij")
-    return x, y
 
 
 def _require_resolution(surface: BSplineSurface, length: float, words: str) -> None:

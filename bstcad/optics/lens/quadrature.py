@@ -12,11 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from bstcad.optics.lens import domes
+from bstcad.optics.lens.base import on_base
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import BSplineSurface, is_net
 from bstcad.optics.surfaces.outlines import Outline
-from bstcad.optics.surfaces.radial import RadialSurface
 from bstcad.optics.surfaces.surfaces import Surface
 
 MIN_SPANS = 128  # smallest number of parts of a chord across a whole net; the spans of a coarser net are divided
@@ -96,33 +95,26 @@ def _of_revolution(face: Surface, raised: float) -> Sums:
 
 
 def of_wall(face: Surface, border: Border, raised: float = 0.0) -> Sums:
-    """Return the sums over the wall from the plane z = 0 up to the rim z = h + raised (mm) of a face, n outwards."""
-    h = face.relative_sag_and_slope(torch.from_numpy(border.x), torch.from_numpy(border.y))[0].numpy() + raised
-    return _of_wall(border, h)
+    """Return the sums over the wall from the plane z = 0 up to the rim of a face, raised by `raised` (mm), n outwards.
 
-
-def _of_wall(border: Border, h: np.ndarray) -> Sums:
-    """Return the sums over the wall on a border, up to heights h (mm)."""
+    border: border of the face in its chart.
+    """
+    border, h = _rim_in_space(face, border)
+    h = h + raised
     cone = h * (border.x * border.dy - border.y * border.dx)  # r·n ds, times the wall's height
     return Sums(float((border.ds * h).sum()), float(cone.sum()) / 3, _moment(cone, border.x, border.y, h / 2))
 
 
 def _sums_of_points(face: Surface, raised: float, x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> Sums:
-    """Return the sums over points (x, y) (mm) of a face, raised by `raised` (mm); weight: dx dy of each point (mm²).
+    """Return the sums over points (x, y) (mm) of a face's chart, raised by `raised` (mm); weight: dx dy of each (mm²).
 
-    On a radial surface S, x and y are coordinates of its chart, and n dA = ∂S/∂x x ∂S/∂y dx dy.
+    n dA = ∂S/∂x × ∂S/∂y dx dy for the surface S(x, y).
     """
-    if domes.is_radial(face):
-        r, along_x, along_y = (
-            np.moveaxis(part.numpy(), 0, -1) for part in face.at(torch.from_numpy(x), torch.from_numpy(y))
-        )
-        r, normal = r + (0.0, 0.0, raised), np.cross(along_x, along_y)
-        area, cone = weight * np.sqrt((normal * normal).sum(axis=1)), weight * (r * normal).sum(axis=1)
-        return Sums(float(area.sum()), float(cone.sum()) / 3, _moment(cone, *r.T))
-    h, h_x, h_y = (part.numpy() for part in face.relative_sag_and_slope(torch.from_numpy(x), torch.from_numpy(y)))
-    area, h = weight * np.sqrt(1 + h_x * h_x + h_y * h_y), h + raised
-    cone = weight * (h - x * h_x - y * h_y)
-    return Sums(float(area.sum()), float(cone.sum()) / 3, _moment(cone, x, y, h))
+    vectors = face.position_and_normal(torch.from_numpy(x), torch.from_numpy(y))
+    (x, y, z), (n_x, n_y, n_z) = ([part.numpy() for part in vector] for vector in vectors)
+    area, z = weight * np.sqrt(n_z * n_z + n_x * n_x + n_y * n_y), z + raised
+    cone = weight * (z * n_z + x * n_x + y * n_y)
+    return Sums(float(area.sum()), float(cone.sum()) / 3, _moment(cone, x, y, z))
 
 
 def _moment(cone: np.ndarray, *r: np.ndarray) -> np.ndarray:
@@ -182,9 +174,9 @@ def outline_border(outline: Outline, face: Surface) -> Border:
     )
 
 
-def _rim_in_space(dome: RadialSurface, border: Border) -> tuple[Border, np.ndarray]:
-    """Return the border in x and y of space, and heights (mm) over the centre, of a border in a dome's chart."""
-    patch = dome.at(torch.from_numpy(border.x), torch.from_numpy(border.y))
+def _rim_in_space(face: Surface, border: Border) -> tuple[Border, np.ndarray]:
+    """Return the border in x and y of space, and heights (mm) over the plane z, of a border in a face's chart."""
+    patch = face.at(torch.from_numpy(border.x), torch.from_numpy(border.y))
     (x, y, h), (x_x, y_x, _), (x_y, y_y, _) = (part.numpy() for part in patch)
     return Border(x, y, x_x * border.dx + x_y * border.dy, y_x * border.dx + y_y * border.dy), h
 
@@ -243,7 +235,7 @@ class MassProperties:
 
 def of_lens(lens: Lens) -> MassProperties:
     """Return the properties of a bare lens to 1e-9; for a large net OpenCASCADE takes minutes, and errs by 1e-5."""
-    lens, total = domes.on_base(lens.plain()), Sums()
+    lens, total = on_base(lens.plain()), Sums()
     z_ref = lens.front.z  # origin of z in the sums: a near one limits rounding
     for face, sign in ((lens.back, 1), (lens.front, -1)):
         rim, raised = face.around, face.around.z - z_ref
@@ -251,8 +243,7 @@ def of_lens(lens: Lens) -> MassProperties:
         if face.outline is not None:  # the optical part replaces the plane there
             inner = outline_border(face.outline, face.optical)
             hole, raised = of_face(rim, inner, raised), face.z - z_ref
-            steep = domes.is_dome(lens)  # the inner face of a dome is nearly vertical at its rim
-            own = _of_revolution(face, raised) if steep else of_face(face.optical, inner, raised)
+            own = _of_revolution(face, raised)
             cap += Sums(own.area - hole.area, own.volume - hole.volume, own.moment - hole.moment)
         volume, moment = sign * (cap.volume + wall.volume), sign * (cap.moment + wall.moment)
         total += Sums(cap.area + sign * wall.area, volume, moment)
@@ -261,12 +252,8 @@ def of_lens(lens: Lens) -> MassProperties:
 
 def _cap_and_wall(lens: Lens, rim: Surface, raised: float) -> tuple[Sums, Sums]:
     """Return the sums over a face inside the lens's rim, and over the wall from the plane z = 0 up to it."""
-    if not domes.is_dome(lens):
+    if rim.chart == lens.back.chart:
         border = outline_border(lens.outline, rim)
-        return of_face(rim, border, raised), of_wall(rim, border, raised)
-    dome = domes.radial_back(lens)
-    in_chart = outline_border(lens.outline, dome)
-    edge, height = _rim_in_space(dome, in_chart)
-    if domes.is_radial(rim):
-        return of_face(rim, in_chart, raised), _of_wall(edge, height + raised)
-    return of_face(rim, edge, raised), of_wall(rim, edge, raised)
+    else:  # the rim of the back, seen along the axis
+        border, _ = _rim_in_space(lens.back, outline_border(lens.outline, lens.back))
+    return of_face(rim, border, raised), of_wall(rim, border, raised)

@@ -28,6 +28,7 @@ from torch import Tensor
 from typing_extensions import TypeIs
 
 from bstcad.optics.numerics import ops
+from bstcad.optics.surfaces.motion import Motion, along_axis
 from bstcad.optics.surfaces.outlines import Outline, inside
 from bstcad.optics.surfaces.sides import Sides, as_pair, side
 from bstcad.optics.surfaces.surfaces import Surface
@@ -267,6 +268,13 @@ class BSplineSurface(Surface):
         m, n = self.shape
         return (self.x[1] - self.x[0]) / (m - 1), (self.y[1] - self.y[0]) / (n - 1)
 
+    @property
+    def places(self) -> tuple[Tensor, Tensor]:
+        """Coordinates x and y (m, n) (mm) of the control points in the chart."""
+        ends = zip((self.x, self.y), self.shape, strict=True)
+        x, y = torch.meshgrid(*(torch.linspace(*side, m, dtype=torch.float64) for side, m in ends), indexing="ij")
+        return x, y
+
     def along_net(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return (u, v) of points (mm) in control-point spacings; a point outside the net is moved to its rim."""
         (m, n), (pitch_x, pitch_y) = self.shape, self.pitch
@@ -307,6 +315,34 @@ class BSplineSurface(Surface):
         (x0, x1), (y0, y1), z = self.x, self.y, about + factor * (self.z - about)
         x, y = (factor * x0, factor * x1), (factor * y0, factor * y1)
         return replace(self, z=z, heights=factor * self.heights, x=x, y=y)
+
+    def shifted(self, axis: int, by: float, half: float) -> Self:
+        """Return the surface shifted by `by` (mm) along x (axis 0) or y (1).
+
+        The net is extended linearly to reach ±half (mm) still; inside, the face does not change.
+        """
+        (low, high), pitch = (self.x, self.y)[axis], self.pitch[axis]
+        more = max(0, math.ceil((half + abs(by) - min(-low, high)) / pitch))
+        heights = np.pad(self.heights, [(more * (k == axis),) * 2 for k in (0, 1)], "reflect", reflect_type="odd")
+        ends = low - more * pitch + by, high + more * pitch + by
+        x, y = (self.x, ends) if axis else (ends, self.y)
+        return replace(self, heights=torch.from_numpy(heights), x=x, y=y)
+
+    def tilted(self, axis: int, angle: float) -> Self:
+        """Return the surface rotated by a small angle (degrees) about x (axis 0) or y (1) through its vertex v.
+
+        A point p = v + (x, y, ζ) of the rotated face was at v + q before the rotation R, with q = Rᵀ (p - v).  In place
+        of the face of height h, its tangent plane at (x, y) is used: q_z = h - h(v) + ∇h · ((q_x, q_y) - (x, y)),
+        linear in ζ.  The error of this is curvature · (angle · sag)², 1 nm at a tenth of a degree.
+        """
+        turn = Motion.of(turn=along_axis(axis, angle)).inverse.rotation.tolist()
+        x, y = self.places
+        h, h_x, h_y = self.relative_sag_and_slope(x, y)
+        vertex = float(self.from_vertex().z) - self.z
+        level = [row[0] * x + row[1] * y for row in turn]  # q for ζ = 0
+        rise = h - vertex + h_x * (level[0] - x) + h_y * (level[1] - y) - level[2]
+        along = turn[2][2] - h_x * turn[0][2] - h_y * turn[1][2]
+        return replace(self, heights=self.heights + (vertex + rise / along - h).to(self.heights))
 
     def bent(self, curvature: float) -> BSplineSurface:
         """Return the surface plus curvature r² / 2 (mm), which adds `curvature` (1/mm) at its vertex."""

@@ -25,12 +25,26 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from bstcad.optics.surfaces.outlines import Outline
+
+MAX_DRAWN_ANGLE = 179.0  # largest angle from the axis (degrees) of a direction in a figure
 
 
 class Chart(ABC):
     """Coordinates of points near a face; positions are relative to the face's `z` on the axis (mm)."""
+
+    flat = False  # True if x and y are those of space, so that an outline is seen along the axis as it is
+    labels: tuple[str, str]  # names of the coordinates in a figure, see `drawn`
+    distance: str  # name of the distance h + offset in a figure
+
+    @property
+    def offset(self) -> float:
+        """Distance (mm) of the surface h = 0."""
+        return 0.0
 
     @abstractmethod
     def point(self, x: Tensor, y: Tensor, h: Tensor) -> Tensor:
@@ -48,9 +62,29 @@ class Chart(ABC):
     def stretch(self, position: Tensor) -> Tensor | float:
         """Return the factor s by which the slope ∇f differs from -(n_x, n_y) / n_d."""
 
+    @abstractmethod
+    def arcs(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return lengths (mm) on the surface h = 0: along x from the plane x = 0, and from the axis."""
+
+    @abstractmethod
+    def drawn(self, places: np.ndarray) -> np.ndarray:
+        """Return the coordinates (…, 2) in a figure, named `labels`, of coordinates (…, 2) (mm)."""
+
+    @abstractmethod
+    def from_drawn(self, places: np.ndarray) -> np.ndarray:
+        """Return the coordinates (…, 2) (mm) of coordinates (…, 2) in a figure, the inverse of `drawn`."""
+
+    @abstractmethod
+    def outline_in(self, other: Chart, outline: Outline) -> Outline:
+        """Return an outline of this chart in another chart of the same kind: the same curve on the same face."""
+
 
 class HeightChart(Chart):
     """Chart of height fields: x, y and z."""
+
+    flat = True
+    labels = ("x (mm)", "y (mm)")
+    distance = "Sag"
 
     def point(self, x: Tensor, y: Tensor, h: Tensor) -> Tensor:
         """Return (x, y, h) stacked."""
@@ -68,6 +102,22 @@ class HeightChart(Chart):
         """Return 1."""
         return 1.0
 
+    def arcs(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return x and sqrt(x² + y²)."""
+        return np.broadcast_arrays(x, y)[0], np.hypot(x, y)
+
+    def drawn(self, places: np.ndarray) -> np.ndarray:
+        """Return the coordinates themselves."""
+        return places
+
+    def from_drawn(self, places: np.ndarray) -> np.ndarray:
+        """Return the coordinates themselves."""
+        return places
+
+    def outline_in(self, other: Chart, outline: Outline) -> Outline:
+        """Return the outline itself."""
+        return outline
+
 
 HEIGHTS = HeightChart()
 
@@ -77,6 +127,14 @@ class SphereChart(Chart):
     """Chart of radial surfaces: stereographic coordinates of the direction from the centre, and distance minus R."""
 
     radius: float  # R, mm
+
+    labels = ("θ cos ψ (degrees)", "θ sin ψ (degrees)")
+    distance = "Distance from the centre"
+
+    @property
+    def offset(self) -> float:
+        """Radius R (mm)."""
+        return self.radius
 
     @staticmethod
     def angle(length: float, radius: float) -> float:
@@ -117,3 +175,25 @@ class SphereChart(Chart):
     def stretch(self, position: Tensor) -> Tensor:
         """Return s = 1 / (1 + u² + v²) = (1 + d_z) / 2."""
         return (1 + position[2] / torch.sqrt((position * position).sum(0))) / 2
+
+    def arcs(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return R times the angles of d from the plane x = 0 and from the axis."""
+        d_x, d_y, d_z = self.direction(*map(torch.from_numpy, map(np.array, np.broadcast_arrays(x, y)))).numpy()
+        return self.radius * np.arctan2(d_x, d_z), self.radius * np.arctan2(np.hypot(d_x, d_y), d_z)
+
+    def drawn(self, places: np.ndarray) -> np.ndarray:
+        """Return θ (cos ψ, sin ψ) (degrees), so that a part that overhangs is shown too."""
+        length = np.hypot(places[..., 0], places[..., 1])[..., None]
+        theta = np.degrees(2 * np.arctan(length / (2 * self.radius)))
+        return places * theta / np.where(length > 0, length, 1.0)
+
+    def from_drawn(self, places: np.ndarray) -> np.ndarray:
+        """Return 2 R tan(θ / 2) (cos ψ, sin ψ), θ at most MAX_DRAWN_ANGLE."""
+        theta = np.hypot(places[..., 0], places[..., 1])[..., None]
+        length = 2 * self.radius * np.tan(np.radians(np.minimum(theta, MAX_DRAWN_ANGLE)) / 2)
+        return length / np.where(theta > 0, theta, 1.0) * places
+
+    def outline_in(self, other: Chart, outline: Outline) -> Outline:
+        """Return the outline of the same directions: coordinates are proportional to R."""
+        assert isinstance(other, SphereChart)
+        return outline.scaled(other.radius / self.radius)

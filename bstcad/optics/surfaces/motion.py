@@ -16,6 +16,11 @@ from bstcad.optics.surfaces.rays import Vector
 ORIGIN: Vector = (0.0, 0.0, 0.0)  # origin, mm
 
 
+def along_axis(axis: int, amount: float) -> Vector:
+    """Return the vector with the component `amount` along an axis (0 to 2), else zeros."""
+    return (amount, 0.0, 0.0) if axis == 0 else (0.0, amount, 0.0) if axis == 1 else (0.0, 0.0, amount)
+
+
 @dataclass(frozen=True, eq=False)
 class Motion:
     """Rigid motion of points x -> p + R (x - p) + t: a rotation R about p, then a shift t."""

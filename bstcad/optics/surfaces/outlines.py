@@ -21,6 +21,7 @@ STRICT = {"extra": "forbid", "arbitrary_types_allowed": True, "revalidate_instan
 # are boxes with round corners; a circle (a = b = 0) and a rectangle (r = 0) are the limiting cases.
 Limits = tuple[float, float, float]
 SIZE_RANGE = (1e-3, 1e6)  # smallest and largest width, height or radius of an outline in a scene, mm
+POINTS_AROUND = 361  # points once around an outline, one per degree; the last is the first
 OUTLINE_POINTS = 720  # rim points on all arcs of an outline together, and about as many on all its straight sides
 
 
@@ -66,6 +67,15 @@ class _Box(ABC):
         sides.append((np.sign(x) * a + r * x, np.sign(y) * b + r * y))
         x, y = (np.concatenate(each) for each in zip(*sides, strict=True))
         return x, y
+
+    def around(self, count: int = POINTS_AROUND) -> np.ndarray:
+        """Return points (count, 2) (mm) around the rim from its end at +x, counterclockwise; the last is the first.
+
+        They lie at equal angles of a circle, or of the arcs of round corners; sharp corners are points themselves.
+        """
+        (a, b, r2), turn = self.limits, np.linspace(0, 2 * np.pi, count)
+        cos, sin, r = np.cos(turn), np.sin(turn), math.sqrt(r2)
+        return np.stack([np.sign(cos) * a + r * cos, np.sign(sin + 1e-12) * b + r * sin], axis=1)
 
     def inset_direction(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the shift (x, y) of rim points per mm of inset: inward normal; on a rectangle 2a x 2b (-x/a, -y/b)."""

@@ -35,11 +35,11 @@ from torch import Tensor
 
 from bstcad.optics.numerics.reductions import elementary
 from bstcad.optics.surfaces.bspline import BSplineSurface, evaluate, interpolating_net
-from bstcad.optics.surfaces.charts import SphereChart
-from bstcad.optics.surfaces.motion import Motion
-from bstcad.optics.surfaces.outlines import Circle, Outline
+from bstcad.optics.surfaces.charts import Chart, SphereChart
+from bstcad.optics.surfaces.motion import Motion, along_axis
+from bstcad.optics.surfaces.outlines import POINTS_AROUND, Circle, Outline
 from bstcad.optics.surfaces.rays import Rays
-from bstcad.optics.surfaces.surfaces import Surface
+from bstcad.optics.surfaces.surfaces import Patch, Surface, Vectors, points_on
 
 NEWTON_STEPS = 20  # maximum number of Newton steps, after which a ray misses; a smooth dome needs 3 to 5
 FLATTEST = 0.05  # lowest start of the search for the height over a point (x, y), as a fraction of R
@@ -51,6 +51,8 @@ APPROACH_COSINE = 1e-2  # smallest cosine of incidence at which Newton's method 
 DIRECTION_TOLERANCE = 1e-9  # largest distance of control points from their directions, as a fraction of R
 CARRYING_STEPS = 6  # corrections of the distances of a surface after a small motion
 DIRECTION_STEPS = 4  # corrections of (x, y) by which the surface is found in a given direction
+SILHOUETTE_RINGS = 181  # number of angles from the axis among which the silhouette is searched
+STANDOFF = 0.01  # distance before the surface at which rays to it start, as a fraction of R
 ROOT_TOLERANCE = 64  # distance from the ray at which the search ends, in units of R times the precision of the numbers
 
 
@@ -62,19 +64,6 @@ class Met(NamedTuple):
     x: Tensor  # coordinates in the chart, mm
     y: Tensor
     found: Tensor  # True for rays that meet the net
-
-
-class Patch(NamedTuple):
-    """Values of the surface at points."""
-
-    position: Tensor  # S - c, (3, …), mm
-    along_x: Tensor  # ∂S/∂x, (3, …)
-    along_y: Tensor  # ∂S/∂y, (3, …)
-
-    @property
-    def normal(self) -> Tensor:
-        """∂S/∂x × ∂S/∂y, outward."""
-        return cross(self.along_x, self.along_y)
 
 
 class RadialBounds(NamedTuple):
@@ -138,6 +127,11 @@ class RadialSurface(BSplineSurface):
         return SphereChart(self.radius)
 
     @property
+    def standoff(self) -> float:
+        """Distance (mm) before the surface at which a ray starts; points in a direction are known to the pitch²."""
+        return STANDOFF * self.radius
+
+    @property
     def directions(self) -> Tensor:
         """Unit vectors d_ij of the control points, (3, m, n), float64 on the CPU."""
         return _directions(self.x, self.y, self.shape, self.chart)
@@ -190,6 +184,14 @@ class RadialSurface(BSplineSurface):
         change = torch.from_numpy(interpolating_net((rho - before).numpy()))
         return replace(self, heights=self.heights + change.to(self.heights))
 
+    def shifted(self, axis: int, by: float, half: float) -> RadialSurface:
+        """Return the surface shifted by `by` (mm) along x (axis 0) or y (1); its net reaches beyond `half` as it is."""
+        return self.carried(Motion.of(shift=along_axis(axis, by)))
+
+    def tilted(self, axis: int, angle: float) -> RadialSurface:
+        """Return the surface rotated by a small angle (degrees) about x (axis 0) or y (1) through its vertex."""
+        return self.carried(Motion.of(turn=along_axis(axis, angle), about=(0.0, 0.0, self.vertex_z)))
+
     def control_points(self) -> np.ndarray:
         """Return the control net (m, n, 3) in mm, float64, x along the first axis."""
         rho = self.radius + self.heights.detach().cpu().double()
@@ -204,6 +206,12 @@ class RadialSurface(BSplineSurface):
         parts = [evaluate((self.radius + self.heights) * d, u, v) for d in directions]
         value, along_u, along_v = (torch.stack(same) for same in zip(*parts, strict=True))
         return Patch(value, along_u / self.pitch[0], along_v / self.pitch[1])
+
+    def position_and_normal(self, x: Tensor, y: Tensor) -> tuple[Vectors, Vectors]:
+        """Return the components of S - c (mm) and of ∂S/∂x × ∂S/∂y at (x, y) (mm) of the chart."""
+        patch = self.at(x, y)
+        (p_x, p_y, p_z), (n_x, n_y, n_z) = patch.position, patch.normal
+        return (p_x, p_y, p_z), (n_x, n_y, n_z)
 
     def relative_sag_and_slope(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return (distance from the centre - R in mm, ∂f/∂x, ∂f/∂y) at (x, y) (mm) of the chart; f: see charts.py."""
@@ -232,21 +240,69 @@ class RadialSurface(BSplineSurface):
         )
         return z, z_x, z_y
 
-    def plan(self, lit: Outline) -> Circle:
+    def opening(self, outline: Outline) -> Circle:
+        """Return the smallest circle about the axis (mm) around the rim over an outline of the chart."""
+        return Circle(float(np.hypot(*self.rim(outline)[:, :2].T).max()))
+
+    def plan(self, outline: Outline) -> Circle:
         """Return the smallest circle about the axis that holds the part inside an outline of the chart, along z."""
-        x, y = (torch.from_numpy(p) for p in lit.rim_points())
+        x, y = (torch.from_numpy(p) for p in outline.rim_points())
         a, b = (torch.cat([share * p for share in torch.linspace(0.5, 1.0, 26, dtype=torch.float64)]) for p in (x, y))
         position = self.plain().at(a, b).position
         return Circle(float(torch.hypot(position[0], position[1]).max()))
 
+    def silhouette(self, outline: Outline, count: int = POINTS_AROUND) -> np.ndarray:
+        """Return points (count, 2) (mm) around the part inside a circle of the chart, seen along the axis."""
+        theta = np.linspace(0.0, self.chart.angle(circle_radius(outline), self.radius), SILHOUETTE_RINGS)
+        psi = np.linspace(0.0, 2 * math.pi, count)
+        points, _ = self.towards(theta[:, None], psi)
+        r = np.hypot(points[..., 0], points[..., 1]).max(axis=0)
+        return np.stack([r * np.cos(psi), r * np.sin(psi)], axis=1)
+
+    def section(self, outline: Outline, upright: bool, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return u and z (mm) of points at equal angles from the centre, see `Surface.section`."""
+        radius = circle_radius(outline)
+        ends = np.array([-radius, radius]), np.zeros(2)
+        rim = points_on(self, *(ends[::-1] if upright else ends)) - (0.0, 0.0, self.z)
+        low, high = np.arctan2(np.hypot(rim[:, 0], rim[:, 1]), rim[:, 2])
+        theta = np.linspace(-low, high, count)
+        points, _ = self.towards(np.abs(theta), np.where(theta < 0, math.pi, 0.0) + upright * math.pi / 2)
+        return points[:, int(upright)], points[:, 2]
+
+    def towards(self, theta: np.ndarray, psi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the points (…, 3) (mm) in directions from the centre, and the unit normals (…, 3) there.
+
+        theta, psi: angle from +z, and azimuth from +x towards +y (rad).  ValueError if there is no point.
+        """
+        theta, psi = np.broadcast_arrays(theta, psi)
+        sin = np.sin(theta)
+        along = torch.from_numpy(np.stack([sin * np.cos(psi), sin * np.sin(psi), np.cos(theta)]))
+        flux, status = torch.ones(theta.shape, dtype=torch.float64), torch.zeros(theta.shape, dtype=torch.uint8)
+        met = self.plain().meet(Rays(torch.zeros_like(along), along, flux, status, z=self.z))
+        if not bool(met.found.all()):
+            raise ValueError("lens.back: the dome has no point in some directions; reduce lens.back.half_angle")
+        unit = met.normal / torch.sqrt((met.normal * met.normal).sum(0))
+        points, normals = (np.moveaxis(part.numpy(), 0, -1).copy() for part in (met.position, unit))
+        points[..., 2] += self.z
+        return points, normals
+
+    def in_chart(self, chart: Chart) -> RadialSurface:
+        """Return the surface in the chart of another radius, with the same directions of its control points.
+
+        The coordinates of a chart are proportional to its radius R, and the distances R + h do not depend on it.
+        """
+        if not isinstance(chart, SphereChart):
+            return super().in_chart(chart)
+        factor = chart.radius / self.radius
+        (x0, x1), (y0, y1) = self.x, self.y
+        heights = self.heights + (self.radius - chart.radius)
+        x, y = (factor * x0, factor * x1), (factor * y0, factor * y1)
+        return replace(self, heights=heights, x=x, y=y, radius=chart.radius)
+
     def sags(self, outline: Outline) -> tuple[float, float]:
         """Return the lowest and highest z (mm) over the centre of the control points that act inside the outline."""
-        (pitch_x, pitch_y), net = self.pitch, self.control_points()
-        along = (
-            torch.linspace(*ends, m, dtype=torch.float64) for ends, m in zip((self.x, self.y), self.shape, strict=True)
-        )
-        x, y = torch.meshgrid(*along, indexing="ij")
-        x, y = ((p.abs() - 2 * pitch).clamp(min=0) for p, pitch in ((x, pitch_x), (y, pitch_y)))
+        net = self.control_points()
+        x, y = ((p.abs() - 2 * pitch).clamp(min=0) for p, pitch in zip(self.places, self.pitch, strict=True))
         z = net[..., 2][outline.contains(x, y).numpy()] - self.z
         return min(float(z.min()), 0.0), max(float(z.max()), 0.0)
 
@@ -383,6 +439,13 @@ class RadialSurface(BSplineSurface):
         return x, y, self.radius + h
 
 
+def circle_radius(outline: Outline) -> float:
+    """Return the radius (mm, in the chart) of the outline of a radial surface; ValueError unless it is a circle."""
+    if not isinstance(outline, Circle):
+        raise ValueError(f"lens.outline: {outline.words} is not a circle; give a dome a circle in its chart")
+    return float(outline.radius)
+
+
 @lru_cache(maxsize=8)  # the distances change in tailoring, the directions do not
 def _directions(x: tuple[float, float], y: tuple[float, float], sides: tuple[int, int], chart: SphereChart) -> Tensor:
     along = (torch.linspace(*ends, m, dtype=torch.float64) for ends, m in zip((x, y), sides, strict=True))
@@ -399,11 +462,6 @@ def path_to_sphere(origin: Tensor, along: Tensor, radius: Tensor | float) -> Ten
 def dot(p: Tensor, q: Tensor) -> Tensor:
     """Return the dot product of vectors (3, …)."""
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
-
-
-def cross(p: Tensor, q: Tensor) -> Tensor:
-    """Return the cross product of vectors (3, …)."""
-    return torch.stack([p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]])
 
 
 def across(along: Tensor) -> tuple[Tensor, Tensor]:

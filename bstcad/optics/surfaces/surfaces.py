@@ -9,22 +9,47 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import Field, dataclass, replace
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from bstcad.optics.surfaces.charts import HEIGHTS, Chart
-from bstcad.optics.surfaces.outlines import STRICT, Circle, Outline
+from bstcad.optics.surfaces.outlines import POINTS_AROUND, STRICT, Circle, Outline
 from bstcad.optics.surfaces.rays import Rays
 
 MIN_COS2 = 1e-6  # 1 - (1 + k) c² r² (for a sphere cos² of the slope angle) up to which a surface is too steep
 MIN_ARRIVAL_COSINE = 1e-3  # smallest cosine with the axis by which a height is divided
+RIM_POINTS = 1440  # number of points of a rim at which its height and its distance from the axis are examined
+
+
+Vectors = tuple[Tensor, Tensor, Tensor]  # components x, y and z of vectors
+
+
+class Patch(NamedTuple):
+    """Positions and tangents of a surface S at points (x, y) of its chart."""
+
+    position: Tensor  # S - (0, 0, z), (3, …), mm
+    along_x: Tensor  # ∂S/∂x, (3, …)
+    along_y: Tensor  # ∂S/∂y, (3, …)
+
+    @property
+    def normal(self) -> Tensor:
+        """∂S/∂x × ∂S/∂y, along +z or outward, not of unit length."""
+        return cross(self.along_x, self.along_y)
+
+
+def cross(p: Tensor, q: Tensor) -> Tensor:
+    """Return the cross product of vectors (3, …)."""
+    return torch.stack([p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]])
 
 
 class Surface(ABC):
-    """Surface given by its height z over (x, y); lengths in mm.  A subclass is a frozen dataclass."""
+    """Surface given by its height z over (x, y); lengths in mm.  A subclass is a frozen dataclass.
+
+    A surface with another `chart` is a function of the chart's coordinates, and so are the outlines of its face.
+    """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
     z: float  # z of the vertex (mm); for a net, z of the plane from which its heights are measured
@@ -43,6 +68,11 @@ class Surface(ABC):
     def detail(self) -> float:
         """Width of the smooth pieces of the surface (mm); infinite if it is smooth everywhere."""
         return math.inf
+
+    @property
+    def standoff(self) -> float:
+        """Distance (mm) before the surface at which a ray to a point (x, y) of it starts: 0, for the point is exact."""
+        return 0.0
 
     @property
     def optical(self) -> Surface:
@@ -67,6 +97,51 @@ class Surface(ABC):
         """Return (z in mm, ∂z/∂x, ∂z/∂y) at (x, y) in mm."""
         h, z_x, z_y = self.relative_sag_and_slope(x, y)
         return self.z + h, z_x, z_y
+
+    def at(self, x: Tensor, y: Tensor) -> Patch:
+        """Return positions and tangents at (x, y) (mm) of the chart: (x, y, h), (1, 0, ∂z/∂x) and (0, 1, ∂z/∂y)."""
+        h, z_x, z_y = self.relative_sag_and_slope(x, y)
+        one, zero = torch.ones_like(h), torch.zeros_like(h)
+        return Patch(torch.stack([x, y, h]), torch.stack([one, zero, z_x]), torch.stack([zero, one, z_y]))
+
+    def position_and_normal(self, x: Tensor, y: Tensor) -> tuple[Vectors, Vectors]:
+        """Return the components of S - (0, 0, z) (mm) and of ∂S/∂x × ∂S/∂y at (x, y) (mm) of the chart; see `at`."""
+        h, z_x, z_y = self.relative_sag_and_slope(x, y)
+        return (x, y, h), (-z_x, -z_y, torch.ones_like(h))
+
+    def rim(self, outline: Outline) -> np.ndarray:
+        """Return points (n, 3) (mm) of the surface along an outline of its chart, at equal angles."""
+        return points_on(self, *outline.around(RIM_POINTS + 1)[:-1].T)
+
+    def opening(self, outline: Outline) -> Outline:
+        """Return the smallest outline, seen along the axis (mm), around the surface's rim over an outline."""
+        return outline
+
+    def plan(self, outline: Outline) -> Outline:
+        """Return the smallest outline, seen along the axis (mm), around the surface inside an outline of its chart."""
+        return outline
+
+    def silhouette(self, outline: Outline, count: int = POINTS_AROUND) -> np.ndarray:
+        """Return points (count, 2) (mm) around the surface inside an outline of its chart, seen along the axis.
+
+        The last point is the first.
+        """
+        return outline.around(count)
+
+    def section(self, outline: Outline, upright: bool, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return u and z (mm) of `count` points of the surface in a plane through the axis, from rim to rim.
+
+        upright: the plane x = 0 with u = y, else the plane y = 0 with u = x.  outline: outline in the chart.
+        """
+        half = outline.half_extent[upright]
+        u = np.linspace(-half, half, count)
+        return u, sag(self, 0.0 * u, u) if upright else sag(self, u, 0.0 * u)
+
+    def in_chart(self, chart: Chart) -> Self:
+        """Return the same surface in another chart of its kind; ValueError if its chart is of another kind."""
+        if type(self.chart) is not type(chart):
+            raise ValueError("the back is not of the designed kind; generate the design again")
+        return self
 
     def reaches(self, x: Tensor, y: Tensor) -> Tensor:
         """Return True where the surface has a point over (x, y)."""
@@ -136,6 +211,30 @@ def sampled(surface: Surface, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray, n
 def sag(surface: Surface, x: Any, y: Any) -> np.ndarray:
     """Return z (mm) of a surface at points (mm), as `sampled` does."""
     return sampled(surface, x, y)[0]
+
+
+def points_on(surface: Surface, x: Any, y: Any) -> np.ndarray:
+    """Return the points (…, 3) (mm) of a surface at (x, y) (mm) of its chart, in float64."""
+    return _in_space(surface, surface.plain().at(*_tensors(x, y)).position)
+
+
+def points_and_normals(surface: Surface, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (…, 3) (mm) and unit normals (…, 3), along +z or outward, at (x, y) (mm) of the chart."""
+    patch = surface.plain().at(*_tensors(x, y))
+    normal = patch.normal
+    unit = normal / torch.sqrt((normal * normal).sum(0))
+    return _in_space(surface, patch.position), np.moveaxis(unit.numpy(), 0, -1)
+
+
+def _tensors(x: Any, y: Any) -> tuple[Tensor, Tensor]:
+    a, b = (torch.from_numpy(np.require(p, float, ["C", "W"])) for p in np.broadcast_arrays(x, y))
+    return a, b
+
+
+def _in_space(surface: Surface, position: Tensor) -> np.ndarray:
+    points = np.moveaxis(position.numpy(), 0, -1).copy()
+    points[..., 2] += float(surface.z)
+    return points
 
 
 class _Revolved(Surface):

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics.lens.domes import is_radial
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.numerics.reductions import total
@@ -26,7 +25,6 @@ from bstcad.optics.surfaces.sampling import point_pairs
 from bstcad.optics.trace import tubes
 from bstcad.optics.trace.trace import behind, through
 
-STEP_BACK = 0.01  # distance before a dome at which rays start, as a fraction of its radius
 MAX_IMAGE_RAYS = 1 << 17  # maximum rays of the images of a source that are traced at a time, which limits the memory
 IMAGE_POINTS_PER_SIDE = 48  # number of points per side of the back face through which the source is imaged
 # Largest distance of landing light from the screen's centre, divided by (longer side of the screen + median distance).
@@ -128,17 +126,15 @@ def _through(channels: Sequence[Channel], lens: Lens, screen: Screen, x: Tensor,
     lens = channels[0].through(lens)
     p, q, rays = tubes.rays_to([channel.source for channel in channels], lens, x, y)
     last = replace(lens.unbounded(), losses=None).interfaces[lens.number_of("back") :]
-    dome = lens.back
-    if is_radial(dome):  # its points in given directions are known to the square of the pitch: start before the face
-        rays = replace(rays, position=rays.position - STEP_BACK * dome.radius * rays.direction)
-    [landed] = through(rays, last, [screen.plane])
+    rays = replace(rays, position=rays.position - lens.back.standoff * rays.direction)
+    [landed] = through(rays, last, [screen.receiver])
     centre = tubes.middle(p), tubes.middle(q)
     cells = zip(channels, *centre, strict=True)
     density = [each.weight * each.source.irradiance(x, y, lens.entrance.z) for each, x, y in cells]
     flux = torch.stack(density) * tubes.area_of(p, q)
     if lens.passes.sense > 0:  # light comes to the front
         enters = lens.apertures[0].contains(*centre)
-        if is_radial(dome):  # the centres of the cells lie on the sphere of the dome
+        if not lens.back.chart.flat:  # the centres of the cells lie on the sphere from which the light is launched
             cells = zip(channels, *centre, strict=True)
             coming = [each.source.rays_through(x, y, lens.entrance.z, 1.0) for each, x, y in cells]
             enters = torch.stack([behind(rays, lens.interfaces[0]).alive for rays in coming])

@@ -40,7 +40,7 @@ def nominal(small_design):
 
 @pytest.fixture(scope="module")
 def light(nominal):
-    return measure(nominal.lens, nominal.channels, nominal.goals[0].receiver, nominal.goals[0].picture, EFFORT)
+    return measure(nominal.lens, nominal.channels, nominal.goals[0].screen, nominal.goals[0].picture, EFFORT)
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_the_form_error_is_recovered_and_its_light_predicted(nominal, light):
     found = part.deviation.form.ravel()
     assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.05 * np.sqrt(np.mean(wanted**2))
     assert part.facts["noise"] == pytest.approx(2e-5, rel=0.05)
-    rrmsd = measure(made, nominal.channels, nominal.goals[0].receiver, nominal.goals[0].picture, EFFORT).rrmsd
+    rrmsd = measure(made, nominal.channels, nominal.goals[0].screen, nominal.goals[0].picture, EFFORT).rrmsd
     assert rrmsd > 1.5 * light.rrmsd
     assert part.facts["rrmsd_predicted"] == pytest.approx(rrmsd, rel=0.05)
     assert part.facts["rrmsd_high"] >= part.facts["rrmsd_predicted"]

@@ -12,7 +12,7 @@ import torch
 
 from bstcad.optics.lens import interfaces
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.numerics import compiling
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
@@ -94,7 +94,7 @@ def test_loops_over_few_elements_have_one_thread():
     assert done.stdout.strip() == "[({1}, 2), ({2}, 2)] omp", done.stderr
 
 
-SOURCE, SCREEN = Point((0.0, 0.0, -40.0), "lambertian"), Screen(400.0, (-80.0, 80.0), (-80.0, 80.0), (8, 8))
+SOURCE, SCREEN = PointSource((0.0, 0.0, -40.0), "lambertian"), Screen(400.0, (-80.0, 80.0), (-80.0, 80.0), (8, 8))
 CHANGED = {  # constant: (where it stands, a value that no ray can fail to feel)
     "NEWTON_STEPS": (interfaces, 1),
     "APPROACH_STEPS": (interfaces, 0),
