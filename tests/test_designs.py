@@ -160,6 +160,7 @@ def net(design, **more):
 
 
 class TestTransport:
+    @suite.in_turn(1, 3)
     def test_light_from_there_lands_where_the_map_says(self, made):
         """The finished lens traced: within a tenth of a pixel of 0.94 mm inside the lit disc."""
         sent, lens, source = made.transport, made.lens, made.scene.source
