@@ -1,8 +1,9 @@
 # make lens    the environment if needed, then the lens of templates/thu.toml in outputs/thu
-# make test    the environment if needed, then the suite, in two processes; with ROOM=optics tests/optics alone, with
+# make test    the environment if needed, then the daily suite, in two processes; with ROOM=optics tests/optics alone
+# make test-all   the daily suite, the tests marked thorough, and the shares of the samples that other commits run; with
 #              DURATIONS=1 it keeps how long each file takes in tests/durations.json, by which the suite is shared out
-# make test-fast    the same without the files of the suite that take 5 s or longer: two minutes
-# make coverage   the suite, and how much of the package its lines have run
+# make test-rest  of what make test-all adds, one test of four, chosen by the commit's hash, each named
+# make coverage   all these tests, and how much of the package its lines have run
 # make bench   what accuracy costs in time
 # make accuracy   what accuracy costs in time on the full-size scenes: records what is missing or of another version, and
 #              writes docs/accuracy.md and its figures; with ONLY="thu-* mitsuba" records these (python -m
@@ -22,7 +23,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: lens test test-fast coverage bench accuracy published effects tradeoff stability docs wheel lint
+.PHONY: lens test test-all test-rest coverage bench accuracy published effects tradeoff stability docs wheel lint
 
 lens: $(READY)
 	$(BIN)/python generate_lens.py templates/thu.toml
@@ -32,14 +33,19 @@ lens: $(READY)
 TEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder \
     $(if $(ROOM),$(wildcard tests/$(ROOM) tests/test_$(ROOM).py)) $(if $(DURATIONS),--record-durations)
 
+ALL = 'not slow and not bench'
+
 test: $(READY)
 	$(TEST)
 
-test-fast: $(READY)
-	$(TEST) --quick
+test-all: $(READY)
+	$(TEST) -m $(ALL)
+
+test-rest: $(READY)
+	$(TEST) -m 'thorough and not slow and not bench' --in-turn 4 -vv
 
 coverage: $(READY)
-	$(TEST) --cov --cov-report=term:skip-covered
+	$(TEST) -m $(ALL) --cov --cov-report=term:skip-covered
 
 bench: $(READY)
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev,judges]'

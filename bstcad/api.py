@@ -27,10 +27,10 @@ from bstcad.commands import OwnCheck, OwnSection, ProofOptions
 from bstcad.designs import folder as folders
 from bstcad.designs import pipeline
 from bstcad.designs.course import BY_HAND, DesignCourse
-from bstcad.designs.folder import Made, same_front
+from bstcad.designs.made import Made, same_front
 from bstcad.figures.drawing import png
 from bstcad.figures.light_figures import View, irradiance_triptych
-from bstcad.manufacture.measured.compensation import Settings as CompensationSettings
+from bstcad.manufacture.measured.compensation import CompensationSettings as CompensationSettings
 from bstcad.manufacture.shop.as_built import AsBuilt
 from bstcad.manufacture.shop.rounds import Compensated
 from bstcad.optics.lens.lens import Lens
@@ -451,7 +451,7 @@ class Design:
         if self.report is not None:
             return self.report.irradiances[number]
         goal = self._made.goals[number]
-        found = tubes_picture(self.lens, self.scene.channels(), goal.receiver, PREVIEW_TUBES).numpy()
+        found = tubes_picture(self.lens, self.scene.channels(), goal.screen, PREVIEW_TUBES).numpy()
         return found * (goal.picture.sum() / found.sum())
 
 

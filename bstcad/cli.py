@@ -52,7 +52,7 @@ with signals.exit_on_signal():  # loading these libraries takes a quarter of a s
         KeyName,
         Kinds,
         Layer,
-        Light,
+        LightOption,
         Listed,
         LitAt,
         LitByLight,
@@ -329,7 +329,7 @@ def plan(
 
 @app.command(epilog=examples("new my-lens --picture photo.jpg --size 80 --distance 400", "new lamp --template led"))
 def new(
-    name: Name = None, picture: Picture = None, light: Light = None, size: Size = None, distance: Distance = None,
+    name: Name = None, picture: Picture = None, light: LightOption = None, size: Size = None, distance: Distance = None,
     template: Template = None, listed: Listed = False,
 ) -> int:  # fmt: skip
     """Write a new scene file with comments: a plate that projects a picture on a wall, or a copy of a template."""
@@ -394,7 +394,7 @@ def compensate(
     folder: Folder, measured: Clouds, gain: Gain = None, cutoff: Cutoff = None, by: By = "form"
 ) -> int:  # fmt: skip
     """Write the back to cut next, from measured points of the parts that were cut last."""
-    from bstcad.manufacture.measured.compensation import Settings as CompensationSettings
+    from bstcad.manufacture.measured.compensation import CompensationSettings as CompensationSettings
 
     processes.begin()
     commands = load_commands()
@@ -604,9 +604,9 @@ def schema() -> int:
 
     Save the schema beside a scene file, whose first line is then: #:schema scene.schema.json
     """
-    from bstcad.scene.schema import FILE
+    from bstcad.scene.schema import schema_text
 
-    print(FILE.read_text(encoding="utf-8"), end="")
+    print(schema_text(), end="")
     return 0
 
 

@@ -69,7 +69,7 @@ Resume = option(bool, None, "Continue the stopped or killed design from the chec
 AsJson = option(bool, None, "Print the result as JSON, for programs.", "--json")
 Name = argument(str | None, "NAME", "Name of the scene; NAME.toml is written.")
 Picture = option(Path | None, "FILE", "Picture that the plate projects on a wall.")
-Light = option(str | None, "L", "Light source of the plate: sun, laser, lamp or led (default: laser).")
+LightOption = option(str | None, "L", "Light source of the plate: sun, laser, lamp or led (default: laser).")
 Size = option(
     str | None, "MM", "Size of the plate: 80 (default), 80x60 (width x height) or 120xphoto (proportions of the photo)."
 )

@@ -28,7 +28,7 @@ from bstcad.cad.tiling import Tiling
 from bstcad.designs import folder as folders
 from bstcad.designs.as_designed import scene_text
 from bstcad.designs.course import StageRecord
-from bstcad.designs.folder import Made
+from bstcad.designs.made import Made
 from bstcad.designs.pipeline import DesignState, design, purpose
 from bstcad.exports import data_sheet, exports
 from bstcad.exports.data_sheet import DataSheet
@@ -40,12 +40,12 @@ from bstcad.figures.drawing import png as rendered
 from bstcad.figures.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, draw_wavefront, light_path_of
 from bstcad.figures.light_figures import View, changed_picture, draw_judges, draw_part
 from bstcad.figures.photometric_figures import draw_isolux, far_field_of
-from bstcad.figures.rendering import LightPath
+from bstcad.figures.rendering import RayPath
 from bstcad.manufacture.measured import cloud as clouds
 from bstcad.manufacture.measured import made_part
 from bstcad.manufacture.measured.cloud import Cloud
 from bstcad.manufacture.measured.compensation import USUAL
-from bstcad.manufacture.measured.compensation import Settings as CompensationSettings
+from bstcad.manufacture.measured.compensation import CompensationSettings as CompensationSettings
 from bstcad.manufacture.measured.form_error import map_files
 from bstcad.manufacture.shop import as_built, rounds
 from bstcad.manufacture.shop.as_built import AsBuilt, Retailored
@@ -659,7 +659,7 @@ def show(folder: Path, png: Path | None) -> None:
         files.put(png, drawn.read_bytes())
 
 
-def light_path_in(folder: Path) -> LightPath:
+def light_path_in(folder: Path) -> RayPath:
     """Return the lens in a folder, rays through it, and its pictures; SceneError if no light reaches the target."""
     scene, nominal = folders.read_nominal(folder)
     wanted, irradiances = (goal.picture for goal in nominal.goals), folders.read_irradiances(folder, scene)

@@ -4,26 +4,24 @@ And one small design, made once a session: every step of the main job on real ge
 """
 
 import gc
-import json
 import os
 import pickle
 import shutil
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-if beside := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):  # they share the cores: a tenth less time in all
-    for library in ("OMP", "OPENBLAS"):
+# Worker processes, and the processes that they start, share the cores.  A second thread for a core that is busy is
+# waited for at each parallel region: 20 ms, where one thread needs 6 µs (1000 elements, beside eight busy processes).
+if beside := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):
+    for library in ("OMP", "OPENBLAS", "NUMBA"):
         os.environ.setdefault(f"{library}_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // beside)))
 
-from collections import Counter
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-DURATIONS = Path(__file__).with_name("durations.json")  # seconds of each test file that takes more than one
-SLOW = 5  # seconds; the files below it take two minutes together
-SPENT = pytest.StashKey[Counter]()
+pytest_plugins = ["tests.suite"]
 DISK = Path(__file__).parent.parent / "templates" / "disk.toml"
 SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tolerance
     "name": "small",
@@ -44,50 +42,6 @@ SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tole
     "tailoring.stage2_iterations": 30,  # two rounds
     "tailoring.transport_grid": 64,
 }
-
-
-def pytest_addoption(parser):
-    parser.addoption("--record-durations", action="store_true", help="keep the seconds of each file for the scheduler")
-    parser.addoption("--quick", action="store_true", help=f"leave out the files that take {SLOW} s or longer")
-
-
-def pytest_ignore_collect(collection_path, config):
-    if config.getoption("--quick") and collection_path.is_relative_to(config.rootpath):
-        name = collection_path.relative_to(config.rootpath).as_posix()
-        return True if json.loads(DURATIONS.read_text()).get(name, 0.0) >= SLOW else None
-
-
-def pytest_configure(config):
-    config.stash[SPENT] = Counter()
-    config.pluginmanager.register(Spent(config.stash[SPENT]))
-
-
-class Spent:
-    """Adds up the seconds of each file."""
-
-    def __init__(self, spent):
-        self.spent = spent
-
-    def pytest_runtest_logreport(self, report):
-        self.spent[report.nodeid.partition("::")[0]] += report.duration
-
-
-def pytest_sessionfinish(session):
-    if session.config.getoption("--record-durations") and not hasattr(session.config, "workerinput"):
-        spent = session.config.stash[SPENT]
-        known = json.loads(DURATIONS.read_text())
-        known = {
-            file: s for file, s in known.items() if file not in spent and Path(session.config.rootpath, file).exists()
-        }
-        known |= {file: round(seconds, 1) for file, seconds in spent.items() if seconds > 1}
-        DURATIONS.write_text(json.dumps(dict(sorted(known.items())), indent=1) + "\n")
-
-
-def pytest_collection_modifyitems(config, items):
-    """Several processes take the longest files first (xdist keeps this order with --no-loadscope-reorder)."""
-    if hasattr(config, "workerinput"):
-        seconds = json.loads(DURATIONS.read_text())
-        items.sort(key=lambda item: -seconds.get(item.nodeid.partition("::")[0], 0.0))
 
 
 def pytest_collection_finish():

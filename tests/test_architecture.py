@@ -41,9 +41,9 @@ MAY_IMPORT = {
     "optics.trace": {"optics"},
     "photometry": {"runs", "optics"},  # transliterated names; the hash by which rays are drawn
     "transport": {"runs"},  # the cache of kernels
-    "scene": {"runs", "optics", "photometry", "step_text"},
-    "tailoring": {"scene", "optics", "transport"},
-    "tailoring.baselines": {"scene", "optics", "transport", "tailoring"},
+    "tailoring": {"runs", "optics", "transport"},
+    "tailoring.baselines": {"runs", "optics", "transport", "tailoring"},
+    "scene": {"runs", "optics", "photometry", "step_text", "tailoring"},
     "cad": {"runs", "scene", "optics", "step_text"},
     "analysis": {"optics", "photometry"},
     "verify": {"runs", "scene", "optics", "step_text", "cad", "analysis"},
@@ -266,11 +266,29 @@ def test_imports_keep_to_the_house():
     assert {file: wrong for file, wrong in found.items() if wrong} == {}
 
 
-def test_the_plan_of_the_house_has_this_table():
-    plan = (PACKAGE.parent / "docs" / "explanation" / "house.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| `([\w.]+)`[^|]*\| (.*) \|$", plan.partition("| part | may import")[2], re.M)
-    stated = {part: {*re.findall(r"`([\w.]+)`", others)} for part, others in rows if part in MAY_IMPORT}
-    assert stated == {part: may - {"bstcad"} for part, may in MAY_IMPORT.items() if part != "bstcad"}
+APPLICATIONS = {"report", "figures", "exports", "designs", "manufacture", "planning", "app", "commands"}
+
+
+def within(part):
+    """All parts that a part imports, directly or through others; `bstcad`, from which some take the version, aside."""
+    known, found = {*MAY_IMPORT} - {"bstcad"}, {each for each in MAY_IMPORT if each.split(".")[0] == part}
+    while more := {one for each in found for one in allowed_to(each) & known} - found:
+        found |= more
+    return found
+
+
+def test_the_method_stands_without_scenes_and_applications():
+    method = {"runs", "optics", "transport", "tailoring"}
+    for part in ("optics", "transport", "tailoring"):
+        assert {each.split(".")[0] for each in within(part)} <= method, part
+    for part in ("cad", "step_text", "verify"):
+        assert not {each.split(".")[0] for each in within(part)} & APPLICATIONS, part
+    files = [file for file in SOURCES if names_of(file)[0] in ("optics", "transport", "tailoring")]
+    modules = [".".join(("bstcad", *names_of(file))) for file in files]
+    loads = f"import sys, importlib; [*map(importlib.import_module, {modules})]; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", loads], capture_output=True, text=True, check=True).stdout.split()
+    assert {*modules} <= {*loaded}
+    assert not {"pydantic", "tomli_w", "tomlkit", "PIL", "bstcad.scene", "OCP"} & {*loaded}
 
 
 def test_every_library_that_is_imported_is_declared():
@@ -350,6 +368,7 @@ def test_nothing_that_is_read_is_run():
 
 # Where a product is no dense one that BLAS divides among threads as it likes, and why.
 PRODUCTS = {
+    "optics/receivers/irradiance.py": "by sparse matrices",
     "optics/surfaces/bspline.py": "of sparse matrices",
     "optics/surfaces/motion.py": "of 3 x 3 numbers; nothing that tailors a lens moves",
     "tailoring/net_variables.py": "of sparse matrices",

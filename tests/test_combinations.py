@@ -49,8 +49,10 @@ from bstcad.planning.preview import PreviewSize, preview
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import as_front, net_extent
 from bstcad.scene.lamp import IntensityFile, RayFile
-from bstcad.tailoring.run import stage_effort
+from bstcad.tailoring import effort as efforts
+from bstcad.tailoring.effort import TailoringEffort
 from bstcad.tailoring.stage2 import PrecisionComparison
+from tests import suite
 from tests.conftest import verify_with
 from tests.planning.conftest import typical_pilot
 
@@ -414,22 +416,21 @@ def scene_with(first, holding, chance):
     return scene
 
 
-def holding_each_value(scenes):
-    """Return the numbers of few scenes that together hold each value that occurs (greedy cover)."""
+def holding_each_value(scenes, first=0):
+    """Return the numbers of few scenes that together hold each value that occurs (greedy cover, from the `first`)."""
     missing, found = {value for scene in scenes for value in scene.items()}, []
+    order = [*range(first, len(scenes)), *range(first)]
     while missing:
-        new = [len(missing & scene.items()) for scene in scenes]
-        found.append(new.index(max(new)))
+        found.append(max(order, key=lambda k: len(missing & scenes[k].items())))
         missing -= scenes[found[-1]].items()
     return found
 
 
 PAIRS = covering(to_cover(2))
 PREVIEWED = holding_each_value(PAIRS)  # numbers of the scenes that are previewed
-PLANNED = [len(PAIRS) - 1 - k for k in holding_each_value(PAIRS[::-1])]  # numbers of the scenes that are planned
-HALF = len(PAIRS) // 2
-TURNED = holding_each_value(PAIRS[HALF:] + PAIRS[:HALF])
-RETAILORED = [(k + HALF) % len(PAIRS) for k in TURNED]  # numbers of the scenes with a blank as built
+PLANNED = holding_each_value(PAIRS, len(PAIRS) // 3)  # numbers of the scenes that are planned
+RETAILORED = holding_each_value(PAIRS, 2 * len(PAIRS) // 3)  # numbers of the scenes with a blank as built
+DAILY = holding_each_value(PAIRS, suite.turn(len(PAIRS)))  # numbers of the scenes of the daily suite
 TRIPLES = "light", "rim", "front"
 
 
@@ -466,16 +467,22 @@ MAY_REFUSE = (  # sentences of designs, and the choices that cannot be had toget
 COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which figures are found
     "optics.trace.measure": {"SETS": 4, "MIN_TUBES": 48, "MIN_SOURCE_POINTS": 2, "MAX_SOURCE_POINTS": 4},
     "scene.scene": {"VERIFICATION_POINTS": 4},
-    "tailoring.run": {
-        "FINE_EFFORT": Effort(48, accuracy=0.0, witness=False),
-        "STAGE_EFFORT": Effort(96, accuracy=0, witness=False),
-        "STAGE_EFFORT_PIXELS": 48,
-        "FLUX_EFFORT": Effort(32, accuracy=1.0, witness=False),
-        "WAVEFRONT_TUBES": 48,
+    "tailoring.effort": {
+        "FULL": TailoringEffort(
+            stage=Effort(96, accuracy=0, witness=False),
+            stage_pixels=48,
+            fine=Effort(48, accuracy=0.0, witness=False),
+            flux=Effort(32, accuracy=1.0, witness=False),
+            wavefront_tubes=48,
+            coarsest_grid=16,
+            trial_cells=24,
+            trial_pixels=32,
+            trial_iterations=20,
+            compared_tubes=16,
+            compared_evaluations=2,
+        )
     },
-    "tailoring.stage1": {"COARSEST_GRID": 16},
     "tailoring.slope_map.lit_window": {"__defaults__": (32,)},
-    "tailoring.stage2": {"COMPARED_EVALUATIONS": 2, "COMPARED_TUBES": 16},
     "tailoring.source_image": {
         "ERROR_RAYS": 32,
         "ERROR_POINTS": 4,
@@ -484,7 +491,6 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
         "IMAGE_PAIRS": 32,
     },
     "tailoring.machinability": {"THICKNESS_POINTS": 65, "QUARTER_RIM_POINTS": 129, "REPAIR_EVALUATIONS": 20},
-    "tailoring.feasibility": {"TRIAL_CELLS": 24, "TRIAL_PIXELS": 32, "TRIAL_ITERATIONS": 20},
     "analysis.light": {"MOUNT_RAYS": 48, "MIN_MOUNT_RAYS": 16, "MARGIN_RAYS": 64, "NEEDED_RAYS": 17},
     "analysis.light.blur": {"__defaults__": (12,)},
     "analysis.neglected_effects": {"FACE_POINTS": 24, "GHOST_RAYS_PER_SIDE": 16},
@@ -601,7 +607,7 @@ def _as_built(design):
     thickness = made.lens.back_net.vertex_z - made.lens.front.z + 0.02
     index = made.scene.index + 2e-3 if made.scene.lens.passes.enters else None
     found = as_built.retailor(made, AsBuilt(thickness=thickness, index=index))
-    again, effort = found.made, stage_effort(made.goals, as_built.RAYS)
+    again, effort = found.made, efforts.FULL.between_stages(made.goals, as_built.RAYS)
     after = max(light.rrmsd for light in again.lights(again.lens, again.goals, effort))
     if not after < 1.1 * max(found.design, found.before) + MAX_DIFFERENCE:
         yield f"as built: RRMSD {found.design:.3f} designed, {found.before:.3f} before, {after:.3f} after"
@@ -654,29 +660,18 @@ def test_a_refusal_names_both_keys(together, tmp_path, capsys):
     assert all(named.get(value, NAMED[choice]) in str(refusal.value) for choice, value in together)
 
 
-def test_each_value_is_previewed_planned_and_tailored_to_a_blank():
+def test_each_value_is_previewed_planned_and_tailored_to_a_blank_and_is_daily():
     all_values = {value for scene in PAIRS for value in scene.items()}
-    for numbers in (PREVIEWED, PLANNED, RETAILORED):
+    for numbers in (PREVIEWED, PLANNED, RETAILORED, DAILY):
         assert {value for k in numbers for value in PAIRS[k].items()} == all_values
         assert len(set(numbers)) == len(numbers) < len(PAIRS) / 4
 
 
-@pytest.mark.parametrize(
-    ("number", "chosen"),
-    list(enumerate(PAIRS)),
-    ids=[f"{chosen['light']}, {chosen['front']}, {chosen['rim']}" for chosen in PAIRS],
-)
-def test_each_pair(number, chosen, tmp_path):
-    assert (
-        faults(
-            chosen,
-            tmp_path / "out",
-            previewed=number in PREVIEWED,
-            planned=number in PLANNED,
-            retailored=number in RETAILORED,
-        )
-        == []
-    )
+@pytest.mark.parametrize("number", suite.daily(range(len(PAIRS)), DAILY))
+def test_each_pair(number, tmp_path):
+    kinds = {"previewed": PREVIEWED, "planned": PLANNED, "retailored": RETAILORED}
+    done = {kind: number in numbers for kind, numbers in kinds.items()}
+    assert faults(PAIRS[number], tmp_path / "out", **done) == [], PAIRS[number]
     gc.collect()
     gc.freeze()  # kernels and modules that it loaded stay: they are walked over once
 
@@ -690,13 +685,13 @@ MAX_HALF_RATIO_OF_ALL, MAX_HALF_OF_ALL = 2.5, 0.1  # both for every pair, after 
 
 
 @pytest.mark.parametrize(("wall", "picture"), [("square", "even"), ("directions", "letters")])
-@pytest.mark.parametrize("light", CHOICES["light"])
+@pytest.mark.parametrize("light", suite.in_turns(CHOICES["light"], 3))
 def test_each_light_is_right_inside_the_pixels(light, wall, picture):
     """Without cells in the merit, even light deviates by 0.05 on half pixels, and letters by 0.2."""
     scene = scene_of(PLAIN | {"light": light, "wall": wall, "picture": picture}).changed(DENSE)
     made = pipeline.design(scene, options=pipeline.DesignOptions(compare_later=True))
     effort = Effort(512, accuracy=0.0, witness=False, cells=2)
-    [found] = measure_goals(made.lens.plain(), scene.channels(), made.goals, effort, ghost=None, draw=scene.draw)
+    [found] = measure_goals(made.lens.plain(), scene.channels(), made.goals, effort, ghost=None, sampler=scene.sampler)
     noise = 3 * math.hypot(found.half.standard_error, MAX_HALF_RATIO * found.standard_error)
     assert found.half.rrmsd <= MAX_HALF_RATIO * found.rrmsd + MAX_HALF + noise
 
@@ -712,7 +707,7 @@ BODIES = {  # choices of a scene, by the body that it has
 }
 
 
-@pytest.mark.parametrize("body", BODIES)
+@pytest.mark.parametrize("body", suite.in_turns(BODIES, 4))
 def test_a_design_remains_the_design_of_its_folder(body, tmp_path):
     """Methods of a design work after it was written, opened, and written again: its net is equal to the last bit."""
     folder = tmp_path / "design"
@@ -754,10 +749,10 @@ def landed_by_snell(lens, source, receiver, grazing):
 
     At each point the face takes every slope up to 70 degrees at which no light leaves at more than `grazing`.
     """
-    number, law = lens.freeform[-1], lens.last_freeform.law
-    half = lens.last_freeform.outline.half_extent
+    number, law = lens.tailored_numbers[-1], lens.last_tailored.law
+    half = lens.last_tailored.outline.half_extent
     x, y = torch.meshgrid(*(torch.linspace(-h, h, 19, dtype=torch.float64) for h in half), indexing="ij")
-    inside = lens.last_freeform.outline.contains(x, y)
+    inside = lens.last_tailored.outline.contains(x, y)
     q_x, q_y, at = rays_to(source, lens, x=x, y=y, number=number)
     coming = source.rays_through(q_x, q_y, lens.entrance.z, 1.0)
     arriving = across(coming, lens.interfaces[:number]).alive & (source.irradiance(q_x, q_y, lens.entrance.z) > 0)
@@ -790,12 +785,14 @@ def landed_by_snell(lens, source, receiver, grazing):
         at, position=place, direction=turned[:, fine], status=torch.zeros(place.shape[1], dtype=torch.uint8),
         flux=torch.ones(place.shape[1], dtype=torch.float64), sense=sense, chart=HEIGHTS,
     )  # fmt: skip
-    landed = receiver.plane.land(across(few, lens.unbounded().interfaces[number + 1 :]))
+    landed = receiver.receiver.land(across(few, lens.unbounded().interfaces[number + 1 :]))
     column, row = receiver.pixels_of(landed.position[:, landed.alive])
     return column.floor().long(), row.floor().long()
 
 
-@pytest.mark.parametrize("number", range(len(REACHING)))
+@pytest.mark.parametrize(
+    "number", suite.daily(range(len(REACHING)), holding_each_value(REACHING, suite.turn(len(REACHING))))
+)
 def test_what_a_face_can_light_is_not_called_dark(number):
     """Rays by Snell's law from each point of the face, for every slope, agree with the closed form of `reachable_part`.
 
@@ -816,15 +813,15 @@ def test_what_a_face_can_light_is_not_called_dark(number):
     channels = scene.with_source_scaled(0.0).channels()
     light = max(channels, key=lambda channel: channel.weight)
     lens, grazing = light.through(scene.flat_lens(pipeline.REACH_NET)), math.radians(85.0)
-    if scene.source.extent and not lens.last_freeform.law.reverses:
+    if scene.source.extent and not lens.last_tailored.law.reverses:
         grazing = grazing_of(light.index, [each.index for each in channels], spread_at(scene.light, lens))
-    columns, rows = landed_by_snell(lens, light.source, goal.receiver, grazing)
-    there = (columns >= 0) & (columns < goal.receiver.columns) & (rows >= 0) & (rows < goal.receiver.rows)
-    lit = np.zeros(goal.receiver.shape, bool)
+    columns, rows = landed_by_snell(lens, light.source, goal.screen, grazing)
+    there = (columns >= 0) & (columns < goal.screen.columns) & (rows >= 0) & (rows < goal.screen.rows)
+    lit = np.zeros(goal.screen.shape, bool)
     lit[rows[there], columns[there]] = True
     called = np.ones_like(lit) if part is None else part
     assert lit.any() and not (lit & ~binary_dilation(called, iterations=3)).any()
-    if lens.last_freeform.law.reverses or scene.lens.front.is_tailored or scene.lens.front.free:
+    if lens.last_tailored.law.reverses or scene.lens.front.is_tailored or scene.lens.front.free:
         return  # the rays of one front, or of a mirror, do not land densely on all that can be lit
     whole = binary_dilation(binary_closing(np.pad(lit, 6), iterations=2), iterations=3)[6:-6, 6:-6]
     few = 0.01 if chosen["elements"] == "none" else 0.05  # a window shifts grazing light a little further

@@ -18,6 +18,7 @@ from bstcad.designs.pipeline import DesignOptions, design
 from bstcad.optics.trace.measure import Effort, measure
 from bstcad.optics.trace.wavefront_error import wavefront_error
 from bstcad.scene.scene import load
+from tests import suite
 
 PAGE = Path(__file__).parent.parent / "docs" / "how-to" / "two-faces.md"
 
@@ -183,7 +184,11 @@ def is_met(scene, lens):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name in DAILY else pytest.mark.bench) for name in DESIGNED]
+    "name",
+    [
+        *suite.in_turns(DAILY, 3),
+        *(pytest.param(name, marks=pytest.mark.bench) for name in DESIGNED if name not in DAILY),
+    ],
 )
 def test_a_system_of_the_table_is_designed(name, loaded):
     scene = loaded(DESIGNED[name])

@@ -166,7 +166,7 @@ class TestTransport:
         assert sent.source.shape == sent.target.shape == (65, 49, 2) and sent.source.dtype == np.float32
         x, y = torch.from_numpy(sent.source.astype(np.float64)).unbind(-1)
         x, y, _ = rays_to(source, lens, x, y)
-        landed = trace(source.rays_through(x, y, lens.entrance.z, 1.0), lens, made.scene.target.screen.plane)
+        landed = trace(source.rays_through(x, y, lens.entrance.z, 1.0), lens, made.scene.target.screen.receiver)
         off = np.linalg.norm(np.stack(landed.position[:2], axis=-1) - sent.target, axis=-1)
         inside = np.linalg.norm(sent.target, axis=-1) < 18
         assert np.percentile(off[inside], 95) < 0.1 and sent.target[inside].std() > 5

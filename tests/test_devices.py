@@ -18,10 +18,11 @@ from bstcad.optics.surfaces import bspline
 from bstcad.optics.trace import tubes
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
-from bstcad.tailoring import stage2
+from bstcad.tailoring import effort as efforts
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Hooks
 from bstcad.tailoring.stage2 import Problem
+from tests import suite
 from tests.conftest import pixels_of_all
 from tests.fake_device import SECOND, SecondDevice, on_second
 
@@ -50,7 +51,7 @@ QUICK = ("beam_shaper", "draft")
 @pytest.fixture(autouse=True)
 def _briefly_compared(monkeypatch):
     """Each design looks at float32 beside float64: by one evaluation here, which takes the way of all."""
-    monkeypatch.setattr(stage2, "COMPARED_EVALUATIONS", 1)
+    monkeypatch.setattr(efforts, "FULL", replace(efforts.FULL, compared_evaluations=1))
 
 
 BOUNDED = ("machinable_letters", "paper")  # the paper's procedure knows no bounds on the back
@@ -77,6 +78,7 @@ def test_a_design_mixes_no_devices_and_finds_the_lens_of_the_cpu(template, quali
     held_to_the_cpu(scene(template, quality), quality)
 
 
+@suite.in_turn(0, 2)
 def test_so_does_one_for_a_tilted_target_that_loses_light_on_the_way():
     metal = {"kind": "fresnel", "metal": "Al", "polarisation": "s"}
     wanted = scene(TEMPLATES[0].with_name("mirror.toml"), "draft")
@@ -137,6 +139,7 @@ def evaluated(wanted, heights):
     return value, torch.cat([gradient.reshape(-1) for gradient in gradients])
 
 
+@suite.in_turn(1, 2)
 @pytest.mark.parametrize("quality", [pytest.param("standard", marks=pytest.mark.bench), "paper"])
 def test_resume_brings_everything_back_to_the_device(quality, tmp_path):
     """States of every stage are read as from a file."""

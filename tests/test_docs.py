@@ -27,6 +27,7 @@ from bstcad.planning import batch
 from bstcad.planning import tradeoff as sweeping
 from bstcad.runs.processes import ExitStatus
 from bstcad.scene.scene import load
+from tests import suite
 from tests.conftest import draws_nothing, quick_effort, verify_with
 from tests.planning.conftest import Synthetic, typical_pilot
 
@@ -38,6 +39,7 @@ PAGES = [
     ROOT / "README.md",
     *sorted((ROOT / "docs").glob("tutorials/*.md")),
     *sorted((ROOT / "docs").glob("how-to/*.md")),
+    *sorted((ROOT / "docs").glob("explanation/*.md")),
     ROOT / "docs" / "reference" / "files.md",
 ]
 RUN = [page for page in PAGES if any(block.kind != "toml" for block in blocks(page))]
@@ -148,8 +150,17 @@ def run_command(words):
             runpy.run_path(arguments[0], run_name="__main__")
 
 
+def params(pages, **options):
+    return [pytest.param(page, id=name_of(page), **options) for page in pages]
+
+
+LONG_PAGES = [page for page in RUN if page.stem in LONG]
+SHORT_PAGES = [page for page in RUN[1:] if page.stem not in LONG]  # pages after the README, which runs at each commit
+
+
 @pytest.mark.parametrize(
-    "page", [pytest.param(page, marks=[pytest.mark.bench] * (page.stem in LONG)) for page in RUN], ids=name_of
+    "page",
+    [*params(RUN[:1]), *suite.in_turns(params(SHORT_PAGES), 4), *params(LONG_PAGES, marks=pytest.mark.bench)],
 )
 def test_its_blocks_run_one_after_the_other(page, workplace):
     for block in blocks(page):
@@ -221,6 +232,18 @@ def test_every_field_of_a_json_file_has_a_meaning():
     assert len(rows) > 100 and [name for name, meaning in rows if not meaning] == []
 
 
+def test_the_tables_of_the_house_name_each_part_and_the_kinds_of_each_noun():
+    from reference_pages import NOUNS, kinds, libraries, rooms
+
+    from tests.test_architecture import MAY_IMPORT, ONLY
+
+    parts = re.findall(r"^\| `([\w.]+)` \| [^|]{20,} \| [`n][^|]+ \|$", rooms(), re.M)
+    assert parts == [part for part in MAY_IMPORT if part != "bstcad"]
+    assert re.findall(r"^\| (\w+) \| `", libraries(), re.M) == list(ONLY)
+    found = dict(re.findall(r"^\| `(\w+)` \| `(\w+)` \| `[\w/.]+` \| [^|]{4,} \|$", kinds(), re.M))
+    assert found.keys() == set(NOUNS) and "`Point`" in kinds() and "`_" not in kinds()
+
+
 def test_the_site_is_complete_without_a_network():
     """Pages name no address from which a browser would fetch; those of links are no fetch."""
     for path in (*(ROOT / "docs").rglob("*.md"), ROOT / "docs" / "conf.py", *(ROOT / "docs" / "_static").iterdir()):
@@ -229,12 +252,28 @@ def test_the_site_is_complete_without_a_network():
             assert not re.search(r"!\[[^\]]*\]\(https?:|src=.https?:|@import|url\(.?https?:", text), path
 
 
-def test_the_guide_to_tolerances_names_every_error():
-    from bstcad.scene.quality import Name
+def test_the_table_of_arrays_has_those_of_a_design(small_design):
+    from reference_pages import arrays
 
-    text = (ROOT / "docs" / "how-to" / "tolerances.md").read_text(encoding="utf-8")
+    with np.load(small_design.folder / "design.npz") as stored:
+        shapes = {name: stored[name].ndim for name in stored.files}
+    listed = dict(re.findall(r"^\| `(\w+)` \| (\(.*?\)) \| .+ \|$", arrays(), re.M))
+    dimensions = {name: len([size for size in shape.strip("()").split(",") if size]) for name, shape in listed.items()}
+    assert len(shapes) >= 10 and shapes.items() <= dimensions.items()
+
+
+def test_the_table_of_grades_bounds_every_error_once_and_has_all_their_limits():
+    from reference_pages import grades
+
+    from bstcad.manufacture.tolerance.grades import GRADES
+    from bstcad.scene.quality import FINISH_KEYS, Name
+
     families = {name.removesuffix("_x").removesuffix("_y") for name in get_args(Name)}
-    assert families - set(re.findall(r"[`\"]([\w.]+)[`\"]", text)) == set()
+    rows = [row.split(" | ") for row in grades().splitlines()[2:]]
+    named = [name for row in rows for name in re.findall(r"`([\w.]+)`", row[1])]
+    assert sorted(named) == sorted({*families, *FINISH_KEYS})
+    [tilt] = [row for row in rows if "`lens.tilt`" in row[1]]
+    assert [float(value.rstrip(" |")) for value in tilt[2:]] == [grade.tilt for grade in GRADES.values()]
 
 
 def test_the_guide_to_checks_names_all_that_a_proof_tells_of_the_shape():

@@ -6,10 +6,8 @@ import re
 import shutil
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
-import torch
 
 import bstcad
 from bstcad import commands
@@ -21,9 +19,7 @@ from bstcad.manufacture.tolerance.study import StudySettings
 from bstcad.optics.surfaces.radial import RadialSurface
 from bstcad.optics.trace.measure import Effort
 from bstcad.scene.errors import SceneError
-from bstcad.scene.scene import load
-from tests import domes
-from tests.conftest import DISK, draws_nothing, verify_with
+from tests.conftest import draws_nothing, verify_with
 
 SCENE = """
 name = "dome"
@@ -184,6 +180,7 @@ def test_changes_of_the_dome_move_the_outlines_that_the_scene_does_not_state(sce
     assert stated.changed({"lens.back.half_angle": 70.0}).lens.front.outline.radius == 7.0
 
 
+@pytest.mark.thorough
 def test_the_tolerances_of_a_dome_are_studied(designed, tmp_path, monkeypatch):
     """A decentred lamp and a thicker dome change the light more than their sum of squares leaves the model."""
     folder = Path(shutil.copytree(designed[1], tmp_path / "out"))
@@ -196,20 +193,6 @@ def test_the_tolerances_of_a_dome_are_studied(designed, tmp_path, monkeypatch):
     assert {name.split("_")[0] for name in changes} >= {"source.decentre", "lens.thickness", "lens.index"}
     assert any(name.startswith("back.form") for name in changes) and study.model_off["median"] < 0.1
     assert all(np.isfinite(each) for each in changes.values()) and (folder / "tolerance.json").is_file()
-
-
-def test_the_same_dome_by_any_number_of_threads():
-    small, nets = load(DISK, domes.SMALL), []
-    before = torch.get_num_threads(), numba.get_num_threads()
-    try:
-        for n in (1, 2):
-            torch.set_num_threads(n)
-            numba.set_num_threads(min(n, numba.config.NUMBA_NUM_THREADS))
-            nets.append(pipeline.design(small, device="cpu").lens.back.control_points())
-    finally:
-        torch.set_num_threads(before[0])
-        numba.set_num_threads(before[1])
-    assert np.array_equal(*nets)
 
 
 def _with_points(folder, change):

@@ -26,6 +26,7 @@ from bstcad.report.units import about
 from bstcad.scene.errors import SceneError
 from bstcad.scene.target import Target
 from bstcad.verify.judges import faces, mitsuba
+from tests import suite
 from tests.conftest import draws_nothing, quick_effort
 
 OUTLINE = Rectangle(16.0, 16.0)
@@ -191,6 +192,7 @@ class OverDirections(Target):
         return replace(super().screen, surface=Directions(self.z))
 
 
+@suite.in_turn(0, 3)
 def test_light_over_directions_is_stated_in_degrees(scene, tmp_path, monkeypatch):
     """Even light a solid angle, by design, proof and report; pages, sheets and sentences have the receiver's words."""
     draws_nothing(monkeypatch)
@@ -273,6 +275,7 @@ class Oval(Emitter):
         return Rays(place, along, self.irradiance(x, y, z) * area, all_alive(x), axial=True, z=z - 20.0)
 
 
+@suite.in_turn(2, 3)
 @pytest.mark.filterwarnings("ignore:Pydantic serializer")  # no file says of which kind such a source is
 def test_light_of_an_emitter_of_its_own_is_spread_evenly(scene, tmp_path, monkeypatch):
     """Design, proof and report know it: an oval beam, much brighter in its middle, on an even square."""
@@ -303,7 +306,7 @@ def test_an_emitter_of_its_own_answers_or_declines_in_a_sentence(scene):
 def test_changes_of_a_scene_keep_source_and_targets_of_its_own(scene):
     around = scene.model_copy(update={"targets": (OnCylinder(**dict(scene.target)),), "source": Oval(5.0, 8.0)})
     changed = around.changed({"target.z": 300.0, "lens.min_thickness": 0.5})
-    assert changed.target.screen.plane == Cylinder(300.0) and changed.lens.min_thickness == 0.5
+    assert changed.target.screen.receiver == Cylinder(300.0) and changed.lens.min_thickness == 0.5
     assert changed.source is around.source
     assert around.changed({"source": scene.source, "target": scene.target}) == scene
 
@@ -314,6 +317,7 @@ def test_a_merit_of_its_own_is_refused_for_several_goals(scene):
         pipeline.design(two, options=pipeline.DesignOptions(lambda picture, target: ((picture - target) ** 2).sum()))
 
 
+@suite.in_turn(1, 3)
 def test_a_merit_of_its_own_is_made_less_than_by_rrmsd(scene):
     """A letter on black, which 33 x 33 control points cannot draw, leaves an error that each merit shares out."""
     scene = scene.changed({"target.uniform": None, "target.outline": None, "target.text": "L"})

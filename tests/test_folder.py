@@ -136,7 +136,7 @@ class TestReading:
         assert nominal.lens.back.heights.dtype == torch.float64
         assert nominal.lens.front == scene.lens.front.surface and nominal.lens.outline == scene.lens.outline
         assert nominal.lens.index == scene.index and nominal.channels == scene.channels()
-        screen = nominal.goals[0].receiver
+        screen = nominal.goals[0].screen
         assert (screen.x, screen.y, screen.shape) == ((-30.0, 30.0), (-25.0, 25.0), (48, 64))
         assert nominal.scene == scene
 

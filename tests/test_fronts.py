@@ -18,6 +18,7 @@ from bstcad.manufacture.tolerance import perturbations
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.surfaces import Toroid, sag
 from bstcad.scene.scene import load
+from tests import suite
 from tests.conftest import draws_nothing, quick_effort
 
 
@@ -69,6 +70,7 @@ def dome(small_scene, tmp_path_factory):
     return made(small_scene.changed(DOME), tmp_path_factory.mktemp("fronts") / "dome")
 
 
+@suite.in_turn(0, 4)
 def test_all_light_goes_through_the_dome_and_lands(dome):
     flux = dome.report["flux"]
     assert flux["on target"] > 0.99 and flux["vignetted by the underside"] < 1e-6
@@ -80,6 +82,7 @@ def test_all_light_goes_through_the_dome_and_lands(dome):
     assert "outline of the face" in text and f"z = {level!r} mm" in text
 
 
+@suite.in_turn(0, 4)
 def test_the_dome_is_in_the_scene_and_in_the_step_file_of_its_design(dome):
     scene, nominal = read_nominal(dome.folder)
     assert scene == dome.scene and nominal.lens.front == dome.scene.lens.front.surface
@@ -88,10 +91,11 @@ def test_the_dome_is_in_the_scene_and_in_the_step_file_of_its_design(dome):
     assert again.solid().isValid()
 
 
+@suite.in_turn(0, 4)
 def test_tolerances_of_a_domed_lens_move_its_dome(dome):
     """A form error is a net in the dome's place, which keeps the outline; a larger lens has a larger outline."""
     _, nominal = read_nominal(dome.folder)
-    setup = perturbations.Setup(nominal.lens, nominal.channels, nominal.goals[0].receiver)
+    setup = perturbations.Setup(nominal.lens, nominal.channels, nominal.goals[0].screen)
     rough = perturbations.form_error(nominal.lens, 4.0, 0, "front").apply(setup, 0.0).lens
     assert rough.front.is_net and rough.apertures == nominal.lens.apertures
     x = torch.linspace(-8, 8, 101, dtype=torch.float64)
@@ -102,13 +106,14 @@ def test_tolerances_of_a_domed_lens_move_its_dome(dome):
     assert larger.front.curvature == pytest.approx(-1 / 12 / 1.01)
 
 
-@pytest.mark.parametrize("name", ["behind_another", "conic", "dome", "toroid"])
+@pytest.mark.parametrize("name", suite.in_turns(["dome", "behind_another", "conic", "toroid"], 4))
 def test_the_design_passes_its_checks(name, request):
     report = request.getfixturevalue(name).report
     assert [check["name"] for check in report["checks"] if not check["passed"]] == []
     assert report["rrmsd"] < 0.1
 
 
+@suite.in_turn(1, 4)
 def test_the_given_front_is_in_every_file(behind_another, small_design):
     earlier = np.load(small_design.folder / "design.npz")["control_points"]
     found = np.load(behind_another.folder / "design.npz")["front_control_points"]
@@ -123,6 +128,7 @@ def test_the_given_front_is_in_every_file(behind_another, small_design):
     assert "freeform" in (behind_another.folder / "prescription.txt").read_text()
 
 
+@suite.in_turn(1, 4)
 def test_it_reads_back_to_the_last_bit_without_the_earlier_design(behind_another):
     """The folder has a copy of the net."""
     scene, nominal = read_nominal(behind_another.folder)
@@ -132,6 +138,7 @@ def test_it_reads_back_to_the_last_bit_without_the_earlier_design(behind_another
     assert again.lens.front.z == 15.0 and again.solid().isValid()
 
 
+@suite.in_turn(2, 4)
 def test_both_numbers_of_the_conic_are_found(conic):
     """The scene of the design has them and nothing left to search for, and so has the STEP file."""
     front = load(conic.folder / "scene.toml").lens.front
@@ -147,6 +154,7 @@ def test_both_numbers_of_the_conic_are_found(conic):
     assert repr(front.conic_constant) in (conic.folder / "prescription.txt").read_text()
 
 
+@suite.in_turn(3, 4)
 def test_the_step_file_of_a_toroid_lies_within_a_nanometre_of_it(toroid):
     step = step_reading.read(toroid.folder / "lens.step")
     x, y = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 1000)) * [[4.0], [3.0]]
@@ -154,6 +162,7 @@ def test_the_step_file_of_a_toroid_lies_within_a_nanometre_of_it(toroid):
     assert sag(step.front, 0.0, 0.0) == pytest.approx(15.0, abs=1e-12)
 
 
+@suite.in_turn(3, 4)
 def test_a_toroid_is_read_again_to_the_last_bit_and_its_sheets_have_both_radii(toroid):
     scene, nominal = read_nominal(toroid.folder)
     assert scene == toroid.scene and nominal.lens.front.is_net

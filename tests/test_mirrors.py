@@ -75,7 +75,7 @@ def test_rays_in_space_draw_the_letter_as_it_is_to_whom_looks_along_z(made):
         np.corrcoef(seen, o.ravel())[0, 1] for o in (wanted, wanted[:, ::-1], wanted[::-1], wanted[::-1, ::-1])
     )
     assert upright > 0.9 and max(others) < 0.7
-    ours = target.screen.plane.to(leaving)
+    ours = target.screen.receiver.to(leaving)
     assert ours.alive.numpy()[alive].all()
 
 

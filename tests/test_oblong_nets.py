@@ -13,7 +13,7 @@ from bstcad.analysis.shape import _grid, survey
 from bstcad.commands import ProofOptions
 from bstcad.optics.kernels import spline
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.bspline import (
     QUARTERS,
@@ -91,7 +91,7 @@ def test_sags_along_the_longer_side_are_those_along_the_shorter_one_of_the_net_t
 def test_landings_and_their_gradient_are_those_of_the_plain_form_and_of_differences():
     lens = Lens(Sphere(15.0, -0.02), bowl(), Rectangle(22.0, 11.0), 1.6)
     x, y = stratified(Rectangle(20.0, 10.0), 40, 0, torch.float64)
-    in_glass = trace.to_first_net(Point().rays_through(x, y, 15.0, 1.0), lens)
+    in_glass = trace.to_first_net(PointSource().rays_through(x, y, 15.0, 1.0), lens)
 
     def merit(form, heights):
         landed = form(in_glass, replace(lens, back=replace(lens.back, heights=heights)), LevelPlane(200.0))
@@ -161,9 +161,9 @@ def test_levels_have_cells_of_one_shape():
 
 def test_tubes_lie_in_the_proportion_of_the_cells_under_the_light():
     lens = Lens(Sphere(15.0, 0.0), bowl(65, 33, depth=0.2), Rectangle(24.0, 12.0), 1.5)
-    assert launch_tubes(Point(position=(0.0, 0.0, -60.0)), lens, 100).flux.shape == (141, 71)
+    assert launch_tubes(PointSource(position=(0.0, 0.0, -60.0)), lens, 100).flux.shape == (141, 71)
     square = replace(lens, back=bowl(33, 33, depth=0.2))
-    assert launch_tubes(Point(position=(0.0, 0.0, -60.0)), square, 100).flux.shape == (100, 100)
+    assert launch_tubes(PointSource(position=(0.0, 0.0, -60.0)), square, 100).flux.shape == (100, 100)
 
 
 @pytest.fixture(scope="module")

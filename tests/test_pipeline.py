@@ -12,6 +12,7 @@ from bstcad.optics.receivers.irradiance import Screen, efficiency, rrmsd
 from bstcad.scene import scene
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.run import Hooks
+from tests import suite
 from tests.tracing import simulated
 
 SMALL = {
@@ -42,7 +43,7 @@ def judged(design):
     return float(rrmsd(found.box, torch.from_numpy(design.goals[0].picture))), efficiency(found.flux)
 
 
-@pytest.mark.parametrize("name", RECORDED)
+@pytest.mark.parametrize("name", suite.in_turns(RECORDED, 2))
 def test_a_template_becomes_a_lens(name):
     found, steps = designed(name)
     value, efficiency = judged(found)

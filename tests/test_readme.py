@@ -34,10 +34,3 @@ def test_the_pictures_are_there_and_small():
 
 def test_it_is_short():
     assert len(README.splitlines()) <= 120
-
-
-def test_the_house_is_as_described():
-    """Each room of the package is named in the plan of the house."""
-    plan = (ROOT / "docs" / "explanation" / "house.md").read_text(encoding="utf-8")
-    rooms = [path.parent.name for path in (ROOT / "bstcad").glob("*/__init__.py")]
-    assert [room for room in rooms if f"{room}/" not in plan] == []

@@ -13,6 +13,7 @@ import torch
 import bstcad
 import bstcad.cad.plugin
 from bstcad.optics.trace.measure import Effort
+from tests import suite
 from tests.cad.test_trimming import occ_volume
 from tests.conftest import draws_nothing, verify_with
 from tests.exact_volume import exact_volume
@@ -96,7 +97,7 @@ FEW = {  # settings that take no time
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=OTHER)
+@pytest.fixture(scope="module", params=suite.in_turns(OTHER, 2))
 def other(request, tmp_path_factory):
     """Kind and folder of a design of another kind."""
     template, changes = OTHER[request.param]

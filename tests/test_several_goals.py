@@ -15,6 +15,7 @@ from bstcad.figures.figure_jobs import NoPictures
 from bstcad.optics.surfaces.surfaces import sag
 from bstcad.verify.judges import comparison
 from bstcad.verify.judges.faces import FaceError, Traced
+from tests import suite
 from tests.conftest import flat_pictures, quick_effort
 from tests.two_faces import made_of, scene_of
 
@@ -116,6 +117,7 @@ def verified(two, tmp_path_factory):
     return SimpleNamespace(report=found, tracer=tracer, page=page, figures=figures, drawn=drawn)
 
 
+@suite.in_turn(1, 2)
 def test_another_program_traces_each_target(two, verified):
     near, far = (target.z for target in two.made.scene.targets)
     assert verified.tracer.asked == [near, far]
@@ -130,6 +132,7 @@ def test_another_program_traces_each_target(two, verified):
     assert "tracer 1, target[0]" in verified.page and "tracer 1, target[1]" in verified.page
 
 
+@suite.in_turn(1, 2)
 def test_a_made_part_is_judged_on_each_target(two, verified):
     part = verified.report.measured
     assert [each["key"] for each in part.facts["goals"]] == ["target[0]", "target[1]"]
@@ -144,6 +147,7 @@ def test_a_made_part_is_judged_on_each_target(two, verified):
     assert " on target[0]." in verified.page and " on target[1]." in verified.page
 
 
+@suite.in_turn(0, 2)
 def test_a_made_part_is_held_to_the_wave_that_is_asked_for(tmp_path):
     """A wave of form error of 1 µm at an index of 1.49 is about 0.8 waves up and down, 0.5 RMS."""
     one = scene_of().target.model_dump(mode="json", exclude_none=True)

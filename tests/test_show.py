@@ -45,7 +45,7 @@ def test_corners_of_a_tilted_screen_lie_on_its_plane():
     level, tilted = (Screen(50.0, (10.0, 30.0), (-5.0, 5.0), 8, tilt) for tilt in (None, (20.0, -10.0)))
     assert corners(level).tolist() == [[10, -5, 50], [30, -5, 50], [30, 5, 50], [10, 5, 50]]
     found = corners(tilted)
-    assert [tilted.plane.height(tuple(corner)) for corner in found] == pytest.approx([0] * 4, abs=1e-12)
+    assert [tilted.receiver.height(tuple(corner)) for corner in found] == pytest.approx([0] * 4, abs=1e-12)
     assert np.linalg.norm(found - np.roll(found, 1, axis=0), axis=1) == pytest.approx([10, 20, 10, 20])
 
 

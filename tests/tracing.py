@@ -40,7 +40,7 @@ def from_first_net_plain(coming: Rays, lens: Lens, plane: Receiver) -> Landed:
 
 def from_first_net_to_each_plain(coming: Rays, lens: Lens, planes: Sequence[Receiver]) -> tuple[Landed, ...]:
     """`trace.from_first_net_to_each` in plain torch."""
-    rays = across(coming, lens.interfaces[lens.freeform[0] :])
+    rays = across(coming, lens.interfaces[lens.tailored_numbers[0] :])
     return tuple(plane.land(rays) for plane in planes)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 
 from bstcad.designs.course import BY_HAND, DesignCourse
-from bstcad.designs.folder import Made
+from bstcad.designs.made import Made
 from bstcad.scene.scene import load
 
 DISK = "templates/disk.toml"

@@ -203,8 +203,8 @@ def unlit(target: np.ndarray, irradiance: np.ndarray, screen: Screen) -> dict[st
     rows, columns = scipy.ndimage.find_objects(patches)[largest - 1]
     x, y = (np.linspace(*ends, n + 1) for ends, n in zip((screen.x, screen.y), target.shape[::-1], strict=True))
     sides = (x[columns.start], x[columns.stop]), (y[-1 - rows.stop], y[-1 - rows.start])
-    named = zip(screen.plane.names, sides, strict=True)
-    place = (f"{name} = {low:.4g} to {high:.4g} {screen.plane.unit}" for name, (low, high) in named)
+    named = zip(screen.receiver.names, sides, strict=True)
+    place = (f"{name} = {low:.4g} to {high:.4g} {screen.receiver.unit}" for name, (low, high) in named)
     return {"share": share, "place": ", ".join(place)}
 
 

@@ -69,17 +69,15 @@ def etendue(source: Emitter, lens: Lens, goal: Goal) -> Etendue | None:
     if radiance is None:
         return None
     area = Silhouette.of(lens).area(np.ones(1))[0]
-    cells = 1 << max(
-        0, int(math.log2(MAX_SIDE / max(goal.receiver.shape)))
-    )  # the target as it is meant, not its pixels
+    cells = 1 << max(0, int(math.log2(MAX_SIDE / max(goal.screen.shape))))  # the target as it is meant, not its pixels
     fine = goal.on_cells(cells)
     wanted, share = fine.picture / fine.picture.sum(), radiance * pixel_etendue(lens, fine)
     half = math.asin(min(math.sqrt(1 / (math.pi * area * radiance)), 1.0))
-    plane = image_from_last_net(lens, goal.receiver.plane)
-    if plane.unit == "degrees":
-        return Etendue(float(np.minimum(wanted, share).sum()), math.degrees(half), plane.unit)
-    throw = abs(plane.throw(float(lens.back.z)))
-    return Etendue(float(np.minimum(wanted, share).sum()), throw * math.tan(min(half, 1.5)), plane.unit)
+    receiver = image_from_last_net(lens, goal.screen.receiver)
+    if receiver.unit == "degrees":
+        return Etendue(float(np.minimum(wanted, share).sum()), math.degrees(half), receiver.unit)
+    throw = abs(receiver.throw(float(lens.back.z)))
+    return Etendue(float(np.minimum(wanted, share).sum()), throw * math.tan(min(half, 1.5)), receiver.unit)
 
 
 def largest_radiance(source: Emitter, lens: Lens) -> float | None:
@@ -107,8 +105,8 @@ def largest_radiance(source: Emitter, lens: Lens) -> float | None:
 
 def pixel_etendue(lens: Lens, goal: Goal) -> np.ndarray:
     """Return g (rows, columns), mm² sr, of the pixels of a goal, seen from the last face through its outline."""
-    screen = goal.receiver
-    plane, sizes = image_from_last_net(lens, screen.plane), screen.cell_sizes
+    screen = goal.screen
+    receiver, sizes = image_from_last_net(lens, screen.receiver), screen.cell_sizes
     (left, right), (low, high) = screen.x, screen.y
     columns = left + (np.arange(screen.columns) + 0.5) * (right - left) / screen.columns
     rows = high - (np.arange(screen.rows) + 0.5) * (high - low) / screen.rows
@@ -116,26 +114,26 @@ def pixel_etendue(lens: Lens, goal: Goal) -> np.ndarray:
     found = np.empty(len(x))
     for first in range(0, len(x), AIMS_AT_A_TIME):
         part = slice(first, first + AIMS_AT_A_TIME)
-        found[part] = _seen(lens, plane, torch.stack([x[part], y[part]]))
+        found[part] = _seen(lens, receiver, torch.stack([x[part], y[part]]))
     return found.reshape(screen.shape) * sizes
 
 
-def _seen(lens: Lens, plane: Receiver, aim: Tensor) -> np.ndarray:
-    """Return g of aims (2, n) per area (mm²) or solid angle (sr) of the receiver, unfolded to `plane`."""
+def _seen(lens: Lens, receiver: Receiver, aim: Tensor) -> np.ndarray:
+    """Return g of aims (2, n) per area (mm²) or solid angle (sr) of the receiver, unfolded to `receiver`."""
     outline, sum_of_all = lens.plan, np.zeros(aim.shape[1])
     half_x, half_y = outline.half_extent
     x, y = (p.reshape(-1) for p in sampling.grid(Rectangle(2 * half_x, 2 * half_y), FACE_POINTS))
     places, seen = torch.stack([x, y])[:, outline.contains(x, y)].T, Silhouette.of(lens)
-    places = places[:1] if plane.unit == "degrees" else places  # a direction is the same from everywhere
+    places = places[:1] if receiver.unit == "degrees" else places  # a direction is the same from everywhere
     for p in places:
         position = torch.tensor([*p.tolist(), 0.0], dtype=torch.float64)[:, None].expand(3, aim.shape[1])
         rays = Rays(position, position, position[0], torch.zeros(aim.shape[1], dtype=torch.uint8), z=float(lens.back.z))
-        towards = plane.vector_to(rays, aim)
+        towards = receiver.vector_to(rays, aim)
         square = (towards * towards).sum(0)
         direction = towards / torch.sqrt(square)
         weight = np.ones(aim.shape[1])
-        if plane.unit != "degrees":
-            normal = torch.stack([torch.as_tensor(n).expand_as(direction[0]) for n in plane.normal(aim)])
+        if receiver.unit != "degrees":
+            normal = torch.stack([torch.as_tensor(n).expand_as(direction[0]) for n in receiver.normal(aim)])
             weight = ((normal * direction).sum(0).abs() / square).numpy()
         sum_of_all += weight * seen.area(direction[2].abs().numpy())
     return sum_of_all / len(places)
@@ -158,7 +156,7 @@ class Silhouette:
         cosines, back = np.linspace(0.0, 1.0, SILHOUETTES), lens.plain().back
         if back.chart.flat:
             return cls(cosines, lens.apertures[1].area * cosines)
-        x, y = (torch.from_numpy(p) for p in lens.last_freeform.outline.rim_points())
+        x, y = (torch.from_numpy(p) for p in lens.last_tailored.outline.rim_points())
         share = torch.linspace(0.0, 1.0, DOME_RINGS, dtype=torch.float64)[:, None]
         points = back.at((share * x).reshape(-1), (share * y).reshape(-1)).position.numpy()
         sines = np.sqrt(1 - cosines**2)

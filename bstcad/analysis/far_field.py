@@ -9,7 +9,7 @@ import numpy as np
 
 from bstcad.analysis.leaving_rays import rays_behind
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.channels import Channel, Draw
+from bstcad.optics.light.channels import Channel, SourceSampler
 from bstcad.optics.receivers.directions import Directions
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.trace.measure import (
@@ -69,7 +69,7 @@ class FarField:
     channels: tuple[Channel, ...]
     lumens: float | None = None  # luminous flux of the source, lm; None: not known, NOMINAL_LUMENS are assumed
     ghost: GhostTracer | None = None  # function that traces light reflected twice inside the lens; None: no ghost
-    draw: Draw | None = None  # function that samples points of an extended source; None: those of `channels`
+    sampler: SourceSampler | None = None  # samples points of an extended source; None: those of `channels`
     grid: Grid | None = None  # C and γ of the table; None: `default_grid`
     seed: int = SEED  # seed of the rays
 
@@ -101,11 +101,13 @@ class FarField:
 
     def sampled(self, rays: int) -> tuple[Channel, ...]:
         """Return the channels for so many rays: points of an extended source, or all parts of the rays of a file."""
-        if self.draw is None:
+        if self.sampler is None:
             return self.channels
-        if self.draw.largest_side is None:
-            return tuple(self.draw(min(max(rays // RAYS_PER_POINT, MIN_SOURCE_POINTS), MAX_SOURCE_POINTS), self.seed))
-        parts = (self.draw(1, part) for part in range(SETS))
+        if self.sampler.largest_side is None:
+            return tuple(
+                self.sampler(min(max(rays // RAYS_PER_POINT, MIN_SOURCE_POINTS), MAX_SOURCE_POINTS), self.seed)
+            )
+        parts = (self.sampler(1, part) for part in range(SETS))
         return tuple(replace(channel, weight=channel.weight / SETS) for part in parts for channel in part)
 
     def rays(self, lens: Lens, count: int) -> RaySet:

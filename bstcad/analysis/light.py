@@ -42,41 +42,41 @@ FAN_RAYS = 15  # number of rays in `fan`
 GRID_LINES = 33  # number of grid lines in each direction in `ray_map`
 
 
-def fan(source: Emitter, lens: Lens, plane: Receiver) -> np.ndarray:
-    """Return polylines (rays, points, 3) in mm from the source to the plane, via (x, 0) on the first vertex plane."""
+def fan(source: Emitter, lens: Lens, receiver: Receiver) -> np.ndarray:
+    """Return polylines (rays, points, 3) in mm from source to receiver, via (x, 0) on the first vertex plane."""
     half = clear_window(source, lens).width / 2
     x = torch.linspace(-0.98 * half, 0.98 * half, FAN_RAYS, dtype=torch.float64)
-    return _polylines(source.rays_through(x, torch.zeros_like(x), lens.entrance.z, 1.0), lens, plane)[0]
+    return _polylines(source.rays_through(x, torch.zeros_like(x), lens.entrance.z, 1.0), lens, receiver)[0]
 
 
-def bundle(source: Emitter, lens: Lens, plane: Receiver, n: int) -> tuple[np.ndarray, np.ndarray]:
+def bundle(source: Emitter, lens: Lens, receiver: Receiver, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Return polylines (rays, points, 3), mm, of one ray per cell of n x n cells of the beam, and the flux on arrival.
 
     Each ray starts with the flux of its cell; the total flux of the source is 1.  Rays that do not arrive are omitted.
     """
     area = clear_window(source, lens)
     x, y = (p.reshape(-1).to(torch.float64) for p in sampling.grid(area, n))
-    return _polylines(source.rays_through(x, y, lens.entrance.z, area.area / n**2), lens, plane)
+    return _polylines(source.rays_through(x, y, lens.entrance.z, area.area / n**2), lens, receiver)
 
 
-def _polylines(rays: Rays, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.ndarray]:
-    """Return polylines (rays, points, 3) in mm of the rays that arrive at the plane, and their flux there."""
+def _polylines(rays: Rays, lens: Lens, receiver: Receiver) -> tuple[np.ndarray, np.ndarray]:
+    """Return polylines (rays, points, 3) in mm of the rays that arrive at the receiver, and their flux there."""
     stops = _at_interfaces(rays, lens)
-    stops.append(landed := plane.to(stops[-1]))
+    stops.append(landed := receiver.to(stops[-1]))
     corners = torch.stack([torch.stack([*stop.position[:2], stop.above(0.0)]) for stop in stops])
     arrive = landed.alive & (landed.flux > 0)
     return corners[:, :, arrive].permute(2, 0, 1).numpy(), landed.flux[arrive].numpy()
 
 
-def ray_map(source: Emitter, lens: Lens, plane: Receiver) -> tuple[np.ndarray, np.ndarray]:
-    """Return (start, end): grid points on the vertex plane of the first surface, and where their rays meet `plane`.
+def ray_map(source: Emitter, lens: Lens, receiver: Receiver) -> tuple[np.ndarray, np.ndarray]:
+    """Return (start, end): grid points on the first surface's vertex plane, and where their rays meet the receiver.
 
-    (GRID_LINES, GRID_LINES, 2) each, start in mm, end in the unit of `plane`; NaN where light is absent or lost.
+    (GRID_LINES, GRID_LINES, 2) each, start in mm, end in its unit; NaN where light is absent or lost.
     """
     area = clear_window(source, lens)
     line = torch.linspace(-0.499, 0.499, GRID_LINES, dtype=torch.float64)
     x, y = torch.meshgrid(line * area.width, line * area.height, indexing="ij")
-    landed = trace(source.rays_through(x, y, lens.entrance.z, 1.0), lens, plane)
+    landed = trace(source.rays_through(x, y, lens.entrance.z, 1.0), lens, receiver)
     start, end = torch.stack([x, y], dim=-1), landed.position.permute(1, 2, 0).clone()
     lost = ~(landed.alive & (landed.flux > 0))
     start[lost] = end[lost] = torch.nan
@@ -229,7 +229,7 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
         through = channel.through(lens)
         for rays in launch_strips(channel.source, through, n, seed):
             rays = to_first_net(rays, through)
-            for face in through.interfaces[through.freeform[0] : through.solid.stop]:
+            for face in through.interfaces[through.tailored_numbers[0] : through.solid.stop]:
                 met, normal = intersect(face.surface, rays, face.outline, face.status_if_missed)
                 n_x, n_y, n_z = normal
                 dx, dy, dz = met.direction
@@ -243,7 +243,7 @@ def margins(channels: Sequence[Channel], lens: Lens, screen: Screen, seed: int, 
                     critical = math.degrees(math.asin(1.0 / face.law.eta))
                     margin = min(margin, critical - float(torch.rad2deg(torch.arccos(cosine)).max()))
                 rays = deflect(met, normal, face.law, level=face.surface.level).rays
-            landed = screen.plane.land(across(rays, through.behind))
+            landed = screen.receiver.land(across(rays, through.behind))
             wrong += int((~torch.isfinite(landed.position)).any(0)[landed.alive].sum())
     return Margins(None if math.isinf(margin) else margin, None if math.isinf(slope) else slope, wrong)
 
@@ -281,7 +281,7 @@ def blur(
     if not found.flux.any():
         return None
     width = found.width()
-    return Blur(width * screen.pixel_side, width, found.deviation(target), screen.plane.unit)
+    return Blur(width * screen.pixel_side, width, found.deviation(target), screen.receiver.unit)
 
 
 @dataclass(frozen=True)
@@ -319,7 +319,7 @@ def finest_detail(
     nearer, image = MIN_DISTANCE_RATIO * max(sizes), source_image * pixel
     width, narrower = (max(detail_width(image * scale, pixel), least) for scale in (1.0, nearer / distance))
     gains = narrower < MAX_NEARER_RATIO * width and grows and not lens.behind
-    gain, unit = (nearer, narrower) if gains else (None, None), screen.plane.unit
+    gain, unit = (nearer, narrower) if gains else (None, None), screen.receiver.unit
     return FinestDetail(
         width, image, pixel, distance, nearer_distance=gain[0], nearer_width=gain[1], of=of, assumed=assumed, unit=unit
     )

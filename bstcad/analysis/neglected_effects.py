@@ -170,8 +170,8 @@ class Reference:
         lens, source = channel.through(self.lens), channel.source
         area, n = clear_window(source, lens), GHOST_RAYS_PER_SIDE
         rays = source.rays_through(*sampling.grid(area, n), lens.entrance.z, area.area / n**2)
-        straight = float(landed_flux(trace(rays, lens, self.screen.plane)).sum())
-        landed = self.screen.plane.land(trace_ghost(rays, lens)[0])
+        straight = float(landed_flux(trace(rays, lens, self.screen.receiver)).sum())
+        landed = self.screen.receiver.land(trace_ghost(rays, lens)[0])
         flux = torch.where(landed.alive, landed.flux, torch.zeros_like(landed.flux)).numpy() / straight
         cells = self._landing(flux, self.screen.pixels_of(landed.position).numpy())
         share, cells = float(cells.sum()), scipy.ndimage.gaussian_filter(cells, GHOST_SMOOTHING, mode="nearest")
@@ -272,7 +272,7 @@ def _trace_through(
     rays = source.rays_through(p, q, lens.entrance.z, 1.0)
     (p_x, p_y), (q_x, q_y) = (torch.gradient(c) for c in (p, q))
     density = rays.flux * (p_x * q_y - p_y * q_x).abs()
-    return trace(replace(rays, flux=torch.ones_like(rays.flux)), lens, screen.plane), density
+    return trace(replace(rays, flux=torch.ones_like(rays.flux)), lens, screen.receiver), density
 
 
 def _transmission(landed: Landed) -> np.ndarray:

@@ -46,7 +46,7 @@ def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
     points = points_on(lens.back, x, y)
     glass, [centre] = thickness(lens, points), thickness(lens, points_on(lens.back, [0.0], [0.0]))
     of_front = {}
-    if lens.shapes("front"):
+    if lens.is_tailored("front"):
         of_front = _face_figures(lens.front_net, survey_front(lens), points_on(lens.front, x, y))
     (thinnest, thickest), (edge_thinnest, edge_thickest) = _range(glass), _range(glass[: 4 * grid])
     return {

@@ -45,7 +45,7 @@ def needed_steepness(
     x (c,), y (r,): coordinates on the receiver, in its unit.  origins: (c, r, 2), x and y (mm) of points of the last
     tailored face or, if not at_back, of the plane through the first vertex.
     """
-    screen, number, lens = image_screen(lens, goal.receiver), lens.freeform[-1], lens.plain()
+    screen, number, lens = image_screen(lens, goal.screen), lens.tailored_numbers[-1], lens.plain()
     i, j = (np.unique(np.linspace(0, n - 1, min(n, MAX_POINTS_PER_SIDE)).round().astype(int)) for n in (len(x), len(y)))
     x, y, origins = x[i], y[j], origins[np.ix_(i, j)]
     p, q = (torch.from_numpy(np.ascontiguousarray(origins[..., k], dtype=float)) for k in (0, 1))
@@ -57,7 +57,7 @@ def needed_steepness(
         coming = across(source.rays_through(p, q, lens.entrance.z, 1.0), before)
         at, _ = intersect(face.surface, coming, face.outline, face.status_if_missed)
     aim = torch.stack(torch.meshgrid(torch.from_numpy(x), torch.from_numpy(y), indexing="ij"))
-    out, eta = screen.plane.vector_to(at, aim), face.law.eta
+    out, eta = screen.receiver.vector_to(at, aim), face.law.eta
     out = out / torch.sqrt((out * out).sum(0))
     normal = at.chart.local(at.position, normal_towards(at, out, face.law))
     angle = torch.rad2deg(torch.atan2(torch.hypot(normal[0], normal[1]), normal[2]))

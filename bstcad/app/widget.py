@@ -27,12 +27,12 @@ from bstcad.scene.scene import Scene, load, of_text
 DESCRIPTION_WIDTH = "180px"  # width of a widget's label
 
 
-def workbench(scene: Scene | str | os.PathLike[str]) -> Workbench:
+def workbench(scene: Scene | str | os.PathLike[str]) -> WorkbenchWidget:
     """Return the workbench of a scene or a scene file, to be shown in a notebook.  SceneError for an invalid scene."""
-    return Workbench(scene)
+    return WorkbenchWidget(scene)
 
 
-class Workbench:
+class WorkbenchWidget:
     """Widgets of a scene; `scene` is the current scene, `text` the text of its file."""
 
     def __init__(self, scene: Scene | str | os.PathLike[str]) -> None:

@@ -41,7 +41,7 @@ from bstcad.cad.walls import MIN_WALL, NO_DRAFT, Draft, Loop, NamedFace, face_in
 from bstcad.cad.wires import LoopPiece, shape_in
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.surfaces import Plane
-from bstcad.scene.mount import Box, Flange, Mount, Part, Round
+from bstcad.scene.mount import Box, CircleRim, Flange, Mount, Part
 
 if TYPE_CHECKING:
     import cadquery
@@ -280,7 +280,7 @@ def part_of(lens: Lens, mount: Mount) -> NamedSolid:
     return found._replace(solid=found.solid.translate((0, 0, -mount.origin(lens.front_vertex))))
 
 
-def wire(outline: Round | Box) -> cadquery.Wire:
+def wire(outline: CircleRim | Box) -> cadquery.Wire:
     """Return an outline as a wire in the plane z = 0."""
     import cadquery
 

@@ -40,7 +40,7 @@ ParameterMap = Callable[[np.ndarray, np.ndarray], np.ndarray]  # map from (x, y)
 
 
 @dataclass(frozen=True)
-class Patch:
+class FacePatch:
     """The OCC surface of an optical face."""
 
     surface: Geom_Surface
@@ -48,22 +48,22 @@ class Patch:
     uv: ParameterMap | None = None  # map to (u, v); None: a plane, on which OCC needs no curves in (u, v)
 
 
-def back_patch(lens: Lens) -> Patch:
+def back_patch(lens: Lens) -> FacePatch:
     """Return the back, Σ B_i(u) B_j(v) P_ij with the net P and the knots of the design; normal towards +z."""
     return _net_patch(lens.back_net.plain(), lens.outline, outward=True)
 
 
-def _net_patch(face: BSplineSurface, outline: Outline, outward: bool) -> Patch:
+def _net_patch(face: BSplineSurface, outline: Outline, outward: bool) -> FacePatch:
     if isinstance(outline, Circle):
         _check_round(face, outline.radius)
-    return Patch(bspline_surface(face.control_points(), *map(knots, face.shape)), outward, net_parameters(face))
+    return FacePatch(bspline_surface(face.control_points(), *map(knots, face.shape)), outward, net_parameters(face))
 
 
-def part_of_net(face: BSplineSurface, x: tuple[float, float], y: tuple[float, float], outward: bool) -> Patch:
+def part_of_net(face: BSplineSurface, x: tuple[float, float], y: tuple[float, float], outward: bool) -> FacePatch:
     """Return the patch of the control points that act over a window (mm): there it is the net, to the last bit.
 
     Clamped knots change a net in its end spans only, which are 1.5 pitches wide.  So the part begins 1.5 pitches or
-    more outside the window, or at the border of the net.  outward: see `Patch`.
+    more outside the window, or at the border of the net.  outward: see `FacePatch`.
     """
     rows, columns = (
         _acting(*span, first=first, pitch=pitch, count=count)
@@ -72,7 +72,7 @@ def part_of_net(face: BSplineSurface, x: tuple[float, float], y: tuple[float, fl
     net = face.control_points()[rows, columns]
     (x_low, y_low, _), (x_high, y_high, _) = net[0, 0].tolist(), net[-1, -1].tolist()
     part = BSplineSurface(face.z, face.heights[rows, columns], (x_low, x_high), (y_low, y_high))
-    return Patch(bspline_surface(net, *map(knots, part.shape)), outward, net_parameters(part))
+    return FacePatch(bspline_surface(net, *map(knots, part.shape)), outward, net_parameters(part))
 
 
 def _acting(low: float, high: float, *, first: float, pitch: float, count: int) -> slice:
@@ -107,7 +107,7 @@ def _check_round(surface: BSplineSurface, radius: float) -> None:
         )
 
 
-def front_patch(lens: Lens) -> Patch:
+def front_patch(lens: Lens) -> FacePatch:
     """Return the front's optical part as an OCC surface of the same kind, whose normal may point into the lens."""
     front, outline = lens.front.plain().optical, lens.front.outline or lens.outline
     if front.level:
@@ -117,12 +117,12 @@ def front_patch(lens: Lens) -> Patch:
     return PATCHES[front.kind](front, outline)
 
 
-def level_patch(z: float) -> Patch:
+def level_patch(z: float) -> FacePatch:
     """Return the plane at z (mm), its normal towards -z."""
-    return Patch(Geom_Plane(gp_Ax3(gp_Pnt(0, 0, z), gp_Dir(0, 0, -1), gp_Dir(1, 0, 0))), True)
+    return FacePatch(Geom_Plane(gp_Ax3(gp_Pnt(0, 0, z), gp_Dir(0, 0, -1), gp_Dir(1, 0, 0))), True)
 
 
-def _sphere_patch(front: Sphere, outline: Outline) -> Patch:
+def _sphere_patch(front: Sphere, outline: Outline) -> FacePatch:
     """Return a sphere with polar axis ±x and u = π at the vertex, so that no pole (x = ±R) or seam is on the patch.
 
     With s = sign(c) and R = 1/|c| for curvature c, x = s R sin v, y = -R cos v sin u, z - z_centre = s R cos v cos u.
@@ -143,7 +143,7 @@ def _sphere_patch(front: Sphere, outline: Outline) -> Patch:
         return np.stack([np.pi + np.arcsin(y / (R * np.cos(v))), v], axis=-1)
 
     axes = gp_Ax3(gp_Pnt(0, 0, front.z + 1 / c), gp_Dir(s, 0, 0), gp_Dir(0, 0, s))
-    return Patch(Geom_SphericalSurface(axes, R), bool(c > 0), uv)
+    return FacePatch(Geom_SphericalSurface(axes, R), bool(c > 0), uv)
 
 
 def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]:
@@ -164,7 +164,7 @@ def conic_net(front: Conic, a: float, b: float) -> tuple[np.ndarray, np.ndarray]
     return net, weights
 
 
-def _conic_patch(front: Conic, outline: Outline) -> Patch:
+def _conic_patch(front: Conic, outline: Outline) -> FacePatch:
     """Return the patch of `conic_net`.  In (u, v), circles about the axis are circles and straight sides are arcs."""
     (c, k), (a, b) = front.conic(), outline.half_extent
     bend = (1 + k) * c**2  # K
@@ -183,10 +183,10 @@ def _conic_patch(front: Conic, outline: Outline) -> Patch:
     half_u, half_v = PATCH_MARGIN * ends
     net, weights = conic_net(front, half_u, half_v)
     surface = bspline_surface(net, np.repeat([-half_u, half_u], 3), np.repeat([-half_v, half_v], 3), weights)
-    return Patch(surface, False, uv)
+    return FacePatch(surface, False, uv)
 
 
-PATCHES: dict[str, Callable[..., Patch]] = {  # function that returns the patch of each kind of front except planes
+PATCHES: dict[str, Callable[..., FacePatch]] = {  # function that returns the patch of each kind of front except planes
     "bspline": partial(_net_patch, outward=False),
     "sphere": _sphere_patch,
     "conic": _conic_patch,

@@ -21,7 +21,7 @@ from OCP.gp import gp_Ax2d, gp_Dir2d, gp_Pnt2d
 from OCP.TopoDS import TopoDS_Face, TopoDS_Solid
 
 from bstcad.cad import patches, walls, wires
-from bstcad.cad.patches import Patch, back_patch, front_patch, level_patch
+from bstcad.cad.patches import FacePatch, back_patch, front_patch, level_patch
 from bstcad.cad.walls import MIN_WALL, NO_DRAFT, Draft, NamedFace, Rail, face_inside
 from bstcad.cad.wires import LoopPiece, RailCurve
 from bstcad.optics.lens.base import check_base, on_base
@@ -204,7 +204,7 @@ def _hole_loop(name: str, hole: cadquery.Wire | Sequence[float]) -> list[LoopPie
 # ---- caps and walls ------------------------------------------------------------------------------------------------
 
 
-def cap(patch: Patch, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
+def cap(patch: FacePatch, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
     """Return the face on a patch, back (along: True) or front (False), inside the first rail and outside the others."""
     loops = [rail.along() if along else rail.against() for rail in rails]
     face = face_inside(patch.surface, patch.outward, *loops)
@@ -231,7 +231,7 @@ def optical_cap(lens: Lens) -> tuple[NamedFace, Rail]:
     return (cap(front_patch(lens), [rim], along=False), "front"), rim
 
 
-def image(patch: Patch, curve: RailCurve) -> Geom2d_Curve:
+def image(patch: FacePatch, curve: RailCurve) -> Geom2d_Curve:
     """Return the image in (u, v) of a curve on a patch: a line, circle or spline with the parameter of the curve."""
     piece, uv = curve.piece, patch.uv
     located = piece if piece.rim is None else piece.rim.arc  # (u, v) follow from the chart

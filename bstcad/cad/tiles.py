@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from OCP.TopoDS import TopoDS_Solid
 
 from bstcad.cad import patches, solid_properties, step_writing, walls, wires
-from bstcad.cad.patches import Patch
+from bstcad.cad.patches import FacePatch
 from bstcad.cad.solid import cap, prepared
 from bstcad.cad.tiling import Cell, Side, Tiling
 from bstcad.cad.wires import LoopPiece
@@ -67,7 +67,7 @@ def tile_shape(lens: Lens, cell: Cell) -> tuple[TopoDS_Solid, tuple[str, ...]]:
     return walls.solid_of([back, front, *built], INVALID_TILE.format(cell.name)), ("back", "front", *names)
 
 
-def _patch(lens: Lens, face: Surface, cell: Cell) -> Patch:
+def _patch(lens: Lens, face: Surface, cell: Cell) -> FacePatch:
     if is_net(face):
         return patches.part_of_net(face, *cell.extent, outward=face is lens.back)
     return patches.front_patch(lens)

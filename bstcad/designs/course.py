@@ -27,6 +27,21 @@ class StageRecord:
     rrmsd: Rrmsd | None = None  # RRMSD after the stage
     cpu_seconds: Seconds | None = None  # CPU time; None: unknown, or another process took part
 
+    @property
+    def stage(self) -> str:
+        """Name of the stage without that of its round: "stage 3" of "stage 3, full size"."""
+        return self.name.partition(", ")[0]
+
+    @property
+    def is_round(self) -> bool:
+        """True for one of several rounds of a stage."""
+        return self.stage != self.name
+
+    @property
+    def is_coarse(self) -> bool:
+        """True for a round with few pixels ("stage 2, 96 x 96 pixels, …"), whose size does not depend on the scene."""
+        return " pixels, " in self.name
+
 
 @dataclass(frozen=True)
 class CurvePoint:

@@ -18,7 +18,6 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ import numpy as np
 from bstcad.cad import mesh as meshes
 from bstcad.cad.mesh import MIRROR_RGBA, Label
 from bstcad.designs.as_designed import scene_text
-from bstcad.designs.course import DesignCourse
+from bstcad.designs.made import Made
 from bstcad.optics.lens import quadrature
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface, is_net, knots
@@ -44,48 +43,37 @@ from bstcad.scene.fronts import NET_FILE
 from bstcad.scene.target import numbered
 from bstcad.transport.mapping import TransportMap, nodes
 from bstcad.verify import jobs
-from bstcad.verify.checks import Nominal
+from bstcad.verify.nominal import Nominal
 
 SCENE, DESIGN, PART = "scene.toml", "design.npz", "part.step"  # names of files in a design's folder
 FRONT_KNOTS = ("front_knots_x", "front_knots_y")  # names in design.npz of the knots of a tailored front
 PROVEN = (SCENE, DESIGN, "lens.step", "lens.stl", PART, NET_FILE)  # files that a verification reads
 ERROR = "irradiance_error"  # name in design.npz of the error of the irradiance
 DISTANCES = "relative_distances"  # name in design.npz of a dome's distances
+# Arrays of design.npz: shape and meaning.  The back has m x n control points, the front m' x n'; rows and columns are
+# pixels of a target, c and r numbers of points on it.  A second target has target_2, irradiance_2, and so on.
+ARRAYS = {
+    "control_points": ("(m, n, 3)", "x, y, z of the net of the back (mm); first axis along x, second along y"),
+    "knots_x": ("(m + 3,)", "knots 0, 0, 0, 1, 2, …, m - 2, m - 2, m - 2 along x"),
+    "knots_y": ("(n + 3,)", "knots along y, with n instead of m"),
+    "degree": ("()", "integer 2"),
+    DISTANCES: ("(m, n)", "of a dome: distances of its control points from the centre, minus lens.back.radius (mm)"),
+    "front_curvature": ("()", "curvature of the front at its vertex (1/mm); no meaning for a net or a toroid"),
+    "front_conic_constant": ("()", "conic constant of a conic front"),
+    "front_control_points": ("(m', n', 3)", "x, y, z of the net of a freeform front or a toroid (mm)"),
+    "front_knots_x": ("(m' + 3,)", "knots of a tailored front along x"),
+    "front_knots_y": ("(n' + 3,)", "knots of a tailored front along y"),
+    "target": ("(rows, columns)", "required flux in each pixel, of sum 1; row 0 = y max, column 0 = x min"),
+    "irradiance": ("(rows, columns)", "flux in each pixel by rays through the written lens, of the target's sum"),
+    ERROR: ("()", "RRMSD between `irradiance` and the light without noise"),
+    "reachable": ("(rows, columns)", "uint8, 1 in pixels that light can reach; absent if it can reach all bright ones"),
+    "transport_x": ("(c,)", "x of points on the target, corners of pixels (unit of the receiver)"),
+    "transport_y": ("(r,)", "y of points on the target, corners of pixels (unit of the receiver)"),
+    "transport_back": ("(c, r, 2)", "float32: x and y of their light on the last tailored face (mm)"),
+    "transport_entrance": ("(c, r, 2)", "float32, for the paper's map: x and y (mm) in the plane of the first vertex"),
+    "scene": ("()", "text of scene.toml"),
+}
 REMEDY = "generate the design again"
-
-
-@dataclass(frozen=True)
-class Made(Nominal):
-    """Designed lens as a folder stores it: on the CPU, with goals restricted to the pixels that light can reach."""
-
-    making: DesignCourse = DesignCourse()  # stages, history and machine, for the report
-    device: str = "cpu"  # device on which the lens was designed: "cpu" or "cuda"
-    transport: TransportMap | None = None  # transport map of stage 1; None: the user's own lens, or not stored
-    # Function that returns `making` with the comparison of float32 and float64 for the report; None: nothing to add.
-    precision_comparison: Callable[[], DesignCourse] | None = None
-
-    def with_report_data(self) -> Made:
-        """Return this design with the comparison of float32 and float64 that the report prints."""
-        compare = self.precision_comparison
-        return self if compare is None else replace(self, making=compare(), precision_comparison=None)
-
-    def is_lens_of(self, other: Nominal) -> bool:
-        """Return True if lens (to the last bit), source and targets are equal to those of another design."""
-        return (
-            same_front(self.lens.front, other.lens.front)
-            and np.array_equal(self.lens.back_net.control_points(), other.lens.back_net.control_points())
-            and self.scene.source == other.scene.source
-            and self.scene.targets == other.scene.targets
-        )
-
-
-def same_front(one: Surface, other: Surface) -> bool:
-    """Return True if two fronts are equal to the last bit."""
-    if is_net(one) and is_net(other):  # independent of their planes z
-        return np.array_equal(one.control_points(), other.control_points())
-    both = [{"z": front.z, **front.parameters()} for front in (one.plain(), other.plain())]
-    same = (one.kind, one.outline) == (other.kind, other.outline) and both[0].keys() == both[1].keys()
-    return same and all(np.array_equal(both[0][key], both[1][key]) for key in both[0])
 
 
 # --- estimates of file sizes ------------------------------------------------------------------------------------------
@@ -278,17 +266,9 @@ def _write_scene(design: Made, folder: Path) -> None:
 def write_design(design: Made, lights: Sequence[Light], folder: Path) -> None:
     """Write design.npz: the optimised surfaces, the pictures, and the scene's text.
 
-    lights: traced light on each target; () if not traced.  irradiance (rows, columns) and irradiance_error are its
-    picture and the RRMSD between this and the noiseless one.  The arrays of the second target are target_2,
-    irradiance_2, irradiance_error_2, reachable_2, and so on.  reachable (rows, columns) is 1 in the pixels that light
-    can reach; it is absent if light can reach all bright pixels.
-
-    Transport map, if known (TransportMap): transport_x (c,) and transport_y (r,), the positions of c columns and r
-    rows of points on the target (unit of the receiver), and transport_back or transport_entrance (c, r, 2), x and y
-    (mm) of the light for each point: transport_back on the last tailored face (the back; the front if only the front
-    is tailored, or for a mirror behind glass), transport_entrance in the plane z = const of the first face's vertex.
-    A dome also has relative_distances (m, n): the distances of its control points from the centre minus
-    lens.back.radius (mm), since those of the points themselves would be rounded.
+    The arrays are those of ARRAYS.  lights: traced light on each target; () if not traced.  The last tailored face is
+    the back; the front if only the front is tailored, or for a mirror behind glass.  The distances of a dome are stored
+    since its control points, which are rounded, do not give them exactly.
     """
     lens, sent = design.lens, design.transport
     (m, n), front = lens.back_net.shape, lens.front
@@ -302,7 +282,7 @@ def write_design(design: Made, lights: Sequence[Light], folder: Path) -> None:
         **_numbers(front),
         **({DISTANCES: lens.back_net.heights.cpu().double().numpy()} if not lens.back.chart.flat else {}),
         **({"front_control_points": front.control_points()} if is_net(front) else {}),
-        **(dict(zip(FRONT_KNOTS, map(knots, lens.front_net.shape), strict=True)) if lens.shapes("front") else {}),
+        **(dict(zip(FRONT_KNOTS, map(knots, lens.front_net.shape), strict=True)) if lens.is_tailored("front") else {}),
         **{numbered("target", k): goal.picture for k, goal in enumerate(design.goals)},
         **{numbered("reachable", k): part.astype(np.uint8) for k, part in parts if part is not None},
         **{numbered("irradiance", k): light.picture for k, light in enumerate(lights)},

@@ -20,15 +20,15 @@ import bstcad
 from bstcad.analysis.shape import thickness_range
 from bstcad.analysis.steepness import Steepness, needed_steepness
 from bstcad.designs.course import CurvePoint, DesignCourse, PrecisionTest, StageRecord
-from bstcad.designs.folder import Made
+from bstcad.designs.made import Made
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.surfaces.sides import as_pair
 from bstcad.optics.trace.reach import MAX_EXIT_ANGLE, grazing_of, spread_at, unreached
 from bstcad.runs import processes
 from bstcad.scene.errors import SceneError
-from bstcad.scene.quality import ResolvedTailoring
 from bstcad.scene.scene import Scene
+from bstcad.tailoring import effort as efforts
 from bstcad.tailoring import slope_map, stage1, stage2, two_faces
 from bstcad.tailoring.baselines import integration, paper
 from bstcad.tailoring.carried import carry_light
@@ -53,6 +53,7 @@ from bstcad.tailoring.run import (
     Steps,
     Task,
 )
+from bstcad.tailoring.settings import Settings
 from bstcad.tailoring.source_image import ExtendedSource
 from bstcad.tailoring.stage2 import PrecisionComparison, compare_precisions
 from bstcad.transport.mapping import Mapping, TransportMap
@@ -99,7 +100,7 @@ class DesignState:
     first: Stage1State | None = None  # state of stage 1; None: it has not begun, or it has ended
     followed: Stage1Result | None = None  # result of stage 1; None: it has not ended
     second: Stage2State | None = None  # state of stage 2 or 3; None: it has not begun, or it has ended
-    best: RatedLens | None = None  # best lens before or during stage 2 or 3; None: stage not running, or a preview
+    best: RatedLens | None = None  # best lens before or during stage 2 or 3; None: not running, or no lens is rated
     lens: Parameters | None = None  # lens after stage 2 or 3; None: tailoring has not ended
     stopped: str = ""  # reason why tailoring ended; "": it has not ended
 
@@ -110,7 +111,7 @@ class DesignOptions:
 
     merit: PictureError | None = None  # function of a picture and the target that stages 2 and 3 minimise; None: RRMSD²
     compare_later: bool = False  # compare float32 with float64 only when a report needs it (`Made.with_report_data`)
-    preview: bool = False  # make a preview, see `Task.preview`
+    effort: efforts.TailoringEffort | None = None  # effort beside the scene's settings; None: FULL
     earlier: Earlier | None = None  # earlier lens that stage 2 or 3 refines; None: stage 1 makes a lens
 
 
@@ -145,21 +146,22 @@ def design(
     torch.manual_seed(scene.tailoring.seed)
     device = device_for(device)
     goals, edge = within_reach(scene, hooks.progress)
-    knobs = scene.tailoring.resolved(scene.lens.back.net)
-    later = options.compare_later and knobs.max_time is None
-    task = replace(task_of(scene, goals, knobs, edge), progress=hooks.progress, merit=merit, preview=options.preview)
+    settings = scene.tailoring.resolved(scene.lens.back.net)
+    later = options.compare_later and settings.max_time is None
+    task = task_of(scene, goals, settings, edge)
+    task = replace(task, progress=hooks.progress, merit=merit, effort=options.effort or efforts.FULL)
     if options.earlier is not None:
-        if PROCEDURES[knobs.method][2] is not stage2.steps:
-            raise SceneError(f"tailoring.method: {knobs.method!r} refines no earlier lens; remove this key")
+        if PROCEDURES[settings.method][2] is not stage2.steps:
+            raise SceneError(f"tailoring.method: {settings.method!r} refines no earlier lens; remove this key")
         task = replace(task, refines=True)
-    if not task.preview:  # a preview is so small that the return of its memory takes longer than it helps
+    if task.effort.rates_lenses:  # a preview is so small that the return of its memory takes longer than it helps
         task = replace(task, tidy=processes.return_freed)
     task = with_solution(scene, task)
     fresh, start = start is None, start or DesignState(DesignRecord())
-    limit, reserved = math.inf if knobs.max_time is None else knobs.max_time, reserve(scene) + RRMSD_SECONDS
+    limit, reserved = math.inf if settings.max_time is None else settings.max_time, reserve(scene) + RRMSD_SECONDS
     driver = Driver(hooks, began, limit=limit, reserve=reserved, record=start.record)
-    precision = getattr(torch, knobs.precision)
-    lens = scene.flat_lens(knobs.levels[0], as_wide_as=knobs.levels[-1]).to(precision, device)
+    precision = getattr(torch, settings.precision)
+    lens = scene.flat_lens(settings.levels[0], as_wide_as=settings.levels[-1]).to(precision, device)
     if not scene.lens.back.optimise:  # no stage refines a back that stays flat
         lens = lens.with_back(lens.back_net.refined(scene.lens.back.net))
     if fresh:
@@ -205,17 +207,18 @@ def within_reach(scene: Scene, progress: Progress) -> tuple[tuple[Goal, ...], Ed
     return tuple(goals), edge
 
 
-def task_of(scene: Scene, goals: Sequence[Goal], knobs: ResolvedTailoring, edge: Edge | None) -> Task:
-    """Return the task of a scene; goals, edge: results of `within_reach`; knobs: [tailoring] with all defaults."""
+def task_of(scene: Scene, goals: Sequence[Goal], settings: Settings, edge: Edge | None) -> Task:
+    """Return the task of a scene; goals, edge: results of `within_reach`; settings: [tailoring] with all defaults."""
     light = scene.with_source_scaled(0.0).channels()
-    sizes = stage2.SOURCE_SIZES if scene.source.extent and knobs.method != "integration" else ()
+    sizes = stage2.SOURCE_SIZES if scene.source.extent and settings.method != "integration" else ()
     scaled = [scene.with_source_scaled(share) for share, _ in sizes]
-    sources = tuple(ExtendedSource(each.light, light, each.draw) for each in scaled if each.draw)
+    sources = tuple(ExtendedSource(each.light, light, each.sampler) for each in scaled if each.sampler)
     return Task(
-        light, tuple(goals), knobs, min_thickness=scene.lens.min_thickness, bounds=scene.lens.bounds,
+        light, tuple(goals), settings, min_thickness=scene.lens.min_thickness, bounds=scene.lens.bounds,
         free=scene.lens.front.free, rim_sags=scene.rim_sags, front_sides=scene.lens.front_net,
         sampled_sources=tuple(each.channels() for each in scaled), extended_sources=sources,
-        edge=edge, wave=scene.wavefront, solution=None if knobs.solution is None else SOLUTION_SIGNS[knobs.solution],
+        edge=edge, wave=scene.wavefront,
+        solution=None if settings.solution is None else SOLUTION_SIGNS[settings.solution],
     )  # fmt: skip
 
 
@@ -226,7 +229,7 @@ def with_solution(scene: Scene, task: Task) -> Task:
     `task.progress` reports the angles and limits of the faces.  SceneError if the faces cannot make the pictures.
     """
     lens = scene.flat_lens(REACH_NET)
-    if not lens.shapes_two_faces or not task.several:
+    if not lens.has_two_tailored_faces or not task.several:
         return task
     demand = find_demand(task, task.heaviest.through(lens))
     sentences = tuple(demand.sentences(scene.lens.back.z - scene.lens.front.z))
@@ -239,10 +242,10 @@ def with_solution(scene: Scene, task: Task) -> Task:
 
 def second_stage(task: Task, lens: Lens, state: Stage2State | None = None) -> tuple[str, Steps]:
     """Return (name, steps) of the stage after stage 1, from `state` on: stage 2, or 3 for a source of finite size."""
-    *_, stage = PROCEDURES[task.knobs.method]
+    *_, stage = PROCEDURES[task.settings.method]
     if not task.sampled_sources:
         return "stage 2", stage(task, lens, state)
-    before = stage if task.knobs.method == "adam" else None  # the paper's procedure is for point sources
+    before = stage if task.settings.method == "adam" else None  # the paper's procedure is for point sources
     return "stage 3", stage2.with_stage3(before, task, lens, state)
 
 
@@ -267,7 +270,7 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
         return found.part, None  # no part of the light is held from total internal reflection yet
     part = found.part
     if part is not None and scene.lens.front.free:  # another front may send light further
-        free, effort = scene.lens.front.free, stage1.FrontSearch(repeats=1)
+        free, effort = scene.lens.front.free, efforts.FrontSearch(repeats=1)
         shaped = stage1.shaped_front(light.source, lens, goal, free, rim_sags=scene.rim_sags, effort=effort)
         part = reach_of(light.source, lens.with_front(shaped.front), goal, grazing=grazing).part
     if part is None:
@@ -378,13 +381,13 @@ def _stage1(
     """Run stage 1 from the blank or from a state; if `compare`, then compare the precisions."""
     if driver.reason_to_interrupt and state is None:
         raise KeyboardInterrupt  # there is no lens yet
-    name, stage, _ = PROCEDURES[task.knobs.method]
+    name, stage, _ = PROCEDURES[task.settings.method]
     like = lens.like
     if scene.lens.front.is_tailored:  # stage 1 of two faces runs in numpy, on the CPU
         stage, lens = two_faces.steps, lens.to(like.dtype, "cpu")
     steps = stage(task, lens, state)
     last = driver.run(steps, task, lambda state: DesignState(driver.record, state), lambda: driver.reason_to_interrupt)
-    lens = replace(last.lens, behind=lens.behind, shaped=lens.shaped).to(like.dtype, like.device)
+    lens = replace(last.lens, behind=lens.behind, tailored=lens.tailored).to(like.dtype, like.device)
     check_front(lens, scene)
     bounds = active_bounds(lens, task.bounds, task.min_thickness)
     if bounds is None:
@@ -393,7 +396,7 @@ def _stage1(
     driver.end(name, rrmsd)
     if bounds is not None:
         driver.hooks.progress(BOUNDS_STAGE, 0, 1, "")
-        if lens.shapes("front"):  # shifted before stage 2, which corrects the light but does not shift the back
+        if lens.is_tailored("front"):  # shifted before stage 2, which corrects the light but does not shift the back
             lens = place_back(lens, lens.back.z, task.min_thickness, bounds)
         lens = enforce_bounds(lens, bounds)
         check_thickness(lens, scene)
@@ -403,7 +406,7 @@ def _stage1(
     if compare and not driver.reason_to_end:
         precision = compare_precisions(task, lens)
         driver.end(COMPARISON_STAGE)
-    screen, mapping = task.goals[0].receiver, last.mapping
+    screen, mapping = task.goals[0].screen, last.mapping
     assert mapping is not None, "each step of stage 1 has its map"
     if last.face_points is None:
         sent = slope_map.map_from_entrance(mapping, lens, screen)
@@ -424,14 +427,15 @@ def _stage2(
     name, steps = second_stage(task, lens, state)
     full = task.at_full_size
     known = not task.sampled_sources and lens.clear is None
-    first = None if task.preview else full.rated(lens, followed.rrmsd if known else full.rrmsd(lens))
+    rates = task.effort.rates_lenses
+    first = full.rated(lens, followed.rrmsd if known else full.rrmsd(lens)) if rates else None
 
     def design_state(state: Stage2State) -> DesignState:
         return DesignState(driver.record, None, followed, state, best=driver.best)
 
     last = driver.run(steps, full, design_state, lambda: driver.reason_to_end, best=best or first)
     lens = _final_lens(full, driver, last, [each for each in (driver.best, first) if each is not None])
-    total = task.knobs.stage2_iterations
+    total = task.settings.stage2_iterations
     driver.hooks.progress(name, total, total, driver.stopped)
     if driver.stopped != "interrupt":
         final = Parameters.of(lens)
@@ -446,13 +450,13 @@ def _final_lens(task: Task, driver: Driver, last: StageStep, before: Sequence[Ra
     """
     lens = last.lens
     corrected, value = _corrected(task, lens), last.rays_rrmsd
-    if task.preview:
+    if not task.effort.rates_lenses:
         return corrected
     if active_bounds(lens, task.bounds, task.min_thickness) is not None:
         driver.end(BOUNDS_STAGE, value := task.rrmsd(corrected))
     elif value is not None and (_is_changed(lens, corrected) or not last.at_full_size):
         value = task.rrmsd(corrected)
-    if value is None or task.knobs.method == "adam":
+    if value is None or task.settings.method == "adam":
         return corrected
     latest = task.rated(corrected, value)
     for known in before:
@@ -471,7 +475,7 @@ def _corrected(task: Task, lens: Lens) -> Lens:
     if task.edge is not None:
         lens = without_reflection(lens, task.edge)
     bounds = active_bounds(lens, task.bounds, task.min_thickness)
-    if not lens.shapes("front"):  # stage 2 may bend the back freely where no light falls
+    if not lens.is_tailored("front"):  # stage 2 may bend the back freely where no light falls
         lens = place_back(lens, lens.back.z, task.min_thickness, bounds)
     return lens if bounds is None else enforce_bounds(lens, bounds)
 

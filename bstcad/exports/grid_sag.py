@@ -221,19 +221,19 @@ def shift_between(lens: Lens, other: Lens, light: GridLight) -> Shift | None:
     for screen in light.screens:
         square = weight = largest = 0.0
         for rays in launch_strips(light.source, lens, SHIFT_RAYS, 0):
-            one, two = (trace(rays, each, screen.plane) for each in (lens, other))
+            one, two = (trace(rays, each, screen.receiver) for each in (lens, other))
             flux = torch.where(one.alive & two.alive, one.flux, torch.zeros_like(one.flux))
             squares = torch.where(flux > 0, ((two.position - one.position) ** 2).sum(0), torch.zeros_like(flux))
             square, weight = square + float(total(flux * squares)), weight + float(total(flux))
             largest = max(largest, float(squares.max())) if squares.numel() else largest  # a strip may launch no rays
         pixel = min((screen.x[1] - screen.x[0]) / screen.columns, (screen.y[1] - screen.y[0]) / screen.rows)
-        found += [Shift((square / weight) ** 0.5, largest**0.5, pixel, screen.plane.unit)] if weight else []
+        found += [Shift((square / weight) ** 0.5, largest**0.5, pixel, screen.receiver.unit)] if weight else []
     return max(found, key=lambda each: each.rms / each.pixel, default=None)
 
 
 def shift_by_patches(lens: Lens, face: Surface, patches: Patches, light: GridLight) -> Shift | None:
     """Return the shift of the light if `patches` replace `face` of a lens; None: no light reaches any target."""
-    plain = replace(lens, losses=None).shaping("back")
+    plain = replace(lens, losses=None).with_tailored("back")
     other = plain.with_back(patches) if face is lens.back else plain.with_front(patches)
     return shift_between(plain, other, light)
 

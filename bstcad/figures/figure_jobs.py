@@ -23,7 +23,7 @@ from bstcad.designs.course import CurvePoint, StageRecord
 from bstcad.figures import light_figures, photometric_figures, rendering
 from bstcad.figures.drawing import BLUE, GLASS, GREY, VERMILION, footnote, new_figure, png, round_up, steps, styled
 from bstcad.figures.light_figures import View, plain_ticks
-from bstcad.figures.rendering import LightPath
+from bstcad.figures.rendering import RayPath
 from bstcad.figures.wavefront_figure import wavefront_map
 from bstcad.optics.lens.base import on_base
 from bstcad.optics.lens.lens import Lens
@@ -126,20 +126,20 @@ class NoPictures(Pictures):
 def draw_lens(source: Emitter, lens: Lens, screens: Sequence[Screen], view: View) -> Pngs:
     """Return maps of the back and of a tailored front, and a side view of the lens; `view` is not used."""
     screens = [drawn(screen, lens) for screen in screens]
-    farthest = max(screens, key=lambda screen: screen.plane.throw(0.0))
+    farthest = max(screens, key=lambda screen: screen.receiver.throw(0.0))
     of_front = {}
-    if lens.shapes("front"):
+    if lens.is_tailored("front"):
         of_front["surface_front"] = png(surface_maps(lens, survey_front(lens), face="front"))
     return {
         "surface": png(surface_maps(lens, survey(lens))),
         **of_front,
-        "side_view": png(side_view(lens, fan(source, lens, farthest.plane), screens)),
+        "side_view": png(side_view(lens, fan(source, lens, farthest.receiver), screens)),
     }
 
 
 def draw_transport(source: Emitter, lens: Lens, screen: Screen, view: View) -> Pngs:
     """Return the picture of the transport map from the lens to a screen."""
-    grid, image = ray_map(source, lens, screen.plane)
+    grid, image = ray_map(source, lens, screen.receiver)
     return {numbered("transport", view.number): png(transport_map(grid, image, view, lens.back.chart))}
 
 
@@ -285,12 +285,12 @@ def side_view(lens: Lens, rays: np.ndarray, screens: Sequence[Screen] = ()) -> F
     close.set(title=f"{lens.passes.optic.capitalize()}, cut along y = 0", aspect="equal")
     whole.set_title("Whole path, source to target (axes at different scales)")
     several = len(screens) > 1
-    visible = [screen for screen in screens if several or not screen.plane.is_level]
+    visible = [screen for screen in screens if several or not screen.receiver.is_level]
     for screen in visible:
         edges = corners(screen)
         whole.fill(edges[:, 2], edges[:, 0], facecolor="none", edgecolor=GREY, linewidth=1.0, gid="screen")
     if visible:
-        tilt = visible[0].plane.tilt
+        tilt = visible[0].receiver.tilt
         one = f"Grey: the target, its plane tilted by {tilt_words(tilt)}." if tilt else "Grey: the target."
         footnote(figure, "Grey: the targets." if several else one)
     return figure
@@ -353,7 +353,7 @@ def convergence(history: Sequence[CurvePoint], stages: Sequence[StageRecord], no
     axes.set_xlim(0.0, last)
     for end in ends[1:]:
         axes.axvline(end, color=GREY, linewidth=0.6, linestyle=":")
-    parts = zip((stage.name.partition(",")[0] for stage in stages), ends, ends[1:], strict=False)
+    parts = zip((stage.stage for stage in stages), ends, ends[1:], strict=False)
     for name, rounds in groupby(parts, key=itemgetter(0)):
         (_, start, end), *others = rounds
         end = others[-1][2] if others else end
@@ -368,19 +368,19 @@ def convergence(history: Sequence[CurvePoint], stages: Sequence[StageRecord], no
 # --- a lens at work ---------------------------------------------------------------------------------------------------
 
 
-def light_path_of(scene: Scene, lens: Lens, pictures: Sequence[tuple[np.ndarray, np.ndarray]]) -> LightPath | None:
+def light_path_of(scene: Scene, lens: Lens, pictures: Sequence[tuple[np.ndarray, np.ndarray]]) -> RayPath | None:
     """Return lens, rays and pictures for `bstcad show`; None if no light reaches the furthest target.
 
     pictures: (target, irradiance) of each target of the scene, (rows, columns) each.
     """
     source, wanted_screens = scene.light.central, [target.screen for target in scene.targets]
     screens = [drawn(screen, lens) for screen in wanted_screens]
-    rays, flux = bundle(source, lens, max(screens, key=lambda screen: screen.plane.throw(0.0)).plane, RAYS)
+    rays, flux = bundle(source, lens, max(screens, key=lambda screen: screen.receiver.throw(0.0)).receiver, RAYS)
     if not len(rays):
         return None
     mesh = meshes.lens_mesh(lens, LIGHT_PATH_CELLS)
     of = "from the centre of the source" if scene.source.extent is not None else "from the source"
-    return LightPath(
+    return RayPath(
         vertices=mesh.vertices,
         faces=mesh.faces,
         rays=rays,
@@ -399,18 +399,18 @@ def _sizes(screens: Sequence[Screen]) -> str:
     """Return the sizes and positions of the targets in words."""
     sizes = (
         f"{number(x[1] - x[0])} × {number(y[1] - y[0])} {plane.unit} at {plane.position_text()}"
-        for plane, x, y in ((screen.plane, screen.x, screen.y) for screen in screens)
+        for plane, x, y in ((screen.receiver, screen.x, screen.y) for screen in screens)
     )
     return f"Target{'s' * (len(screens) > 1)} {', '.join(sizes)}"
 
 
 def drawn(screen: Screen, lens: Lens) -> Screen:
     """Return the screen as pictures show it: directions at a distance of a few lens widths."""
-    place = screen.plane.drawn(2 * max(lens.plan.half_extent), lens.back.z)
-    return screen if place == screen.plane else replace(screen, surface=place)
+    place = screen.receiver.drawn(2 * max(lens.plan.half_extent), lens.back.z)
+    return screen if place == screen.receiver else replace(screen, surface=place)
 
 
 def corners(screen: Screen) -> np.ndarray:
     """Return the corners of a screen in space (4, 3), mm, in order around it from x min, y min."""
-    around = [screen.plane.point(x, y) for y, x in product(screen.y, screen.x)]
+    around = [screen.receiver.point(x, y) for y, x in product(screen.y, screen.x)]
     return np.array(around)[[0, 1, 3, 2]]

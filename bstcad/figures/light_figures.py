@@ -100,7 +100,7 @@ class View:
         target = scene.targets[number]
         side: dict[str, Any] = {"optic": scene.optic, "folded": scene.folded}
         side["lumens"] = scene.source.luminous_flux
-        return cls(target.x, target.y, target.seen_from, receiver=target.screen.plane, number=number, **side)
+        return cls(target.x, target.y, target.seen_from, receiver=target.screen.receiver, number=number, **side)
 
     def with_flux(self, target: np.ndarray, on_target: float) -> View:
         """Return the view with the mean light of the lit pixels; on_target: flux there / flux of the source."""

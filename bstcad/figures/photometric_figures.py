@@ -51,7 +51,7 @@ def far_field_of(scene: Scene) -> FarField:
     target = scene.target
     wanted = target.intensity if isinstance(target, AngularTarget) else None
     return FarField(
-        scene.verification_channels(), scene.source.luminous_flux, ghost=scene.ghost, draw=scene.draw,
+        scene.verification_channels(), scene.source.luminous_flux, ghost=scene.ghost, sampler=scene.sampler,
         grid=None if wanted is None else grid_of(wanted.table),
     )  # fmt: skip
 
@@ -67,7 +67,7 @@ def draw_far_field(far: FarField, lens: Lens, view: View) -> dict[str, bytes]:
 
     view: its coordinates are those of the isocandela diagram if it is over directions.
     """
-    table = far.table(lens, rays=POINT_SOURCE_RAYS if far.draw is None else RAYS)
+    table = far.table(lens, rays=POINT_SOURCE_RAYS if far.sampler is None else RAYS)
     if not table.candela.any():
         return {}
     known = far.lumens is not None

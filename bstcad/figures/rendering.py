@@ -79,7 +79,7 @@ def lens_picture(mesh: Mesh) -> bytes | None:
         return picture.read_bytes() if done and picture.exists() else None
 
 
-def draw(path: LightPath, picture: Path | None) -> bool:
+def draw(path: RayPath, picture: Path | None) -> bool:
     """Draw into the PNG `picture`, or if None in a window until it closes; False: this machine cannot draw in 3-D."""
     given = vars(path).items()
     arrays = {name: np.asarray(value) for name, value in given if not isinstance(value, tuple)}
@@ -126,7 +126,7 @@ def main(arrays: str, picture: str) -> None:
         return
     for name in [name for name in values if " " in name]:  # elements of a tuple, in their order
         values[name.split()[0]] = (*values.get(name.split()[0], ()), values.pop(name))
-    plotter = plotter_of(LightPath(**values), off_screen=bool(picture))
+    plotter = plotter_of(RayPath(**values), off_screen=bool(picture))
     if picture:
         plotter.screenshot(picture)
     else:
@@ -170,7 +170,7 @@ def _add_lights(plotter: Any, lights: Iterable[tuple[Any, float]], centre: Any) 
 
 
 @dataclass(frozen=True, eq=False)
-class LightPath:
+class RayPath:
     """Solid, rays coloured by their flux, and screens with their pictures; lengths in mm."""
 
     vertices: np.ndarray  # vertices of the lens, (n, 3)
@@ -186,7 +186,7 @@ class LightPath:
     words: str  # caption of one or two lines
 
 
-def plotter_of(path: LightPath, off_screen: bool) -> Any:
+def plotter_of(path: RayPath, off_screen: bool) -> Any:
     """Return a pyvista plotter with two views: the lens close up at the left, the whole path at the right, to scale."""
     import pyvista
 
@@ -228,7 +228,7 @@ def _add_text(plotter: Any, words: str, place: tuple[float, float], size: int, c
     plotter.add_text(words, position=place, viewport=True, font_size=size, color=colour, font_file=str(font))
 
 
-def _close_rays(path: LightPath) -> np.ndarray:
+def _close_rays(path: RayPath) -> np.ndarray:
     """Return every RAY_STEP-th ray, cut to RAY_REACH diagonals of the lens before its first and after its last face."""
     reach = RAY_REACH * np.linalg.norm(np.ptp(path.vertices, axis=0))
     rays = path.rays[::RAY_STEP].copy()
@@ -239,7 +239,7 @@ def _close_rays(path: LightPath) -> np.ndarray:
     return rays
 
 
-def _add_lens(plotter: Any, solid: Any, path: LightPath) -> None:
+def _add_lens(plotter: Any, solid: Any, path: RayPath) -> None:
     """Add the solid of transparent glass or of metal, two lights, and a sphere at a point source."""
     import pyvista
 
@@ -286,7 +286,7 @@ def _add_screen(plotter: Any, screen: np.ndarray, picture: np.ndarray, opacity: 
     plotter.add_mesh(border, color=SOFT, line_width=1.5, lighting=False)
 
 
-def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarray, filled: float) -> None:
+def _frame(plotter: Any, points: np.ndarray, path: RayPath, towards: np.ndarray, filled: float) -> None:
     """Look from direction `towards` (`_clear_of_screen`), y up; the points fill the fraction `filled` of the view."""
     towards = _clear_of_screen(path, towards)
     right = np.cross([0.0, 1.0, 0.0], towards)
@@ -310,7 +310,7 @@ def _frame(plotter: Any, points: np.ndarray, path: LightPath, towards: np.ndarra
     plotter.reset_camera_clipping_range()
 
 
-def _clear_of_screen(path: LightPath, towards: np.ndarray) -> np.ndarray:
+def _clear_of_screen(path: RayPath, towards: np.ndarray) -> np.ndarray:
     """Return `towards` as a unit vector; the sign of x is such that the first screen does not cover the lens."""
     offset = path.screens[0][:, 0].mean() - path.vertices[:, 0].mean()
     return towards * [-1 if offset > 0 else 1, 1, 1] / np.linalg.norm(towards)
@@ -319,7 +319,7 @@ def _clear_of_screen(path: LightPath, towards: np.ndarray) -> np.ndarray:
 # --- the model that a reader can rotate -------------------------------------------------------------------------------
 
 
-def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> str:
+def turnable(lens: Lens, path: RayPath | None = None, cells: int = FINE) -> str:
     """Return the JSON for solid_view.js: the faces in mm, the lamps that shade them, and the rays of `path`.
 
     cells: cells of a net per axis, even; fewer for a preview that is sent often (256: 0.9 MB, 96: 0.2 MB).
@@ -396,7 +396,7 @@ def turnable(lens: Lens, path: LightPath | None = None, cells: int = FINE) -> st
     return json.dumps(shape | lit | FINISH | {"values": numbers} | light)
 
 
-def _light(path: LightPath) -> dict[str, Any]:
+def _light(path: RayPath) -> dict[str, Any]:
     """Return a light path as JSON values; positions in mm.
 
     rays: at most MAX_MODEL_RAYS rays, each with its points from the source to the furthest screen.  flux: flux of each

@@ -28,7 +28,7 @@ from typing_extensions import TypedDict
 from bstcad.designs.folder import SCENE, read_nominal, scene_files
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.bspline import BSplineSurface
@@ -173,7 +173,10 @@ def calibration_kernel(tubes: int = KERNEL_TUBES) -> Callable[[], Any]:
     back = BSplineSurface(KERNEL_THICKNESS, WAVE_HEIGHT * u.cos()[:, None] * u.cos(), span, span)
     lens = Lens(Plane(0.0), back, outline, KERNEL_INDEX)
     target = np.full((KERNEL_PIXELS, KERNEL_PIXELS), 1.0)
-    channel, screen = Channel(Collimated(outline), KERNEL_INDEX), Screen(KERNEL_SCREEN_Z, span, span, KERNEL_PIXELS)
+    channel, screen = (
+        Channel(CollimatedSource(outline), KERNEL_INDEX),
+        Screen(KERNEL_SCREEN_Z, span, span, KERNEL_PIXELS),
+    )
     merit = Merit.of((channel,), lens, tubes, [Goal("target", screen, target)], overshoot=0.03)
     evaluate = partial(Problem(lens, merit), [back.heights])
     evaluate()  # compiles the kernels and allocates memory
@@ -328,7 +331,7 @@ def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick:
 def judge_run(run: ColdRun, base: Scene, folder: Path, effort: Effort) -> ColdRun:
     """Return `run` with the RRMSD of the lens in `folder` by `effort`: the largest on the targets of `base`."""
     lens, channels = read_nominal(folder)[1].lens, base.verification_channels()
-    lights = measure_goals(lens, channels, base.goals, effort, ghost=base.ghost, draw=base.draw)
+    lights = measure_goals(lens, channels, base.goals, effort, ghost=base.ghost, sampler=base.sampler)
     if not all(light.rrmsd >= 0 for light in lights):
         return run.model_copy(update={"status": FAILED, "reason": "none of its light falls on the target"})
     light = max(lights, key=lambda light: light.rrmsd)

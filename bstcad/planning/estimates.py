@@ -22,7 +22,7 @@ from bstcad.designs.course import DesignCourse
 from bstcad.optics.lens import media
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.profiles import pair_of
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.surfaces.sides import as_pair
@@ -33,6 +33,7 @@ from bstcad.scene.real_source import DEFAULT_DIAMETER as DEFAULT_DIAMETER
 from bstcad.scene.real_source import DEFAULT_DIVERGENCE as DEFAULT_DIVERGENCE
 from bstcad.scene.real_source import real_size
 from bstcad.scene.scene import Scene
+from bstcad.tailoring.effort import FrontSearch
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import Solver, face_grid, fit_to_map, lit_window, slope_map, square_grid
@@ -57,7 +58,7 @@ def coarse_lens(scene: Scene) -> Lens:
         from bstcad.tailoring import stage1  # with scipy.optimize, a tenth of a second to load
 
         start = replace(lens, back=scene.flat_lens(FRONT_NET).back)
-        free, effort = scene.lens.front.free, stage1.FrontSearch(COARSE_CELLS, COARSE_STEPS, repeats=1)
+        free, effort = scene.lens.front.free, FrontSearch(COARSE_CELLS, COARSE_STEPS, repeats=1)
         found = stage1.shaped_front(channel.source, start, goal, free, rim_sags=scene.rim_sags, effort=effort)
         lens = replace(lens, front=found.front)
     slopes, z = None, lens.back.z
@@ -115,7 +116,7 @@ def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ..
 def _diffraction(scene: Scene, reference: Reference) -> LeftOut:
     """Return diffraction at the aperture; over directions with its blur λ / D in degrees."""
     change, screen, words = reference.diffraction(), scene.target.screen, "at the whole aperture"
-    if change is not None and screen.plane.unit == "degrees":
+    if change is not None and screen.receiver.unit == "degrees":
         blur = change.blur / math.sqrt(math.prod(screen.per_unit))
         words = f"{words}, λ/D = {blur:.2g} degrees"
     return _entry("diffraction", change, words)
@@ -210,7 +211,7 @@ def _bands(lines: Sequence[float]) -> list[tuple[float, float]]:
 def band(scene: Scene) -> tuple[float, float]:
     """Return the band (low, high), nm, assumed for one wavelength: VISIBLE_BAND for sunlight, else LINE_WIDTH wide."""
     source = scene.source
-    if isinstance(source, Collimated):
+    if isinstance(source, CollimatedSource):
         divergences = pair_of(source.divergence or source.real_divergence or 0.0)
         if all(SUN_ANGLES[0] <= divergence <= SUN_ANGLES[1] for divergence in divergences):
             return VISIBLE_BAND
@@ -233,15 +234,13 @@ def _entry(kind: str, change: Change | None, detail: str = "", simulate_by: str 
 
 # --- the diagnosis of a finished design -------------------------------------------------------------------------------
 
-SIZE_STAGE_PREFIX = "stage 3, "  # beginning of the names of the rounds of stage 3 (stage2.SOURCE_SIZES)
-
 
 def diagnosis(scene: Scene, making: DesignCourse, proof: Proof, target: np.ndarray) -> dict[str, Any]:
     """Return the entries convergence, remaining_error and bounds of report.json (record.Contents).
 
     scene: scene with only the target of the largest RRMSD in the proof.  target: its picture (rows, columns).
     """
-    sizes = [k for k, stage in enumerate(making.stages) if stage.name.startswith(SIZE_STAGE_PREFIX)]
+    sizes = [k for k, stage in enumerate(making.stages) if stage.is_round and stage.stage == "stage 3"]
     curve = ending(
         [(point.seconds, point.rrmsd) for point in making.history],
         [(stage.seconds, stage.rrmsd) for stage in making.stages],
@@ -253,8 +252,8 @@ def diagnosis(scene: Scene, making: DesignCourse, proof: Proof, target: np.ndarr
         "at": {key: at.share for key, at in reached.items()},
         "tightest": {key: at.tightest for key, at in reached.items()},
     }
-    if proof.lens.shapes("front"):
-        bounds["both" if proof.lens.shapes("back") else "front"] = True  # faces with bounds
+    if proof.lens.is_tailored("front"):
+        bounds["both" if proof.lens.is_tailored("back") else "front"] = True  # faces with bounds
     error = remaining(proof.light.picture, target, scene.target.screen.per_unit)
     return {
         "convergence": None if curve is None else asdict(curve),

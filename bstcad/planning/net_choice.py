@@ -185,7 +185,7 @@ def seam_shift(scene: Scene) -> float:
     if radius is None:
         return math.inf
     deflection = max(scene.lens.passes.deflection(face, scene.index) for face in scene.lens.tailored_faces)
-    throw = abs(target.screen.plane.per_radian(scene.lens.back.z)) * deflection / radius
+    throw = abs(target.screen.receiver.per_radian(scene.lens.back.z)) * deflection / radius
     return throw * math.sqrt(math.prod(scene.lens.cells)) * math.sqrt(math.prod(target.screen.per_unit))
 
 
@@ -208,8 +208,8 @@ def area_cells(scene: Scene, lens: Lens) -> ControlCells:
     columns, rows = as_pair(screen.pixels)
     tiles = replace(screen, pixels=(-(-columns // TILE_PIXELS), -(-rows // TILE_PIXELS)))
     tubes = launch_tubes(light.source, lens, DENSITY_TUBES)
-    x, y = cross(tubes.rays, lens.interfaces[lens.freeform[0]]).rays.position[:2]
-    landed = tubes.landing(lens, screen.plane)
+    x, y = cross(tubes.rays, lens.interfaces[lens.tailored_numbers[0]]).rays.position[:2]
+    landed = tubes.landing(lens, screen.receiver)
     flux, corners = tubes.arriving_flux(landed), landed.position.double()
     area = torch.where(flux > 0, area_of(x, y).double(), torch.zeros_like(flux))
     area, flux = (

@@ -28,7 +28,7 @@ from bstcad.runs.processes import Tick
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.scene import Scene
 from bstcad.scene.schema import MAX_CONTROL_POINTS
-from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT
+from bstcad.verify.nominal import DEFAULT_RRMSD_LIMIT
 
 CAVEAT = "Estimates assume one target and one tailored face; with several, the lens deflects light differently."
 

@@ -28,9 +28,9 @@ from bstcad.optics.surfaces.sides import Sides, as_pair, coarser
 from bstcad.optics.trace.measure import Effort, measure_goals
 from bstcad.planning.cold_run import KERNEL_REPEATS, calibration_kernel, measure_seconds
 from bstcad.runs.processes import Tick
-from bstcad.scene.quality import COARSEST_GRID
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.run import RRMSD_SECONDS, Hooks, Task
+from bstcad.tailoring.settings import COARSEST_GRID
 from bstcad.tailoring.slope_map import SUBCELLS
 from bstcad.tailoring.stage2 import round_shares, sheet_sizes, stage3_sheet_sizes
 
@@ -47,8 +47,7 @@ MIN_PILOT_POINTS = 65  # minimum control points per side of a pilot, unless its 
 MIN_PILOT_TUBES = 16  # minimum tubes per side of a pilot
 PILOT_CELLS = (16, 256)  # minimum and maximum cells per side of the transport of a pilot
 PILOT_EFFORT = Effort(rays=2048, accuracy=0.02, witness=False, cells=2)  # effort of the measurement of a pilot's RRMSDs
-SEARCH_STAGES = ("stage 2", "stage 3")  # beginnings of the names of stages that use the minimiser
-COARSE_ROUND_TEXT = " pixels, "  # text in the names of rounds with few pixels, whose sizes do not depend on the scene
+SEARCH_STAGES = ("stage 2", "stage 3")  # stages that use the minimiser
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class Seconds:
 
     first: float  # stage 1
     search: float  # stage 2 or 3
-    rest: float  # start, writing, verification, report; for a pilot: loading, and rounds with COARSE_ROUND_TEXT
+    rest: float  # start, writing, verification, report; for a pilot: loading, and coarse rounds
 
     @property
     def total(self) -> float:
@@ -90,16 +89,16 @@ def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
     if compilations.buffer:  # the first design after an installation waits for the compiler; time another one
         finished = make_design()
     light, finer = small.channels(), factor > 1
-    lights = measure_goals(finished.lens, light, finished.goals, PILOT_EFFORT, ghost=None, draw=small.draw)
+    lights = measure_goals(finished.lens, light, finished.goals, PILOT_EFFORT, ghost=None, sampler=small.sampler)
     rrmsd = max(each.rrmsd for each in lights)
     ratios = [each.half.rrmsd / each.rrmsd for each in lights if each.half is not None and each.rrmsd > 0]
-    sides = [max(goal.receiver.shape) for goal in finished.goals]
+    sides = [max(goal.screen.shape) for goal in finished.goals]
     pairs = zip(scene.single_target_scenes(), small.single_target_scenes(), strict=True)
     blurs = [blur_rrmsd(one, finished.lens) - blur_rrmsd(few, finished.lens) for one, few in pairs] if finer else [0.0]
     times = dict.fromkeys(("first", "search", "rest"), 0.0)
     for stage in finished.making.stages:
-        part = "search" if stage.name.startswith(SEARCH_STAGES) else "first"
-        times["rest" if stage.name == "loading" or COARSE_ROUND_TEXT in stage.name else part] += stage.seconds
+        part = "search" if stage.stage in SEARCH_STAGES else "first"
+        times["rest" if stage.name == "loading" or stage.is_coarse else part] += stage.seconds
     transport: Mapping[str, Any] = finished.making.transport or {}
     steep = Steepness(transport["steep_share"], transport["steepest_deg"])
     lost = max(map(detail, (goal.picture for goal in scene.goals), sides)) if finer else 0.0
@@ -116,12 +115,12 @@ def with_quality(scene: Scene, quality: str) -> Scene:
 def pilot_scene(scene: Scene) -> tuple[Scene, float]:
     """Return the scene of a pilot, and the ratio of the pixels per side of the full scene to those of the pilot."""
     net, (pixels, points, tubes) = scene.lens.back.net, PILOT_LIMITS
-    knobs, spans = scene.tailoring.resolved(net), max(as_pair(net)) - 1
+    settings, spans = scene.tailoring.resolved(net), max(as_pair(net)) - 1
     widest = max(max(target.columns_rows) for target in scene.targets)
     factor = max(min(max(widest / pixels, spans / (points - 1)), spans / (MIN_PILOT_POINTS - 1)), 1.0)
     changes: dict[str, Any] = {
-        "tailoring.rays": max(min(round(knobs.rays / factor), tubes), MIN_PILOT_TUBES),
-        "tailoring.transport_grid": int(np.clip(round(knobs.transport_grid / factor), *PILOT_CELLS)),
+        "tailoring.rays": max(min(round(settings.rays / factor), tubes), MIN_PILOT_TUBES),
+        "tailoring.transport_grid": int(np.clip(round(settings.transport_grid / factor), *PILOT_CELLS)),
     }
     for key, target in zip(scene.target_keys, scene.targets, strict=True):
         changes[f"{key}.pixels"] = target.fewer_pixels(factor)
@@ -223,18 +222,20 @@ def pace() -> float:
 
 def typical_seconds(scene: Scene) -> Seconds:
     """Return the times of a design on two cores of pace 1 (see `pace`), estimated from its sizes only."""
-    knobs, point = scene.tailoring.resolved(scene.lens.back.net), not scene.source.parallel
+    settings, point = scene.tailoring.resolved(scene.lens.back.net), not scene.source.parallel
     rest = START_SECONDS + proof_seconds(scene)
-    sheets, net, pixels = search_rounds(scene), (knobs.side / UNIT_POINTS) ** 2, _pixel_ratio(scene)
-    if knobs.method == "adam":
-        step = ADAM_SECONDS * (knobs.rays / UNIT_TUBES) ** 2
-        return Seconds(step * (knobs.stage1_iterations * len(knobs.levels)), step * knobs.stage2_iterations, rest)
+    sheets, net, pixels = search_rounds(scene), (settings.side / UNIT_POINTS) ** 2, _pixel_ratio(scene)
+    if settings.method == "adam":
+        step = ADAM_SECONDS * (settings.rays / UNIT_TUBES) ** 2
+        stage1 = step * (settings.stage1_iterations * len(settings.levels))
+        return Seconds(stage1, step * settings.stage2_iterations, rest)
     halvings, transport = (1, TWO_FACE_TRANSPORT_SECONDS) if scene.lens.front.is_tailored else (2, TRANSPORT_SECONDS)
-    grids = [max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left, halvings)) for left in range(knobs.rounds)]
-    first = ROUND_SECONDS * knobs.rounds + (FRONT_SECONDS if scene.lens.front.free else 0.0)
+    grids = [max(COARSEST_GRID, settings.transport_grid // 2 ** min(left, halvings)) for left in range(settings.rounds)]
+    first = ROUND_SECONDS * settings.rounds + (FRONT_SECONDS if scene.lens.front.free else 0.0)
     first += TWO_FACE_SECONDS if scene.lens.front.is_tailored else 0.0
-    first += transport * sum((grid / UNIT_GRID) ** 2 for grid in grids) * knobs.transport_iterations / UNIT_ITERATIONS
-    fits = [fitted for level in knobs.levels[-2:] for fitted in scene.lens.nets(level)]
+    cells = sum((grid / UNIT_GRID) ** 2 for grid in grids)
+    first += transport * cells * settings.transport_iterations / UNIT_ITERATIONS
+    fits = [fitted for level in settings.levels[-2:] for fitted in scene.lens.nets(level)]
     first += FIT_SECONDS * sum(math.prod(as_pair(fitted)) for fitted in fits) / UNIT_POINTS**2
     each, begun = CALL_SECONDS + VARIABLE_SECONDS * net, RRMSD_SECONDS * pixels ** (2 / 3)  # per evaluation, round
     if scene.source.extent is not None:
@@ -243,7 +244,7 @@ def typical_seconds(scene: Scene) -> Seconds:
     tube = len(scene.targets) * EVALUATION_SECONDS  # upper limit: rounds for several pictures may end early
     search = sum(count * (tube * (tubes / UNIT_TUBES) ** 2 + each) + begun for tubes, count in sheets)
     if point:
-        sides = [*(SUBCELLS * grid for grid in grids), min(2 * knobs.side, knobs.rays)]
+        sides = [*(SUBCELLS * grid for grid in grids), min(2 * settings.side, settings.rays)]
         first += AIMING_SECONDS * sum((side / UNIT_TUBES) ** 2 for side in sides)
         search += AIMING_SECONDS * launched
     return Seconds(first, search + RRMSD_SECONDS * pixels ** (2 / 3), rest)
@@ -251,13 +252,12 @@ def typical_seconds(scene: Scene) -> Seconds:
 
 def search_rounds(scene: Scene) -> tuple[tuple[int, int], ...]:
     """Return (tubes per side, number of evaluations) of each round of stage 2 or 3."""
-    knobs = scene.tailoring.resolved(scene.lens.back.net)
+    settings = scene.tailoring.resolved(scene.lens.back.net)
     if scene.source.extent is not None:
         columns, rows = zip(*(target.columns_rows for target in scene.targets), strict=True)
-        return tuple(stage3_sheet_sizes(knobs, (max(columns), max(rows))))
-    return tuple(
-        sheet_sizes(knobs, round_shares(Task((), scene.goals, knobs, bounds=scene.lens.bounds, wave=scene.wavefront)))
-    )
+        return tuple(stage3_sheet_sizes(settings, (max(columns), max(rows))))
+    task = Task((), scene.goals, settings, bounds=scene.lens.bounds, wave=scene.wavefront)
+    return tuple(sheet_sizes(settings, round_shares(task)))
 
 
 def memory_gb(scene: Scene) -> float:

@@ -1,6 +1,6 @@
 """A preview of a scene: the light of its lens after about a second, from a reduced design.
 
-The preview is a quick design (`Task.preview`) of the same scene with fewer pixels, control points, flux tubes and
+The preview is a design with the effort PREVIEW of the same scene with fewer pixels, control points, flux tubes and
 evaluations.  Details finer than its pixels are not shown.
 """
 
@@ -18,7 +18,7 @@ import torch
 from bstcad.analysis.light import Blur, blur
 from bstcad.analysis.shape import describe
 from bstcad.designs import pipeline
-from bstcad.designs.folder import Made
+from bstcad.designs.made import Made
 from bstcad.manufacture.tolerance.as_made import AsMade, as_made
 from bstcad.manufacture.tolerance.lit_by import LitBy, lit_by
 from bstcad.optics.lens.lens import Lens
@@ -29,6 +29,7 @@ from bstcad.optics.trace.measure import side_factor, simulated, tubes_picture
 from bstcad.optics.trace.source_images import landing_pixels
 from bstcad.optics.trace.tubes import corners, middle
 from bstcad.scene.scene import Scene
+from bstcad.tailoring.effort import PREVIEW
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.run import Hooks, Progress
 from bstcad.tailoring.source_image import ExtendedSource
@@ -106,7 +107,7 @@ def preview(scene: Scene, size: PreviewSize = QUICK, outdated: Callable[[], bool
     began, remarks = time.perf_counter(), list(scene.warnings())
     small = reduced_scene(scene, size)
     hooks = Hooks(progress=_progress(outdated, remarks))
-    made = pipeline.design(small, hooks=hooks, options=pipeline.DesignOptions(compare_later=True, preview=True))
+    made = pipeline.design(small, hooks=hooks, options=pipeline.DesignOptions(compare_later=True, effort=PREVIEW))
     return replace(_evaluate(small, made), remarks=tuple(remarks), seconds=time.perf_counter() - began)
 
 
@@ -173,11 +174,11 @@ def _lit_fraction(scene: Scene, lens: Lens) -> float:
 
 @torch.no_grad()
 def _picture(scene: Scene, lens: Lens, goal: Goal) -> np.ndarray:
-    n = round(TUBES_PER_PIXEL * max(goal.receiver.shape))
+    n = round(TUBES_PER_PIXEL * max(goal.screen.shape))
     if (
-        scene.source.extent is None or scene.draw is None
+        scene.source.extent is None or scene.sampler is None
     ):  # a point source; otherwise the picture is blurred with images of the source
-        return tubes_picture(lens, scene.channels(), goal.receiver, n).numpy()
-    source = ExtendedSource(scene.light, scene.with_source_scaled(0.0).channels(), scene.draw)
+        return tubes_picture(lens, scene.channels(), goal.screen, n).numpy()
+    source = ExtendedSource(scene.light, scene.with_source_scaled(0.0).channels(), scene.sampler)
     merit = Merit.of(source.centre, lens, n, [goal], overshoot=0.0).with_blur(source, lens)
     return merit.picture(0, *merit.landing(lens).on_goals)[0].cpu().numpy().clip(min=0.0)

@@ -15,7 +15,7 @@ import statistics
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -97,7 +97,7 @@ def knobs(scene: Scene) -> tuple[Knob, ...]:
              multiples("rays", (1 / 4, HALF, SQRT_HALF, 1, 1 / SQRT_HALF, 2))),
         Knob("control_points", "Control points per side", _choices(NET_KEY, own, nets)),
         Knob("adam", "Adam on control points, by rays",
-             _adam_points(resolved.quality == "paper") if _allows_paper(scene) else {}),
+             _adam_points(scene.tailoring.quality == "paper") if _allows_paper(scene) else {}),
         Knob("precision", "Precision", _choices("tailoring.precision", resolved.precision, ("float32", "float64"))),
         Knob("pixels", "Pixels of the target", _pixels(scene)),
         Knob("rounds", "Rounds of stage 1",
@@ -408,6 +408,7 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
     unit = [run.kernel_seconds for run in comparable.values() if run.kernel_seconds]
     on_front, labels = tuple(run.settings for run in best), _labels(scene, knobs)
     presets = {name: selected[point].time_and_error for name, point in knobs[0].points.items() if point in selected}
+    settings = {key: value for key, value in asdict(scene.tailoring.resolved(own)).items() if value is not None}
     base = {"quality": scene.tailoring.quality, "control_points": own, "pixels": scene.target.columns_rows}
 
     def described(run: ColdRun) -> ColdRun:
@@ -418,7 +419,7 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
     return TradeoffTable(
         name=scene.name,
         title=scene.title,
-        base=base | {"knobs": scene.tailoring.resolved(own).model_dump(exclude_none=True)},
+        base=base | {"knobs": {"quality": scene.tailoring.quality, **settings}},
         budget_seconds=budget,
         spent_seconds=sum(run.cost_seconds or 0.0 for run in runs),
         errors_alone=bool(selected) and not comparable,

@@ -129,7 +129,7 @@ def figures_of(goals: Sequence[Goal], lights: Sequence[Light]) -> tuple[GoalFigu
     return tuple(
         GoalFigures(
             goal.key,
-            goal.receiver.plane.position_text(),
+            goal.screen.receiver.position_text(),
             goal.weight,
             light.rrmsd,
             rrmsd_standard_error=light.standard_error,
@@ -138,9 +138,9 @@ def figures_of(goals: Sequence[Goal], lights: Sequence[Light]) -> tuple[GoalFigu
             efficiency=light.efficiency,
             leak=light.leak and light.leak.share,
             contrast=light.leak and light.leak.contrast,
-            unit=goal.receiver.plane.unit,
-            rrmsd_by_cell=tuple(_cell_figures(light.by_cell, goal.receiver)),
-            right_down_to=None if smallest is None else smallest * goal.receiver.pixel_side,
+            unit=goal.screen.receiver.unit,
+            rrmsd_by_cell=tuple(_cell_figures(light.by_cell, goal.screen)),
+            right_down_to=None if smallest is None else smallest * goal.screen.pixel_side,
         )
         for goal, light, smallest in zip(goals, lights, finest, strict=True)
     )
@@ -150,7 +150,7 @@ def _cell_figures(errors: Sequence[CellError], screen: Screen) -> Iterator[CellF
     """Yield the figures of cells of each size on a screen."""
     for each in errors:
         yield CellFigures(
-            each.cell * screen.pixel_side, screen.plane.unit, each.cell,
+            each.cell * screen.pixel_side, screen.receiver.unit, each.cell,
             rrmsd=each.rrmsd, standard_error=each.standard_error, blurred=each.blurred,
         )  # fmt: skip
 
@@ -184,7 +184,7 @@ def photometry(scene: Scene, proof: Proof) -> Iterator[Photometry]:
     lumens = scene.source.luminous_flux
     for key, target, light in zip(scene.target_keys, scene.targets, proof.lights, strict=True) if lumens else ():
         screen, on_target = target.screen, lumens * light.on_screen
-        unit = screen.plane.photometric_unit
+        unit = screen.receiver.photometric_unit
         mean = peak = error = luminance = None
         if unit is not None and light.picture.any():
             sizes = screen.cell_sizes
@@ -205,7 +205,7 @@ def _luminance(proof: Proof, screen: Screen, peak: float, at: tuple[int, int]) -
     """Return I / A (cd/m²): I = peak (cd) in the direction of the pixel `at`, from which the back has the area A."""
     (row, column), (per_x, per_y) = at, screen.per_unit
     x, y = screen.x[0] + (column + 0.5) / per_x, screen.y[1] - (row + 0.5) / per_y
-    cosine = float(screen.plane.normal(torch.tensor([x, y], dtype=torch.float64))[2])
+    cosine = float(screen.receiver.normal(torch.tensor([x, y], dtype=torch.float64))[2])
     area = float(Silhouette.of(proof.lens).area(np.array([abs(cosine)]))[0])
     return peak / area * PER_LX if area > 0 else None
 

@@ -20,6 +20,8 @@ FIRST = "index"  # name of the first page
 PAGES = ("checks", "remarks")  # pages beside this file, without ".md", whose sections `bstcad docs` also shows singly
 SECTION = re.compile(r"^\(([\w-]+)\)=\n+(### .+?)(?=\n+^(?:\([\w-]+\)=$|#{1,2} )|\s*\Z)", re.M | re.S)
 TO_A_SECTION = re.compile(r"\[([^]]+)\]\((?:\w+\.md)?#([\w-]+)\)")
+INCLUDED = re.compile(r"^```\{include\} (\S+)$.*?^```$\n?", re.M | re.S)
+NOT_MADE = "(`make docs` writes the table that belongs here.)\n"
 DIRECTIVE = re.compile(r"^```\{.*?^```$\n?", re.M | re.S)
 CARD = re.compile(r"^:::\{grid-item-card\} ([^\n]+)\n:link: (\S+)\n:link-type: doc\n(.*?)^:::$\n?", re.M | re.S)
 NOT_SHOWN = re.compile(r"^(?::{3,}.*|:[\w-]+: .*|\([\w-]+\)=)\n", re.M)
@@ -61,7 +63,11 @@ def page(name: str) -> str:
         other = normpath(join(dirname(name), found[2])) if found[2] else ""
         return f"{found[1]} (`bstcad docs {other}`)" if other in pages() else found[1]
 
-    text = pages()[name].read_text(encoding="utf-8")
+    def included(found: re.Match[str]) -> str:
+        path = pages()[name].parent / found[1]
+        return path.read_text(encoding="utf-8") if path.is_file() else NOT_MADE
+
+    text = INCLUDED.sub(included, pages()[name].read_text(encoding="utf-8"))
     text = NOT_SHOWN.sub("", CARD.sub(_card, DIRECTIVE.sub("", text)))
     return re.sub(r"\n{3,}", "\n\n", LINK.sub(linked, text)).strip() + "\n"
 

@@ -82,7 +82,7 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         "back": _face("bspline", vertex(lens), {}),
         "reflects": lens.reflects,  # True for a mirror
         "net": _net(lens.back_net),
-        **({"front_net": _net(lens.front_net), "front_asked": scene.lens.front.z} if lens.shapes("front") else {}),
+        **({"front_net": _net(lens.front_net), "front_asked": scene.lens.front.z} if lens.is_tailored("front") else {}),
         "back_asked": scene.lens.back.z,  # position of the back's vertex in the scene
         **({} if scene.lens.back.chart.flat else {"back_key": scene.lens.back.vertex_key}),  # if not lens.back.z
         "centre_thickness": shape["centre_thickness"],

@@ -57,9 +57,10 @@ from bstcad.report.units import DIGITS, Remark, Rows, number, paragraphs, percen
 from bstcad.report.units import remarks as written
 from bstcad.runs import files
 from bstcad.scene.scene import Scene
-from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Nominal, Proof
+from bstcad.verify.checks import Proof
 from bstcad.verify.judges.comparison import Judge
 from bstcad.verify.light_limits import LightValue
+from bstcad.verify.nominal import DEFAULT_RRMSD_LIMIT, Nominal
 from bstcad.verify.verdict import NO_LIMIT, Check, verdict
 
 if TYPE_CHECKING:
@@ -299,7 +300,7 @@ def contents_of(
         shape=proof.shape,
         stability=proof.stability,
         blur=proof.blur,
-        finest_detail=_finest_detail(scene, proof, goal.receiver, estimates, least=stated.right_down_to or 0.0),
+        finest_detail=_finest_detail(scene, proof, goal.screen, estimates, least=stated.right_down_to or 0.0),
         picture=scene.picture_remarks(),
         lines=tuple(
             LineFigures(k.wavelength, k.share, rrmsd_of_pictures(goal.picture, k.picture)) for k in proof.lines
@@ -381,7 +382,7 @@ def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: 
     """Return remarks, the most important first; irradiances: one per goal, normalised to the sum of its picture."""
     allowed = DEFAULT_RRMSD_LIMIT if report.rrmsd_asked is None else report.rrmsd_asked
     pairs = list(zip(goals, irradiances, strict=True))
-    dark = {goal.words: unlit(goal.picture, found, goal.receiver) for goal, found in pairs}
+    dark = {goal.words: unlit(goal.picture, found, goal.screen) for goal, found in pairs}
     bright = {goal.words: lifted(goal.picture, found) for goal, found in pairs}
     given = {"report": report, "scene": scene, "allowed": allowed, "names": LEFT_OUT}
     return written("remarks.txt.j2", "remarks", unlit=dark, lifted=bright, **given)

@@ -94,10 +94,11 @@ def _packed(arrays: dict[str, np.ndarray], value: Any) -> dict[str, Any]:
 def _unpacked(arrays: Mapping[str, np.ndarray], records: Mapping[str, type], device: str, found: dict) -> Any:
     """Decode a dict from `_packed` whose inner values are already decoded; records: classes by their "module.Class"."""
     (kind, content), *_ = [*found.items(), ("", None)]
-    if kind == "@array":
-        return arrays[content]
-    if kind == "@tensor":
-        return torch.from_numpy(arrays[content]).to(device)
+    if kind in ("@array", "@tensor"):
+        array = arrays[content]
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError  # every number of a state is finite
+        return array if kind == "@array" else torch.from_numpy(array).to(device)
     if kind.startswith("@"):
         return records[kind[1:]](**content)
     return {key: _as_tuples(part) for key, part in found.items()}

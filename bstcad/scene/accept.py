@@ -166,7 +166,7 @@ def _point_complaints(key: str, point: PointLimit, targets: Sequence[Target], so
         if not low <= value <= high:
             beside = f"{axis} = {value:g} is outside of the target, {low:g} to {high:g} {target.unit}"
             yield f"{key}.at: {beside}; move the point, or widen target.{axis}"
-    if point.unit not in (own := ("relative", target.screen.plane.photometric_unit)):
+    if point.unit not in (own := ("relative", target.screen.receiver.photometric_unit)):
         units = " or ".join(f'"{unit}"' for unit in own if unit)
         yield f"{key}.unit: the light on this target is not measured in {point.unit}; write {units}"
     if point.unit != "relative" and source.luminous_flux is None:

@@ -245,7 +245,7 @@ def _law(image: Picture, subtract: bool, width: float, origin: str) -> Profile:
 
 
 @dataclass(frozen=True)
-class Collimated(collimated.Collimated):
+class Collimated(collimated.CollimatedSource):
     """Parallel light of a scene, whose profile may be measured."""
 
     profile: Annotated[

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import torch
@@ -40,6 +40,7 @@ from bstcad.scene.schema import (
     Record,
     leaving_out,
 )
+from bstcad.tailoring.settings import Bounds
 
 if TYPE_CHECKING:
     from bstcad.optics.surfaces.bspline import BSplineSurface
@@ -128,21 +129,6 @@ def export_complaints(
 
 
 AnyBack = Annotated[Back | RadialBack, Field(discriminator="kind")]
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Bounds on tailored faces everywhere inside the outline; a field that is None is no bound.
-
-    A tool cuts the back from +z and the front from -z; for the tool a valley is concave and a ridge convex.
-    """
-
-    concave: float | None = None  # maximum curvature of a valley, 1/mm
-    convex: float | None = None  # maximum curvature of a ridge, 1/mm
-    slope: float | None = None  # maximum |∇z|
-    thinnest: float = 0.0  # minimum thickness along z, mm
-    thickest: float | None = None  # maximum thickness along z, mm
-    edge: float | None = None  # minimum thickness along the rim, mm
 
 
 def _outline_unless_dome(node: dict[str, Any]) -> None:

@@ -198,7 +198,7 @@ class LightPath:
                     yield f"{key}.curvature: {plane}; remove the curvature, or put the element before the lens"
                 yield from element.complaints(key)
         for key, target in self.targets.items():
-            if self.behind and target.screen.plane.frame is None:
+            if self.behind and target.screen.receiver.frame is None:
                 yield f"{key}: windows and mirrors behind the lens need a target on a plane; remove [[behind]]"
         if self.before or self.behind:
             yield from self._out_of_order()
@@ -237,7 +237,7 @@ class LightPath:
         behind = interfaces(self.behind, 1, self.source.main_wavelength)
         vertex: Vector = (0.0, 0.0, self.lens.back.z)
         for key, target in self.targets.items():
-            seen = Image.of(image(behind, target.screen.plane))
+            seen = Image.of(image(behind, target.screen.receiver))
             if not is_faced(seen, vertex):
                 view = "seen from the lens in the mirrors, the target is edge-on or turned away"
                 yield f"{key}.tilt: {view}; tilt the target or a mirror"

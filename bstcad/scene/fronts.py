@@ -32,6 +32,7 @@ from bstcad.scene.schema import (
 )
 from bstcad.step_text import part21
 from bstcad.step_text.placement import own_frame
+from bstcad.tailoring.settings import CONIC_CONSTANTS
 
 if TYPE_CHECKING:  # importing this module loads numba
     from bstcad.optics.surfaces.bspline import BSplineSurface
@@ -43,7 +44,6 @@ MAX_RECESS_SLOPE = 80.0  # degrees; steepest slope at the rim of a front with an
 MAX_DOME_SLOPE = 89.5  # degrees; the same for the front of a dome
 MIN_RECESS_SAG = 1e-3  # mm; smallest sag at the rim of a front with its own outline, so that there is an edge
 MIN_RECESS_GAP = 1e-2  # mm; smallest distance between the outlines of the front and of the lens
-CONIC_CONSTANTS = (-1e3, 1e3)  # range of conic constants
 CURVATURES = (-1e3, 1e3)  # range of curvatures, 1/mm
 
 NET_FILE = "front.npz"  # file in a design's folder with the net that was read from lens.front.file

@@ -217,7 +217,7 @@ def read_intensity(path: Path, prefix: str) -> IntensityFile:
 
 
 @dataclass(frozen=True)
-class Point(point.Point):
+class Point(point.PointSource):
     """A point, disc or rectangle of a scene, whose intensity may come from a file, or a file of rays."""
 
     half_angle_1e2: Annotated[

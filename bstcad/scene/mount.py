@@ -88,7 +88,7 @@ def _is_date(text: str) -> bool:
         return False
 
 
-class Round(Record):
+class CircleRim(Record):
     """A circle about the axis of the lens."""
 
     shape: Annotated[Literal["circle"], Key("A circle about the axis.")]
@@ -116,7 +116,7 @@ class Box(Record):
         return Rounded(*size, corner_radius=r) if r else Rectangle(*size)
 
 
-Shape: TypeAlias = Annotated[Round | Box, Field(discriminator="shape")]
+Shape: TypeAlias = Annotated[CircleRim | Box, Field(discriminator="shape")]
 
 
 class Screws(Record):
@@ -174,12 +174,12 @@ class Mount(Record):
         assert self.flange is not None  # otherwise `complaints` has refused the scene
         return self.flange.z
 
-    def rim_of(self, outline: Outline) -> Round | Box:
+    def rim_of(self, outline: Outline) -> CircleRim | Box:
         """Return the rim that a lens with this outline has in the part."""
         if self.rim is not None:
             return self.rim
         if isinstance(outline, Circle):
-            return Round(shape="circle", diameter=2 * outline.radius)
+            return CircleRim(shape="circle", diameter=2 * outline.radius)
         return Box(shape="rectangle", width=outline.width, height=outline.height)
 
     def clear(self, lens: Lens) -> tuple[Outline, Outline] | None:
@@ -287,7 +287,7 @@ def _dome_complaints(mount: Mount, dome: RadialBack) -> Iterator[str]:
         yield f"mount.flange.thickness: {above}, where light leaves; make the flange thinner, or move it down"
 
 
-def _wall_complaints(mount: Mount, lens: LensBlank, rim: Round | Box) -> Iterator[str]:
+def _wall_complaints(mount: Mount, lens: LensBlank, rim: CircleRim | Box) -> Iterator[str]:
     """Yield complaints about draft and bevel of the lens's own walls, below its back or its flange."""
     key, tangent = "mount.draft" if mount.draft else "mount.bevel", math.tan(math.radians(mount.draft))
     top, above, remedy = lens.back.z, "back", "move the back up"
@@ -315,7 +315,7 @@ def _wall_complaints(mount: Mount, lens: LensBlank, rim: Round | Box) -> Iterato
         yield f"{key}: draft and bevel remove {taken:.3g} mm, and the axis is {half:g} mm away; make them smaller"
 
 
-def _depth(shape: Round | Box, x: float, y: float) -> float:
+def _depth(shape: CircleRim | Box, x: float, y: float) -> float:
     """Return the distance (mm) of a point (x, y) inside the shape from the shape's edge; negative outside."""
     return float(shape.outline.depth(np.array(x), np.array(y)))
 
@@ -328,14 +328,14 @@ def _steepest_descent(front: Surface, rim: Outline) -> float:
     return -float((z_x * m_x + z_y * m_y).min())
 
 
-def _corner_complaints(key: str, shape: Round | Box, taken: float) -> Iterator[str]:
+def _corner_complaints(key: str, shape: CircleRim | Box, taken: float) -> Iterator[str]:
     """Yield complaints about a corner radius not above `taken`, the width (mm) that draft and bevel remove."""
     if 0 < shape.corner_radius <= taken:
         size = f"{shape.corner_radius:g} mm is too small, as draft and bevel remove {taken:.3g} mm"
         yield f"{key}.corner_radius: {size}; make it larger, or 0"
 
 
-def _flange_complaints(flange: Flange, lens: LensBlank, rim: Round | Box) -> Iterator[str]:
+def _flange_complaints(flange: Flange, lens: LensBlank, rim: CircleRim | Box) -> Iterator[str]:
     """Yield complaints: a flange too thin for its bevels, or above or below the lens's wall; holes that do not fit."""
     key, upper = "mount.flange", flange.z + flange.thickness
     taken = flange.bevel + flange.thickness * math.tan(math.radians(flange.draft))

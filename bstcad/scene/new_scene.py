@@ -38,7 +38,7 @@ COMMENT_WIDTH = 118  # largest number of characters in a line of comment
 
 
 @dataclass(frozen=True)
-class Light:
+class PlateLight:
     """A light for which a plate is made; plate.toml.j2 contains its table [source]."""
 
     name: str  # value of the option --light
@@ -53,14 +53,16 @@ class Light:
 
 
 _TABLES = tomllib.loads(Path(__file__).with_name("lights.toml").read_text(encoding="utf-8"))
-LIGHTS = {name: Light(name, **table) for name, table in _TABLES.items()}  # lights by name; the first is the default
+LIGHTS = {
+    name: PlateLight(name, **table) for name, table in _TABLES.items()
+}  # lights by name; the first is the default
 
 
 @dataclass(frozen=True)
 class Plate:
     """A plate with the light before it and the wall behind it."""
 
-    light: Light
+    light: PlateLight
     width: float  # mm
     height: float  # mm
     distance: float  # distance from the plate to the wall, mm

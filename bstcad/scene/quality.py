@@ -11,6 +11,7 @@ from bstcad.optics.surfaces.key import Key
 from bstcad.optics.surfaces.sides import MIN_SIDE, Sides, as_pair, coarser, side
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.schema import NET_SIZES, OneOrTwo, Record
+from bstcad.tailoring.settings import COARSEST_GRID, Method, Precision, Settings, Solution
 
 COMMON_PRESET = {"method": "least-squares", "transport_iterations": 40, "stage1_iterations": 1000, "rounds": 10}
 OWN_PRESET = COMMON_PRESET | {"overshoot": 0.03, "precision": "float64"}  # settings of bstcad's own qualities
@@ -27,9 +28,8 @@ BASELINES = {  # method without limits of time, accuracy or shape: (name in mess
     "adam": ("the paper's procedure", "tailoring.quality"),
     "integration": ("point-by-point integration", "tailoring.method"),
 }
-COARSEST_GRID = 64  # fewest cells per side to which the transport grid is reduced; they cost almost no time
 VERIFICATION_POINTS = 32  # points of an extended source in a verification; the RRMSD uses random points instead
-VERIFICATION_DRAW = 1 << 12  # number of the set of these points; each further spectral line has the next number
+VERIFICATION_SET = 1 << 12  # number of the set of these points; each further spectral line has the next number
 
 
 class Tailoring(Record):
@@ -40,7 +40,7 @@ class Tailoring(Record):
     ] = "standard"
     seed: Annotated[int, Key("Seed of all random numbers.", "", 0, 2**63 - 1)] = 0
     method: Annotated[
-        Literal["least-squares", "adam", "integration"] | None,
+        Method | None,
         Key("Method: least squares, adam (paper) or integration; that of quality if absent.", example="least-squares"),
     ] = None
     levels: Annotated[
@@ -63,10 +63,10 @@ class Tailoring(Record):
     ] = None
     source_points: Annotated[int | None, Key("Number of points that represent an extended source.", "", 2, 4096)] = None
     solution: Annotated[
-        Literal["convex", "concave"] | None,
+        Solution | None,
         Key("For two faces and two targets: no rays (convex) or all (concave) cross between them.", example="concave"),
     ] = None
-    precision: Annotated[Literal["float32", "float64"] | None, Key("Precision in tailoring.", example="float64")] = None
+    precision: Annotated[Precision | None, Key("Precision in tailoring.", example="float64")] = None
     accuracy: Annotated[float | None, Key("RRMSD on pixels at which tailoring ends.", "", 1e-6, 10.0, example=0.05)] = (
         None
     )
@@ -84,7 +84,7 @@ class Tailoring(Record):
         """Method that the scene states, or else the method of its quality."""
         return self.method or PRESETS[self.quality]["method"]
 
-    def resolved(self, net: Sides) -> ResolvedTailoring:
+    def resolved(self, net: Sides) -> Settings:
         """Return the settings with all values set; net: control points per side of the back, or along x and along y.
 
         Levels of an oblong net become pairs with its proportions.  Defaults: at least two rays per cell of the net
@@ -100,8 +100,8 @@ class Tailoring(Record):
             preset["stage2_iterations"] = 0
         if self.quality != "paper":  # a finer map has folds in corners, which a net cannot follow
             preset["transport_grid"] = min(preset["transport_grid"], max(2 * (max(as_pair(net)) - 1), COARSEST_GRID))
-        given = self.model_dump(exclude_none=True, exclude={"levels"})
-        return ResolvedTailoring.model_validate(preset | given)
+        given = self.model_dump(exclude_none=True, exclude={"levels", "quality"})
+        return Settings(**preset | given)
 
     def complaints(self, lens: LensBlank) -> Iterator[str]:
         """Yield the faults: levels that do not rise to those of the net, and keys that the method does not support."""
@@ -125,27 +125,6 @@ class Tailoring(Record):
             yield f"lens.front.optimise: {who} cannot optimise a front; {fixed}, or choose another {other}"
         if self.method == "integration" and self.stage2_iterations:
             yield f"tailoring.stage2_iterations: {who} has no stage 2; remove this key, or choose another {other}"
-
-
-class ResolvedTailoring(Tailoring):
-    """The effort of tailoring with all values set, by `Tailoring.resolved`."""
-
-    method: Literal["least-squares", "adam", "integration"]
-    levels: tuple[Sides, ...]
-    transport_grid: int
-    transport_iterations: int
-    rays: int
-    stage1_iterations: int
-    rounds: int
-    stage2_iterations: int
-    overshoot: float
-    source_points: int
-    precision: Literal["float32", "float64"]
-
-    @property
-    def side(self) -> int:
-        """Control points per side of the square net with as many points as the finest of `levels`."""
-        return side(self.levels[-1])
 
 
 def coarse_to_fine(net: Sides) -> tuple[Sides, ...]:
@@ -174,7 +153,10 @@ FINISH_KEYS = ("layer_height", "smoothing_length", "roughness", "roughness_lengt
 GRADE_NAMES = (  # grades of manufacture, which manufacture/tolerance/grades.py defines
     "moulded", "diamond-turned", "precise", "milled-polished", "milled-sanded", "resin-printed", "resin-printed-coated",
 )  # fmt: skip
-TWO_FACE_ERRORS = ("front.", "lens.wedge")  # prefixes of errors that are zero unless a [[tolerance]] names them
+TWO_FACE_ERRORS = (  # errors of one face relative to the other, which are zero unless a [[tolerance]] names them
+    "front.form", "front.decentre", "front.decentre_x", "front.decentre_y",
+    "lens.wedge", "lens.wedge_x", "lens.wedge_y",
+)  # fmt: skip
 NONE = "none"  # grade of an error that is always zero
 
 

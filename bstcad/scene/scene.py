@@ -11,8 +11,9 @@ import datetime
 import json
 import math
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -21,7 +22,14 @@ import tomli_w
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_serializer, model_validator
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.channels import Channel, Draw, channels_of, drawn_channels, given_channels, merge_wavelengths
+from bstcad.optics.light.channels import (
+    Channel,
+    SourceSampler,
+    channels_of,
+    drawn_channels,
+    given_channels,
+    merge_wavelengths,
+)
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.light.wavefront import MAX_RAY_ANGLE, PlaneWave, Wave, ZernikeWave
 from bstcad.optics.receivers.goal import Goal
@@ -44,16 +52,16 @@ from bstcad.scene.lamp import Point
 from bstcad.scene.moulding import CAVITY, MISSING, Moulding
 from bstcad.scene.mount import Mount, Part
 from bstcad.scene.picture import Picture
-from bstcad.scene.quality import VERIFICATION_DRAW, VERIFICATION_POINTS, Tailoring, Tolerance
-from bstcad.scene.schema import FILE, FileContent, Record, contents, of_model
+from bstcad.scene.quality import VERIFICATION_POINTS, VERIFICATION_SET, Tailoring, Tolerance
+from bstcad.scene.schema import FileContent, Record, contents, of_model
 from bstcad.scene.target import FAR_Z, AngularTarget, Target, Targets, coplanar_complaints
+from bstcad.tailoring.settings import SEARCH_RANGE
 
 if TYPE_CHECKING:
     from bstcad.optics.trace.measure import GhostTracer
 
 MESH_TOLERANCE = 1e-3  # mm; default maximum distance of mesh facets from a lens up to 100 mm wide
 IMAGE_KEY = re.compile(r"target(\[\d+\])?\.image|source\.profile\.image")  # dotted keys of images
-SEARCH_RANGE = 0.999  # fraction of the possible range of a front's sag at the rim that tailoring searches
 FLOAT32_ROUNDING = 2.0**-24  # largest relative rounding error of a coordinate in float32
 FINEST_MESH = 4 * FLOAT32_ROUNDING  # smallest tolerance of a mesh, as a fraction of the largest coordinate
 
@@ -140,7 +148,7 @@ class Scene(Record):
             yield from self._of_targets(lambda target: target.unfaced(lens))
         if len(self.targets) > 1 or self.wavefront is not None:
             for key, target in zip(self.target_keys, self.targets, strict=True):
-                if target.screen.plane.frame is None:
+                if target.screen.receiver.frame is None:
                     several = "several targets, or a wavefront, need targets on planes"
                     yield f"{key}: {several}; make it a plane, or keep one target without a wavefront"
         yield from coplanar_complaints(self.targets)
@@ -210,7 +218,7 @@ class Scene(Record):
                 target.screen,
                 target.irradiance(),
                 target.weight,
-                draw=target.irradiance,
+                cell_picture=target.irradiance,
                 is_shape=target.photo is None and target.text is None,
             )
             for key, target in pairs
@@ -315,7 +323,7 @@ class Scene(Record):
     def assembled(self, lens: Lens) -> Lens:
         """Return the lens with the scene's windows, mirrors and mount, and with its tailored faces marked."""
         before, behind = self.around(self.source.main_wavelength) or ((), ())
-        return self.as_mounted(replace(lens, before=before, behind=behind).shaping(*self.lens.tailored_faces))
+        return self.as_mounted(replace(lens, before=before, behind=behind).with_tailored(*self.lens.tailored_faces))
 
     def as_mounted(self, lens: Lens) -> Lens:
         """Return the lens with the clear apertures that the mount leaves; the mount of a dome cuts nothing."""
@@ -323,28 +331,28 @@ class Scene(Record):
             return lens
         return replace(lens, clear=self.mount.clear(lens))
 
-    def channels(self, points: int | None = None, draw: int = 0) -> tuple[Channel, ...]:
+    def channels(self, points: int | None = None, number: int = 0) -> tuple[Channel, ...]:
         """Return the light as a weighted sum of channels; a point source of one wavelength is one channel.
 
         points: number of points of an extended source, divided among its lines (default: tailoring.source_points).
-        draw: number of the point set; other numbers give other points.
+        number: number of the point set; other numbers give other points.
         """
         if points is None:
             points = self.tailoring.points_of_source
-        return self._with_losses(channels_of(self.light, self.lens.index_at, points, draw))
+        return self._with_losses(channels_of(self.light, self.lens.index_at, points, number))
 
     def verification_channels(self) -> tuple[Channel, ...]:
         """Return the channels of a verification: an extended source has other points than in tailoring."""
-        return self.channels(VERIFICATION_POINTS, VERIFICATION_DRAW)
+        return self.channels(VERIFICATION_POINTS, VERIFICATION_SET)
 
     @property
-    def draw(self) -> Draw | None:
+    def sampler(self) -> SourceSampler | None:
         """Function of (points, seed) that samples the channels of an extended source; None for other sources."""
         if (bundles := given_channels(self.source, self.lens.index_at)) is not None:
-            return Draw(lambda points, seed: self._with_losses(bundles(seed)), bundles.largest_side)
+            return SourceSampler(lambda points, seed: self._with_losses(bundles(seed)), bundles.largest_side)
         if self.source.extent is None:
             return None
-        return Draw(
+        return SourceSampler(
             lambda points, seed: self._with_losses(drawn_channels(self.light, self.lens.index_at, points, seed))
         )
 
@@ -425,12 +433,12 @@ class Scene(Record):
 
     def toml(self) -> str:
         """Return the text of a file from which an equal scene is loaded; images have the file names of their copies."""
-        unused = set() if self.source.extent else {"source_points"}
+        unused = {"seed"} if self.source.extent else {"seed", "source_points"}
         optic = f"refractive index {self.index:.6g}" if self.lens.passes.enters else f"a {self.optic}"
         comment = f"# {optic}; quality {self.tailoring.quality}"
         if self.lens.back.control_points is not None:  # the settings depend on them
-            knobs = self.tailoring.resolved(self.lens.back.net).model_dump(exclude={"quality", "seed"} | unused)
-            comment += ": " + ", ".join(f"{key} {value}" for key, value in knobs.items())
+            settings = asdict(self.tailoring.resolved(self.lens.back.net))
+            comment += ": " + ", ".join(f"{key} {value}" for key, value in settings.items() if key not in unused)
         return f"{comment}\n" + tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
 
 
@@ -621,4 +629,4 @@ def _image(values: np.ndarray, key: str) -> Picture:
 
 
 if __name__ == "__main__":
-    FILE.write_text(json.dumps(of_model(Scene), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    sys.stdout.buffer.write(json.dumps(of_model(Scene), indent=1, ensure_ascii=False).encode() + b"\n")

@@ -1,21 +1,25 @@
 """The base of a scene's records, and their JSON schema for editors, messages and `bstcad keys`.
 
-The records load torch, which takes seconds.  So their schema is stored in schema.json, which
-`python -m bstcad.scene.scene` writes; a test checks that it agrees with the records.
+The records load torch, which takes seconds.  So their schema is made once, by `python -m bstcad.scene.scene`, and kept
+in __pycache__ under the hash of the code that states it.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 from weakref import WeakValueDictionary
 
+import pydantic
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -31,7 +35,8 @@ from pydantic.json_schema import GenerateJsonSchema, WithJsonSchema
 from bstcad.optics.surfaces.sides import MIN_SIDE
 from bstcad.runs import files
 
-FILE = Path(__file__).with_name("schema.json")
+FOLDER = Path(__file__).parent
+STATED_IN = FOLDER, FOLDER.with_name("optics"), FOLDER.with_name("photometry")  # folders whose code states keys
 TAGS = ("kind", "shape")  # keys whose value selects the record of a union
 ESCAPES = "\0\a\b\f\n\r\t\v\x1b"  # characters that escapes in TOML or Python denote, such as \n in "C:\new.png"
 LENGTHS, COORDINATES = (1e-3, 1e6), (-1e8, 1e8)  # ranges of lengths and of coordinates, mm
@@ -212,8 +217,29 @@ def _nodes(node: Any) -> list[dict[str, Any]]:
 
 @functools.cache
 def schema() -> Node:
-    """Read the stored JSON schema."""
-    return json.loads(FILE.read_text(encoding="utf-8"))
+    """Return the JSON schema of a scene."""
+    return json.loads(schema_text())
+
+
+def schema_text() -> str:
+    """Return the JSON schema of a scene as text, from its file or, once per version of the code, from the records."""
+    code = b"".join(path.read_bytes() for folder in STATED_IN for path in sorted(folder.rglob("*.py")))
+    digest = hashlib.sha256(pydantic.VERSION.encode() + code).hexdigest()
+    path = FOLDER / "__pycache__" / f"schema-{digest[:16]}.json"
+    with contextlib.suppress(OSError, ValueError):
+        text = path.read_text(encoding="utf-8")
+        json.loads(text)
+        return text
+    paths = os.pathsep.join(map(str, [FOLDER.parents[1], *sys.path]))
+    command, known = [sys.executable, "-m", "bstcad.scene.scene"], {**os.environ, "PYTHONPATH": paths}
+    text = subprocess.run(command, env=known, stdout=subprocess.PIPE, encoding="utf-8", check=True).stdout
+    with contextlib.suppress(OSError):  # a folder that cannot be written: it is made again by the next process
+        for old in path.parent.glob("schema-*.json"):
+            old.unlink(missing_ok=True)
+        path.parent.mkdir(exist_ok=True)
+        with files.atomic_file(path) as file:
+            file.write(text.encode())
+    return text
 
 
 def records(node: Node) -> list[Node]:

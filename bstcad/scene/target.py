@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 import numpy as np
 import torch
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag
-from scipy.sparse import csr_array
 
 from bstcad.optics.receivers.directions import Angles, Directions
 from bstcad.optics.receivers.goal import interpolated
-from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.irradiance import Screen, overlap
 from bstcad.optics.receivers.receivers import PlaneReceiver
 from bstcad.optics.surfaces.key import Key
 from bstcad.optics.surfaces.outlines import Circle, Outline
@@ -168,7 +167,7 @@ class Target(Record):
     @property
     def unit(self) -> str:
         """Unit of x and y, which the receiver states."""
-        return self.screen.plane.unit
+        return self.screen.receiver.unit
 
     @property
     def columns_rows(self) -> tuple[int, int]:
@@ -229,14 +228,14 @@ class Target(Record):
 
     def clearance(self, lens: LensBlank, highest: float) -> float:
         """Return the gap (mm) from a lens that ends at z = highest (mm) to the target's receiver; < 0: they overlap."""
-        return self.screen.plane.clearance(lens.outline, highest)
+        return self.screen.receiver.clearance(lens.outline, highest)
 
     def grazed(self, lens: LensBlank) -> Iterator[str]:
         """Yield a warning about a tilted target that is nearly edge-on, seen from the lens."""
-        plane, vertex = self.screen.plane, (0.0, 0.0, lens.back.z)
-        if plane.tilt is None or not isinstance(plane, PlaneReceiver):
+        receiver, vertex = self.screen.receiver, (0.0, 0.0, lens.back.z)
+        if receiver.tilt is None or not isinstance(receiver, PlaneReceiver):
             return
-        sine = -plane.height(vertex) / math.dist(plane.middle, vertex)  # the plane misses the lens: not zero
+        sine = -receiver.height(vertex) / math.dist(receiver.middle, vertex)  # the plane misses the lens: not zero
         if sine < math.sin(math.radians(GRAZING_VIEW)):
             angle = math.degrees(math.asin(max(sine, -1.0)))
             yield (
@@ -246,10 +245,10 @@ class Target(Record):
 
     def unfaced(self, lens: LensBlank) -> Iterator[str]:
         """Yield complaints about a target that does not face the lens, cuts the lens, or reaches down to the lens."""
-        screen, plane, back, optic = self.screen, self.screen.plane, lens.back.z, lens.optic
-        if plane.is_level:
+        screen, receiver, back, optic = self.screen, self.screen.receiver, lens.back.z, lens.optic
+        if receiver.is_level:
             return
-        tilted = plane if plane.tilt is not None and isinstance(plane, PlaneReceiver) else None
+        tilted = receiver if receiver.tilt is not None and isinstance(receiver, PlaneReceiver) else None
         key, less = ("target.tilt", "tilt it less, or ") if tilted else ("target.z", "")
         if tilted and not is_faced(tilted, (0.0, 0.0, back)):
             yield f"{key}: seen from the {optic}, the target is edge-on or turned away; tilt it less, or move it"
@@ -257,7 +256,7 @@ class Target(Record):
             yield f"{key}: the plane of the target cuts the {optic}; {less}move the target further along +z"
         if tilted is None:
             return
-        lowest = min(plane.point(x, y)[2] for x in screen.x for y in screen.y)
+        lowest = min(receiver.point(x, y)[2] for x in screen.x for y in screen.y)
         if not lowest > back:
             edge = f"is at z = {lowest:.6g}, not behind the back of the {optic} at z = {back:g}"
             yield f"{key}: an edge of the target {edge}; tilt it less, make it smaller, or move it along +z"
@@ -429,7 +428,7 @@ def coplanar_complaints(targets: tuple[Target, ...]) -> Iterator[str]:
 def _in_one_plane(one: Screen, other: Screen) -> bool:
     """Return True if the corners of each screen are in the other's plane; receivers other than planes must be equal."""
     heights = _corner_heights(one, other) + _corner_heights(other, one)
-    return max(map(abs, heights)) < PLANE_DISTANCE if heights else one.plane == other.plane
+    return max(map(abs, heights)) < PLANE_DISTANCE if heights else one.receiver == other.receiver
 
 
 def _cuts(screen: Screen, other: Screen) -> bool:
@@ -440,10 +439,10 @@ def _cuts(screen: Screen, other: Screen) -> bool:
 
 def _corner_heights(screen: Screen, other: Screen) -> list[float]:
     """Return the heights (mm) of the screen's corners above the other's plane; none if a receiver is not a plane."""
-    plane, own = other.plane, screen.plane
-    if not (isinstance(plane, PlaneReceiver) and isinstance(own, PlaneReceiver)):
+    receiver, own = other.receiver, screen.receiver
+    if not (isinstance(receiver, PlaneReceiver) and isinstance(own, PlaneReceiver)):
         return []
-    return [plane.height(own.point(x, y)) for x in screen.x for y in screen.y]
+    return [receiver.height(own.point(x, y)) for x in screen.x for y in screen.y]
 
 
 def kind(given: Any) -> str:
@@ -626,19 +625,6 @@ def average(light: Callable[[PixelBox], np.ndarray], size: Pixels, window: Windo
     down = overlap(bottom - top, pixels[1], window[1] - top, window[3] - top)
     parts = (light(box) for box in strips((left, top, right, bottom)))
     return down @ np.concatenate([(across @ part.T).T for part in parts])
-
-
-def overlap(size: int, pixels: int, start: float = 0.0, stop: float | None = None) -> csr_array:
-    """Return the matrix (pixels, size) that averages `size` inputs of width 1 over equal pixels from start to stop."""
-    stop = size if stop is None else stop
-    edges = start + np.arange(pixels + 1) * (stop - start) / pixels
-    edges[-1] = stop
-    cuts = np.union1d(np.arange(size + 1), np.clip(edges, 0, size))
-    cuts = cuts[(cuts >= start) & (cuts <= stop)]
-    middle = (cuts[1:] + cuts[:-1]) / 2
-    to = np.clip(((middle - start) * pixels / (stop - start)).astype(int), 0, pixels - 1)
-    of = np.clip(middle.astype(int), 0, size - 1)
-    return csr_array((np.diff(cuts) * pixels / (stop - start), (to, of)), shape=(pixels, size))
 
 
 def inside(outline: Outline, pixels: Pixels, size: Size) -> np.ndarray:

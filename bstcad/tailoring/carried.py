@@ -31,12 +31,12 @@ def carry_light(source: Emitter, before: Lens, after: Lens, goal: Goal) -> Lens:
     source: with the index of both lenses set for its wavelength.  goal: target, for its receiver.
     """
     window = lit_window(source, after)
-    seen, plane = (image_screen(lens, goal.receiver).plane for lens in (before, after))
+    seen, receiver = (image_screen(lens, goal.screen).receiver for lens in (before, after))
     old, new = (face_grid(source, lens, window, CELLS) for lens in (before, after))
-    landed = seen.land(behind(old.at_face, before.last_freeform))
+    landed = seen.land(behind(old.at_face, before.last_tailored))
     aim = torch.stack(list(landed.position))
     lit = (old.density > 0) & (new.density > 0) & landed.alive
-    needed = wanted_slopes(new.at_face, torch.where(lit, aim, torch.zeros_like(aim)), plane, after.last_freeform.law)
+    needed = wanted_slopes(new.at_face, torch.where(lit, aim, torch.zeros_like(aim)), receiver, after.last_tailored.law)
     x, y, z_x, z_y = (part[lit] for part in (*new.at_face.places, *needed))
     net = after.nets[-1]
     fitted = fit_slopes(net, x, y, z_x=z_x, z_y=z_y, weight=torch.ones_like(x), fit=FIT)

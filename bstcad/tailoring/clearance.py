@@ -24,7 +24,7 @@ from bstcad.optics.numerics.reductions import total
 from bstcad.optics.surfaces.bspline import QUARTERS, SPANS_AT_A_TIME, BSplineSurface, evaluate, net_gradient, span
 from bstcad.optics.surfaces.outlines import inside
 from bstcad.optics.surfaces.sampling import sample_rim
-from bstcad.scene.blank import Bounds
+from bstcad.tailoring.settings import Bounds
 
 PENALTY_MARGIN = 0.01  # relative distance before a bound at which its penalty begins (thickness: distance / `unit`)
 QUARTER_RIM_POINTS = 1025  # number of points along a quarter of the rim

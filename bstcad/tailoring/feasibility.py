@@ -31,8 +31,6 @@ from bstcad.tailoring.stage2 import with_pixels
 from bstcad.tailoring.two_faces import front_map
 from bstcad.transport.mapping import Solver
 
-TRIAL_CELLS, TRIAL_PIXELS = 64, 128  # transport grid of the trial (cells per side), pixels on the pictures' longer side
-TRIAL_ITERATIONS = 100  # largest number of iterations of the trial's map between two targets
 MAX_UNSERVED = 0.5  # largest fraction of the light whose rays may miss the back's aperture or cross each other
 REPORTED_FRACTION = 1e-3  # smallest reported fraction of light that misses the aperture or whose rays cross
 MAX_GENTLE_DEFLECTION = 30.0  # largest deflection at the front for which the furthest picture needs no floor (degrees)
@@ -109,15 +107,18 @@ def find_demand(task: Task, lens: Lens) -> Demand:
 
 def _demand(task: Task, solution: float, lens: Lens) -> tuple[Demand, LightBehind]:
     """Return the demand of a solution on coarse grids (deflection: NaN), and rays behind the lens that do not cross."""
-    knobs = task.knobs.model_copy(update={"transport_grid": TRIAL_CELLS, "transport_iterations": TRIAL_ITERATIONS})
-    task = replace(with_pixels(task, TRIAL_PIXELS), knobs=knobs, solution=solution, progress=no_progress)
+    effort = task.effort
+    cells, iterations = effort.trial_cells, effort.trial_iterations
+    settings = replace(task.settings, transport_grid=cells, transport_iterations=iterations)
+    task = with_pixels(task, effort.trial_pixels)
+    task = replace(task, settings=settings, solution=solution, progress=no_progress)
     light = light_behind.light_for_task(task)
     if task.wave is not None:  # the picture, resampled by means, has a sum below 1
         light = replace(light, picture=light.picture / light.picture.sum())
     angle = np.degrees(np.arccos(light.direction[2].clip(-1, 1)))[lit_corners(light.picture)]
     crossed = light.crossed_fraction(lens.back)
-    near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
-    served = light_behind.without_crossings(light, near.receiver, lens.back, TRIAL_CELLS)
+    near = min(task.goals, key=lambda goal: goal.screen.receiver.throw(0.0))
+    served = light_behind.without_crossings(light, near.screen, lens.back, cells)
     outside = served.fraction_outside(lens.back, lens.apertures[1].scaled(1 + 1e-3).contains)
     limit, largest, rms = math.degrees(largest_deflection(lens.index)), float(angle.max()), np.sqrt((angle**2).mean())
     return Demand(solution, largest, float(rms), crossed, outside=outside, deflection=math.nan, limit=limit), served
@@ -126,9 +127,9 @@ def _demand(task: Task, solution: float, lens: Lens) -> tuple[Demand, LightBehin
 @torch.no_grad()
 def _largest_deflection(task: Task, lens: Lens, light: LightBehind) -> float:
     """Return the largest angle (degrees) between the directions of a ray before the front and in the glass."""
-    front, source = lens.shaping("front"), task.heaviest.source
+    front, source = lens.with_tailored("front"), task.heaviest.source
     window, b = lit_window(source, front), light.intersect(lens.back)
-    grid = square_grid(source, front, window, TRIAL_CELLS)
+    grid = square_grid(source, front, window, task.effort.trial_cells)
     slopes = front_map(front, grid, window, light.picture, b=b, q=None, solver=Solver())
     lit = lit_corners(light.picture)
     x, y = (torch.from_numpy(q[lit]) for q in slopes.face_points)

@@ -63,12 +63,12 @@ class Folds:
         most = torch.tensor(padded.shape, device=device).flip(0)[:, None, None] - 1
         fluxes = []
         for sheet, corners in zip(sheets, landed, strict=True):
-            x = scaled(corners.position.detach().double(), goal.receiver.scale)
+            x = scaled(corners.position.detach().double(), goal.screen.scale)
             centre = (x[:, 1:, 1:] + x[:, :-1, 1:] + x[:, 1:, :-1] + x[:, :-1, :-1]) / 4
             pixel = torch.where(centre.isfinite(), centre, torch.full_like(centre, -1.0)).floor().add(1)
             column, row = torch.minimum(pixel.clamp(min=0), most).long()
             fluxes.append(torch.where(padded[row, column], sheet.flux, torch.zeros_like(sheet.flux)))
-        return cls(peak, goal.receiver.scale, tuple(fluxes), tuple(float(total(sheet.flux)) for sheet in sheets))
+        return cls(peak, goal.screen.scale, tuple(fluxes), tuple(float(total(sheet.flux)) for sheet in sheets))
 
     def __call__(self, channels: Sequence[Channel], landed: Sequence[Landed]) -> Tensor:
         """Return the weighted penalty of all channels (0-d), differentiable in the landing points."""

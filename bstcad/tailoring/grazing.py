@@ -61,7 +61,7 @@ class Grazing:
         inside = (np.abs(x) <= window.width / 2) & (np.abs(y) <= window.height / 2)
         light = np.where(inside, interpolate(grid, grid.density[None], (x, y))[0].numpy(), 0.0)
         weight = torch.from_numpy(maximum_filter(light, 5))  # a span that is lit in part gets its full weight
-        rays, eta = rays_at(grid, (x, y)), own_lens.last_freeform.law.eta
+        rays, eta = rays_at(grid, (x, y)), own_lens.last_tailored.law.eta
         return cls(net, rays, weight / total(weight), eta=eta, angle=edge.angle)
 
     def __call__(self, heights: Tensor) -> tuple[float, Tensor, float]:

@@ -40,7 +40,7 @@ from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import Receiver
 from bstcad.optics.surfaces.rays import Vector
 from bstcad.optics.surfaces.surfaces import Surface
-from bstcad.scene.errors import SceneError
+from bstcad.runs.files import SceneError
 from bstcad.tailoring.run import Task
 from bstcad.tailoring.slope_map import centroid, pixel_corners, resample_picture
 from bstcad.transport.bfm import TransportStep
@@ -79,16 +79,16 @@ class LightBehind:
         position, direction = (v[:, ::-1, ::-1].copy() for v in (self.position, self.direction))
         return replace(self, position=position, direction=direction, picture=self.picture[::-1, ::-1])
 
-    def positions_on(self, plane: Receiver) -> Points:
+    def positions_on(self, receiver: Receiver) -> Points:
         """Return the coordinates x and y (mm) on a plane of the points where the rays cross it, each (c + 1, r + 1)."""
-        (e_x, e_y, normal), (x, y) = _frame(plane), plane.origin
-        off = np.array(plane.middle).reshape(3, 1, 1) - self.position
+        (e_x, e_y, normal), (x, y) = _frame(receiver), receiver.origin
+        off = np.array(receiver.middle).reshape(3, 1, 1) - self.position
         off = _dot(normal, off) / _dot(normal, self.direction) * self.direction - off
         return _dot(e_x, off) + x, _dot(e_y, off) + y
 
     def sampled_at(self, screen: Screen, values: np.ndarray) -> np.ndarray:
         """Interpolate values at the rays (k, c + 1, r + 1) to a screen's pixel corners, (k, columns + 1, rows + 1)."""
-        x, y = self.positions_on(screen.plane)
+        x, y = self.positions_on(screen.receiver)
         if float((x[1:] - x[:-1]).mean()) < 0:
             x, y, values = x[::-1, ::-1], y[::-1, ::-1], values[:, ::-1, ::-1]
         return _bilinear(values, *grid_coordinates(x, y, *pixel_corners(screen)))
@@ -143,21 +143,21 @@ class LightBehind:
 def light_for_task(task: Task) -> LightBehind:
     """Return the rays behind the lens for the nearest target and the wavefront or, without one, the furthest target."""
     # twice, so that a single goal is both the nearest and the furthest
-    near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.receiver.plane.throw(0.0))
-    if any(goal.receiver.plane.frame is None for goal in (near, far)):
+    near, *_, far = sorted((*task.goals, *task.goals), key=lambda goal: goal.screen.receiver.throw(0.0))
+    if any(goal.screen.receiver.frame is None for goal in (near, far)):
         raise SceneError("target: several targets, or a wavefront, need plane targets; make each target a plane")
-    n = task.knobs.transport_grid
+    n = task.settings.transport_grid
     if task.wave is not None:
-        parts = max(1, round(n / max(near.receiver.shape)))
+        parts = max(1, round(n / max(near.screen.shape)))
         wavelength = task.heaviest.source.main_wavelength
-        return light_of_wave(near.receiver, near.picture, task.wave, wavelength=wavelength, parts=parts)
+        return light_of_wave(near.screen, near.picture, task.wave, wavelength=wavelength, parts=parts)
 
     def progress(s: TransportStep) -> None:
-        task.progress("stage 1", 0, task.knobs.rounds, f"between the targets, {s.grid}² cells")
+        task.progress("stage 1", 0, task.settings.rounds, f"between the targets, {s.grid}² cells")
 
-    lifted = far.receiver, np.maximum(far.picture, task.floor * far.picture.mean())
-    solver = replace(TARGETS_SOLVER, iterations=task.knobs.transport_iterations, progress=progress)
-    return between_targets((near.receiver, near.picture), lifted, n, sign=task.solution or 1.0, solver=solver)
+    lifted = far.screen, np.maximum(far.picture, task.floor * far.picture.mean())
+    solver = replace(TARGETS_SOLVER, iterations=task.settings.transport_iterations, progress=progress)
+    return between_targets((near.screen, near.picture), lifted, n, sign=task.solution or 1.0, solver=solver)
 
 
 def corners(screen: Screen, parts: int) -> Points:
@@ -170,14 +170,14 @@ def subdivide(picture: np.ndarray, parts: int) -> np.ndarray:
     return np.kron(picture, np.ones((parts, parts)) / parts**2)
 
 
-def in_space(plane: Receiver, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def in_space(receiver: Receiver, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the points (3, …) in space (mm) at x and y (…) on a receiver."""
-    return np.stack(plane.point(x, y))
+    return np.stack(receiver.point(x, y))
 
 
-def _frame(plane: Receiver) -> tuple[Vector, Vector, Vector]:
-    assert plane.frame is not None, "`light_for_task` refuses receivers that are not planes"
-    return plane.frame
+def _frame(receiver: Receiver) -> tuple[Vector, Vector, Vector]:
+    assert receiver.frame is not None, "`light_for_task` refuses receivers that are not planes"
+    return receiver.frame
 
 
 def _dot(vector: Vector, of: np.ndarray) -> np.ndarray:
@@ -189,7 +189,7 @@ def light_of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength
 
     wavelength: nm.  SceneError if rays of the wave cross before the screen.
     """
-    place, picture = in_space(screen.plane, *corners(screen, parts)), subdivide(picture, parts)
+    place, picture = in_space(screen.receiver, *corners(screen, parts)), subdivide(picture, parts)
     if isinstance(wave, SphericalWave):  # each ray is the line through the focus
         way = _normalised(place - np.array(wave.focus).reshape(3, 1, 1))
         return LightBehind(place, way * np.where(way[2] < 0, -1.0, 1.0), picture)
@@ -223,15 +223,15 @@ def between_targets(
     (screen, picture), (behind, target) = (far, near) if against else (near, far)
     smooth = (gaussian_filter(picture, width, mode="nearest") for width in SOURCE_BLURS)
     sharp, *pictures = (np.maximum(p, SOURCE_FLOOR * p.mean()) for p in (picture, *smooth))
-    e_x, e_y, _ = _frame(screen.plane)
+    e_x, e_y, _ = _frame(screen.receiver)
 
     def cosines(p: np.ndarray, t: np.ndarray) -> Points:
         way = _normalised(t - p)
         return _dot(e_x, way), _dot(e_y, way)
 
-    t = in_space(behind.plane, *pixel_corners(behind))
-    m = in_space(behind.plane, *(np.array(c) for c in centroid(target, behind))).reshape(3, 1, 1)
-    p = in_space(screen.plane, *(np.full_like(t[0], sum(ends) / 2) for ends in (screen.x, screen.y)))
+    t = in_space(behind.receiver, *pixel_corners(behind))
+    m = in_space(behind.receiver, *(np.array(c) for c in centroid(target, behind))).reshape(3, 1, 1)
+    p = in_space(screen.receiver, *(np.full_like(t[0], sum(ends) / 2) for ends in (screen.x, screen.y)))
     for number in range(MAP_ROUNDS):
         last = number == MAP_ROUNDS - 1
         cells = FINE_FACTOR * n if last else max(MIN_COARSE_CELLS, n // COARSE_DIVISOR)
@@ -241,18 +241,18 @@ def between_targets(
         sharper = [other for other, _ in others] if last else []
         sigma, y_frame = resample_picture(target, y, cells)
         mapping = solve(rho, sigma, frame, y_frame, solver=solver, sharper=sharper)
-        p = in_space(screen.plane, *mapping.inverse(*y))
+        p = in_space(screen.receiver, *mapping.inverse(*y))
     if max(contrasts) > CONTRAST_RATIO * min(contrasts):
         parts = max(1, round(n * math.sqrt(max(contrasts)) / max(behind.shape)))
-        place = in_space(behind.plane, *corners(behind, parts))
+        place = in_space(behind.receiver, *corners(behind, parts))
         i, j = np.meshgrid(*(np.arange(parts * pixels + 1) / parts for pixels in behind.shape[::-1]), indexing="ij")
-        way = _normalised(place - in_space(screen.plane, *mapping.inverse(*_bilinear(np.stack(y), i, j))))
+        way = _normalised(place - in_space(screen.receiver, *mapping.inverse(*_bilinear(np.stack(y), i, j))))
         light = LightBehind(place, -way if against else way, subdivide(target / target.sum(), parts))
         return light.reversed() if sign < 0 and not against else light
     parts = max(1, round(n / max(screen.shape)))
-    place, there = in_space(screen.plane, *corners(screen, parts)), mapping(*corners(screen, parts))
+    place, there = in_space(screen.receiver, *corners(screen, parts)), mapping(*corners(screen, parts))
     i, j = grid_coordinates(*(sign * c for c in y), *(sign * c for c in there))  # now increasing with t
-    way = _normalised(in_space(behind.plane, *_bilinear(np.stack(pixel_corners(behind)), i, j)) - place)
+    way = _normalised(in_space(behind.receiver, *_bilinear(np.stack(pixel_corners(behind)), i, j)) - place)
     return LightBehind(place, way, subdivide(sharp / sharp.sum(), parts))
 
 
@@ -268,11 +268,11 @@ def without_crossings(light: LightBehind, screen: Screen, surface: Surface, n: i
     if light.crossed_fraction(surface) <= CROSSING_TOLERANCE:
         return light
     b_x, b_y, b_z = light.intersect(surface)
-    rho, frame = resample_picture(light.picture, light.positions_on(screen.plane), n)
+    rho, frame = resample_picture(light.picture, light.positions_on(screen.receiver), n)
     sigma, back_frame = resample_picture(light.picture, (b_x, b_y), n)
-    mapping, there = solve(rho, sigma, frame, back_frame), light.positions_on(screen.plane)
+    mapping, there = solve(rho, sigma, frame, back_frame), light.positions_on(screen.receiver)
     b = np.stack([*mapping(*there), np.full(light.position.shape[1:], float(b_z.mean()))])
-    place = in_space(screen.plane, *there)
+    place = in_space(screen.receiver, *there)
     return replace(light, position=place, direction=_normalised(place - b))
 
 

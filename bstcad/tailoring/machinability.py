@@ -27,11 +27,11 @@ from bstcad.optics.surfaces import bspline
 from bstcad.optics.surfaces.bspline import BSplineSurface, Jet, Spans
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.optics.surfaces.sampling import sample_rim
-from bstcad.scene.blank import Bounds
-from bstcad.scene.errors import SceneError
+from bstcad.runs.files import SceneError
 from bstcad.tailoring.clearance import PENALTY_MARGIN, QUARTER_RIM_POINTS, clearance
 from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.minimise import lbfgs, minimise
+from bstcad.tailoring.settings import Bounds
 
 THICKNESS_POINTS = 513  # points per side at which the thickness is computed
 RELIEF_RESERVE = 0.02  # additional thickness for the changes of stage 2, relative to the sag range (PV) of the back
@@ -98,7 +98,7 @@ def active_bounds(lens: Lens, bounds: Bounds | None, least: float) -> Bounds | N
 
     These are the bounds of the scene; without them a tailored front still requires a thickness of `least` mm.
     """
-    return Bounds(thinnest=least) if bounds is None and lens.shapes("front") else bounds
+    return Bounds(thinnest=least) if bounds is None and lens.is_tailored("front") else bounds
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def excess(lens: Lens, bounds: Bounds) -> Excess:
 
     Sums have fixed parts, so that no bit depends on the number of threads.
     """
-    nets = {k: net.to(torch.float64) for k, net in zip(lens.freeform, lens.nets, strict=True)}
+    nets = {k: net.to(torch.float64) for k, net in zip(lens.tailored_numbers, lens.nets, strict=True)}
     square, worst = 0.0, -PENALTY_MARGIN
     gradients = {k: net.heights.new_zeros(()).expand_as(net.heights) for k, net in nets.items()}
     for squared, changes, largest in _parts(lens, nets, bounds):
@@ -141,7 +141,7 @@ def _parts(lens: Lens, nets: dict[int, BSplineSurface], bounds: Bounds) -> Itera
         for k, from_above in _bounds_from_above(lens, bounds).items():
             squared, gradient, worst = _shape_excess(nets[k], lens.outline, from_above)
             yield squared, {k: gradient}, worst
-    if lens.shapes("front"):
+    if lens.is_tailored("front"):
         yield clearance(lens.to(torch.float64), bounds)
     elif bounds.thickest is not None and (back := lens.number_of("back")) in nets:
         squared, gradient, worst = _thickness_excess(lens.with_back(nets[back]), bounds)
@@ -152,7 +152,7 @@ def _bounds_from_above(lens: Lens, bounds: Bounds) -> dict[int, Bounds]:
     """Return the bounds on z(x, y), seen from +z, for each tailored face, by its number."""
     front = replace(bounds, concave=bounds.convex, convex=bounds.concave)
     faces: dict[Face, Bounds] = {"back": bounds, "front": front}
-    return {lens.number_of(face): limits for face, limits in faces.items() if lens.shapes(face)}
+    return {lens.number_of(face): limits for face, limits in faces.items() if lens.is_tailored(face)}
 
 
 def _shape_excess(net: BSplineSurface, outline: Outline, bounds: Bounds) -> tuple[float, Tensor, float]:
@@ -213,7 +213,7 @@ def enforce_bounds(lens: Lens, bounds: Bounds) -> Lens:
     are flattened.  If the front is tailored, the back is shifted only if changes of the faces do not suffice, since a
     shift changes the picture.  SceneError if even a flat back exceeds a bound.
     """
-    for place in (_unmoved, _with_back_moved) if lens.shapes("front") else (_with_back_moved,):
+    for place in (_unmoved, _with_back_moved) if lens.is_tailored("front") else (_with_back_moved,):
         lens = place(lens, bounds)
         if not _exceeds(lens, bounds):
             return lens
@@ -250,7 +250,7 @@ def _heights(lens: Lens) -> list[Tensor]:
 
 
 def _flat(lens: Lens, bounds: Bounds) -> Lens:
-    faces, nets = _bounds_from_above(lens, bounds), zip(lens.freeform, _heights(lens), strict=True)
+    faces, nets = _bounds_from_above(lens, bounds), zip(lens.tailored_numbers, _heights(lens), strict=True)
     return lens.with_heights(torch.zeros_like(h) if k in faces else h for k, h in nets)
 
 

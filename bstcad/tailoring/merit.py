@@ -131,13 +131,13 @@ class Merit:
         seed: seed of the rays that measure the error of the blur, in almost a second per goal; None: no measurement.
         """
         exact = lens.plain()
-        merit = replace(self, blurs=tuple(blurs(source, exact, goal.receiver) for goal in self.goals))
+        merit = replace(self, blurs=tuple(blurs(source, exact, goal.screen) for goal in self.goals))
         if seed is None:
             return merit
         with torch.no_grad():
             images = [merit.picture(k, landed)[0] for k, landed in enumerate(merit.landing(lens).on_goals)]
         errors = (
-            blur_error(image, source.draw, exact, goal.receiver, border=blur.border, seed=seed)
+            blur_error(image, source.sampler, exact, goal.screen, border=blur.border, seed=seed)
             for image, goal, (blur, *_) in zip(images, merit.goals, merit.blurs, strict=True)
         )
         return replace(merit, blur_errors=tuple(errors))
@@ -162,7 +162,7 @@ class Merit:
 
     def landing(self, lens: Lens) -> Landings:
         """Trace the corners of each sheet to the receivers."""
-        planes = [goal.receiver.plane for goal in self.goals]
+        planes = [goal.screen.receiver for goal in self.goals]
         if self.wave is None:
             return Landings(self.light.landings(lens, planes))
         lens, pairs = _from_source(lens, self.wave), zip(self.light.channels, self.light.sheets, strict=True)
@@ -189,7 +189,7 @@ class Merit:
 
         This flux is the transmitted flux, or 1 if the picture is already divided.
         """
-        channels, screen = self.light.channels, self.goals[k].receiver
+        channels, screen = self.light.channels, self.goals[k].screen
         pairs = list(zip(self.light.sheets, landed, strict=True))
         # flux after the losses at faces and in the glass, so that they do not change the merit
         flux = weighted_sum(channels, (total(sheet.transmitted_flux(corners)) for sheet, corners in pairs))
@@ -235,10 +235,10 @@ class Merit:
 
 
 def _from_source(lens: Lens, wave: Wave | None) -> Lens:
-    """Return the lens, for a wavefront goal with interface 0 first in `freeform`: paths need tubes that start there."""
-    if wave is None or lens.freeform[0] == 0:
+    """Return the lens; for a wavefront goal interface 0 is tailored first, since paths need tubes that start there."""
+    if wave is None or lens.tailored_numbers[0] == 0:
         return lens
-    return replace(lens, shaped=(0, *lens.freeform))
+    return replace(lens, tailored=(0, *lens.tailored_numbers))
 
 
 def _traced_corners(source: Emitter, sheet: Tubes, lens: Lens) -> tuple[Rays, Tensor]:
@@ -355,7 +355,7 @@ def local_weight(source: Emitter, lens: Lens, goals: Sequence[Goal], number: int
     x, y = torch.meshgrid(*_even_axes(net, few), indexing="ij")
     _, _, at_net = rays_to(source, lens, x=x, y=y, number=number)
     with torch.no_grad():
-        landings = through(at_net, onwards, [goal.receiver.plane for goal in goals])
+        landings = through(at_net, onwards, [goal.screen.receiver for goal in goals])
     first, *others = (
         torch.from_numpy(_spread(_weight_for(goal, lens, number, at_net=at_net, landed=landed), net.shape))
         for goal, landed in zip(goals, landings, strict=True)
@@ -368,7 +368,7 @@ def local_weight(source: Emitter, lens: Lens, goals: Sequence[Goal], number: int
 
 def _weight_for(goal: Goal, lens: Lens, number: int, *, at_net: Rays, landed: Landed) -> np.ndarray:
     """Return the weight (k, l) for one goal; at_net, landed: rays (k, l) through even points, at net and receiver."""
-    screen, interface = goal.receiver, lens.interfaces[number]
+    screen, interface = goal.screen, lens.interfaces[number]
     sides = zip(at_net.status.shape, interface.net.shape, strict=True)
     smooth = partial(gaussian_filter, sigma=[WEIGHT_SMOOTHING * (k - 1) / (m - 1) for k, m in sides])
     column, row = (p.cpu().double().numpy() for p in screen.pixel(*landed.position))
@@ -377,9 +377,9 @@ def _weight_for(goal: Goal, lens: Lens, number: int, *, at_net: Rays, landed: La
     irradiance = map_coordinates(picture, [row - 0.5, column - 0.5], order=1, mode="nearest")
     logarithm = np.where(on_screen, np.log(np.maximum(irradiance, MAX_LOCAL_WEIGHT**-4)), 0.0)
     weight = np.exp(-0.5 * smooth(logarithm)).clip(1 / MAX_LOCAL_WEIGHT, MAX_LOCAL_WEIGHT)
-    if number == lens.freeform[-1] and interface.law.eta > 1:
-        plane = image_from_last_net(lens, screen.plane)
-        leverage = _excess_leverage(at_net, landed.position, plane, law=interface.law, on_screen=on_screen)
+    if number == lens.tailored_numbers[-1] and interface.law.eta > 1:
+        receiver = image_from_last_net(lens, screen.receiver)
+        leverage = _excess_leverage(at_net, landed.position, receiver, law=interface.law, on_screen=on_screen)
         if leverage is not None:
             weight = weight / np.exp(smooth(np.log(leverage)))
     return weight
@@ -404,7 +404,9 @@ def _spread(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return map_coordinates(values, at, order=1, mode="nearest")
 
 
-def _excess_leverage(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, on_screen: np.ndarray) -> np.ndarray | None:
+def _excess_leverage(
+    at_net: Rays, aim: Tensor, receiver: Receiver, law: Law, on_screen: np.ndarray
+) -> np.ndarray | None:
     """Return leverage / (MIN_LEVERAGE times its median), raised to at least 1, (m, n); None if it is 1 everywhere.
 
     The leverage is the largest singular value of ∂t/∂p, the inverse of the smallest one of ∂p/∂t; p(b, t) are the
@@ -415,9 +417,9 @@ def _excess_leverage(at_net: Rays, aim: Tensor, plane: Receiver, law: Law, on_sc
         t, lit = aim[..., some, some], on_screen[some, some]
         if not lit.any():
             return None
-        step = LEVERAGE_STEP * torch.sqrt((t**2).sum(0) + plane.per_radian(at_net.z) ** 2).max()
+        step = LEVERAGE_STEP * torch.sqrt((t**2).sum(0) + receiver.per_radian(at_net.z) ** 2).max()
         centre, *shifted = (
-            torch.stack(wanted_slopes(rays, t + step * torch.tensor(way).to(t).view(2, 1, 1), plane, law))
+            torch.stack(wanted_slopes(rays, t + step * torch.tensor(way).to(t).view(2, 1, 1), receiver, law))
             for way in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
         )
         (a, b), (c, d) = ((p - centre) / step for p in shifted)

@@ -105,7 +105,7 @@ def along_light(source: Emitter, lens: Lens, goals: Sequence[Goal]) -> tuple[csr
     carried = carried @ diags_array(np.where(lit, factor, 1.0).reshape(-1))
 
     shift_on_back = (back.z - front.z) / lens.index / _magnification(q, b, lit)
-    planes = [goal.receiver.plane for goal in goals]
+    planes = [goal.screen.receiver for goal in goals]
     shifts = [p.per_radian(back.z) / _magnification(q, _array(p.land(out).position), lit) for p in planes]
     weights = [goal.weight for goal in goals]
     mean = math.sqrt(sum(w * s * s for w, s in zip(weights, shifts, strict=True)) / sum(weights))

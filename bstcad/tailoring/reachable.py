@@ -21,12 +21,11 @@ from bstcad.optics.lens.interfaces import Law
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.receivers.goal import Goal
-from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.irradiance import Screen, averaged
 from bstcad.optics.receivers.receivers import Receiver
 from bstcad.optics.surfaces.charts import HEIGHTS
 from bstcad.optics.trace.reach import MAX_EXIT_ANGLE, reach_margin
 from bstcad.optics.trace.unfolding import image_from_last_net
-from bstcad.scene.target import average
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.slope_map import FaceGrid
 from bstcad.transport.mapping import Points
@@ -51,13 +50,13 @@ def reach_of(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT_
 
     lens: the blank, with its final front.  grazing: largest angle to the normal at which light may leave (rad).
     """
-    screen, small = goal.receiver, resample(goal)
-    corners = slope_map.pixel_corners(small.receiver)
+    screen, small = goal.screen, resample(goal)
+    corners = slope_map.pixel_corners(small.screen)
     grid = slope_map.face_grid(source, lens, slope_map.lit_window(source, lens, FACE_CELLS), FACE_CELLS)
-    plane, law = image_from_last_net(lens, screen.plane), lens.last_freeform.law
-    margin, lit = reach_from_each(grid, corners, plane, law, grazing=grazing), slope_map.lit_corners(small.picture)
-    ordered = reach_in_order(grid, corners, lit, plane=plane, law=law, grazing=grazing)
-    found = _inside(torch.maximum(margin.amax(0), ordered), screen, small.receiver)
+    receiver, law = image_from_last_net(lens, screen.receiver), lens.last_tailored.law
+    margin, lit = reach_from_each(grid, corners, receiver, law, grazing=grazing), slope_map.lit_corners(small.picture)
+    ordered = reach_in_order(grid, corners, lit, receiver=receiver, law=law, grazing=grazing)
+    found = _inside(torch.maximum(margin.amax(0), ordered), screen, small.screen)
     lost = margin[:, torch.from_numpy(lit)].amax(1) < 0
     some = grid.density[::FACE_STRIDE, ::FACE_STRIDE].cpu()
     position = grid.at_face.position[:, ::FACE_STRIDE, ::FACE_STRIDE][:, some > 0].cpu().double()
@@ -71,17 +70,21 @@ def reach_of(source: Emitter, lens: Lens, goal: Goal, grazing: float = MAX_EXIT_
 
 def resample(goal: Goal, pixels: int = MAX_AIMS) -> Goal:
     """Return the goal with at most `pixels` pixels on its longer side, each the mean of old ones; the sum decreases."""
-    screen, picture = goal.receiver, goal.picture
+    screen, picture = goal.screen, goal.picture
     shrunk = max(1.0, max(screen.shape) / pixels)
     rows, columns = (max(round(n / shrunk), 1) for n in screen.shape)
-    size = screen.columns, screen.rows
-    small = average(lambda b: picture[b[1] : b[3], b[0] : b[2]], size, (0.0, 0.0, *size), (columns, rows))
+    small = averaged(picture, columns, rows)
     return replace(
-        goal, receiver=replace(screen, pixels=(columns, rows)), picture=small, reachable=None, whole=None, draw=None
+        goal,
+        screen=replace(screen, pixels=(columns, rows)),
+        picture=small,
+        reachable=None,
+        whole=None,
+        cell_picture=None,
     )
 
 
-def reach_from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver, law: Law, grazing: float) -> Tensor:
+def reach_from_each(grid: FaceGrid, aims: Sequence[np.ndarray], receiver: Receiver, law: Law, grazing: float) -> Tensor:
     """Return `trace.reach.reach_margin` from every FACE_STRIDE-th lit point of the face to each aim, (points, …).
 
     aims: x and y of the aims, in the receiver's unit, of one shape (…).  grazing: see `reachable`.
@@ -92,10 +95,12 @@ def reach_from_each(grid: FaceGrid, aims: Sequence[np.ndarray], plane: Receiver,
         for v in (grid.at_face.position, grid.at_face.direction)
     )
     rays = replace(grid.at_face, position=position, direction=direction)
-    return reach_margin(rays, t[:, None].expand(-1, *position.shape[1:]), plane, law=law, grazing=grazing)
+    return reach_margin(rays, t[:, None].expand(-1, *position.shape[1:]), receiver, law=law, grazing=grazing)
 
 
-def reach_in_order(grid: FaceGrid, aims: Points, lit: np.ndarray, plane: Receiver, law: Law, grazing: float) -> Tensor:
+def reach_in_order(
+    grid: FaceGrid, aims: Points, lit: np.ndarray, receiver: Receiver, law: Law, grazing: float
+) -> Tensor:
     """Return the margin (…) of each aim from the point of the face with the same relative position in its lit window.
 
     A target close to the lens is reached from the part of the face in front of it, which may lie between the points of
@@ -107,7 +112,9 @@ def reach_in_order(grid: FaceGrid, aims: Points, lit: np.ndarray, plane: Receive
         for p, size in zip(aims, sizes, strict=True)
     ]
     b = places[0], places[1]
-    margin = reach_margin(slope_map.rays_at(grid, b), torch.from_numpy(np.stack(aims)), plane, law=law, grazing=grazing)
+    margin = reach_margin(
+        slope_map.rays_at(grid, b), torch.from_numpy(np.stack(aims)), receiver, law=law, grazing=grazing
+    )
     [shone] = slope_map.interpolate(grid, (grid.density > 0)[None], b)
     return torch.where(shone > 0.99, margin, -torch.ones_like(margin))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,9 +22,9 @@ from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.surfaces.sides import Sides
 from bstcad.optics.trace.measure import Effort, measure_goal, rrmsds_by_rays
 from bstcad.optics.trace.unfolding import image_screen
-from bstcad.scene.blank import Bounds
-from bstcad.scene.quality import ResolvedTailoring
+from bstcad.tailoring.effort import FULL, TailoringEffort
 from bstcad.tailoring.merit import Merit
+from bstcad.tailoring.settings import Bounds, Settings
 from bstcad.tailoring.source_image import ExtendedSource
 from bstcad.transport.mapping import Mapping
 
@@ -41,7 +41,7 @@ class NetParameters:
 class Parameters:
     """Parameters that tailoring changes; together with a blank they determine the lens."""
 
-    nets: tuple[NetParameters, ...]  # freeform interfaces, in the order of Lens.freeform
+    nets: tuple[NetParameters, ...]  # freeform interfaces, in the order of Lens.tailored_numbers
     front: dict[str, float | Tensor]  # values by name, such as curvature (1/mm); empty for a plane or a net
     back: float  # z of the plane of the back (mm); tailoring moves it even if the heights are fixed
 
@@ -74,19 +74,11 @@ class RatedLens:
         return SIGNIFICANT_RATIO * self.figure < theirs
 
 
-SIGNIFICANT_RATIO = 1.05  # smallest ratio of two figures that is significant: STAGE_EFFORT has errors of 5 %
+SIGNIFICANT_RATIO = 1.05  # smallest ratio of two figures that is significant: `TailoringEffort.stage` has errors of 5 %
 BEST_LENS_STAGE = "back to the best lens before"  # name, in the record of a design, of the return to an earlier lens
-WAVEFRONT_TUBES = 256  # flux tubes per side that measure the wavefront error of a lens between the stages
 TUBES_PER_SECOND = 4.7e6  # tubes traced per second, with the gradient of the merit, on a machine of pace 1
 RRMSD_SECONDS = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
-# Rays for the RRMSD of a lens between the stages, accurate to some 5 % for STAGE_EFFORT_PIXELS pixels per side.  RRMSD²
-# is estimated from products of two pictures (measure.py).  With n² stratified rays per picture its error varies as
-# (p / n)³ / p, so a target of p pixels per side needs (p / STAGE_EFFORT_PIXELS)^⅔ times as many rays per side.
-STAGE_EFFORT, STAGE_EFFORT_PIXELS = Effort(rays=724, accuracy=0, witness=False, cells=1), 512
-ROUGH_RAYS = 0.5  # rays per side of `Task.stage_effort`, relative to STAGE_EFFORT, for an RRMSD known to some 15 %
-# Rays in scenes with accuracy or bounds, and in `better`.
-FINE_EFFORT = Effort(rays=2048, accuracy=0.01, witness=False, cells=1)
-FLUX_EFFORT = Effort(rays=128, accuracy=1.0, witness=False, cells=1)  # rays for the flux on the target alone
+ROUGH_RAYS = 0.5  # rays per side, relative to `TailoringEffort.stage`, for an RRMSD known to some 15 %
 
 Progress = Callable[[str, int, int, str], None]  # called with stage, units done, units in total, text
 LensCallback = Callable[[Callable[[], Lens]], None]  # called with a function that returns the best lens so far
@@ -95,13 +87,6 @@ PACE_MEMORY = 4.0  # seconds of work over which the pace of the machine is avera
 
 def no_progress(stage: str, done: int, total: int, text: str) -> None:
     """Report no progress; default of a `Progress`."""
-
-
-def stage_effort(goals: Sequence[Goal], factor: float = 1.0) -> Effort:
-    """Return STAGE_EFFORT, scaled to the number of pixels of the goals; factor: of the rays per side."""
-    pixels = max(goal.picture.size for goal in goals)
-    rays = factor * STAGE_EFFORT.rays * (pixels / STAGE_EFFORT_PIXELS**2) ** (1 / 3)
-    return replace(STAGE_EFFORT, rays=round(rays))
 
 
 @dataclass(frozen=True)
@@ -118,7 +103,7 @@ class Task:
 
     channels: tuple[Channel, ...]  # light of the source, or of the centre of a source of finite size
     goals: tuple[Goal, ...]  # targets; stage 1 with one freeform face uses only the first
-    knobs: ResolvedTailoring  # settings of the scene's [tailoring]
+    settings: Settings  # settings of the scene's [tailoring]
     min_thickness: float = 0.0  # minimum thickness of the glass everywhere (mm)
     free: tuple[str, ...] = ()  # names of the parameters of the front that stage 1 optimises
     rim_sags: tuple[float, float] = (-math.inf, math.inf)  # range of the front's sag at the rim (mm)
@@ -131,7 +116,7 @@ class Task:
     # error of a picture relative to the target in the merit, both (rows, columns) and of sum <= 1; None: RRMSD²
     merit: Callable[[Tensor, Tensor], Tensor] | None = None
     wave: Wave | None = None  # required wavefront behind the lens; None: no wavefront goal
-    preview: bool = False  # preview: one round in stages 2 and 3, no RRMSD by rays, no costly alternative
+    effort: TailoringEffort = FULL  # effort beside the settings; that of a preview is smaller
     refines: bool = False  # refinement of an earlier lens: only the last round of stage 2 or 3
     solution: float | None = None  # sign σ of light_behind.py, +1 or -1; None: feasibility.py chooses
     floor: float = 0.0  # smallest irradiance, relative to the mean, of the furthest picture in stage 1 of two faces
@@ -151,7 +136,7 @@ class Task:
     def sides(self, lens: Lens, sides: Sides) -> tuple[Sides, ...]:
         """Return the control points per side of each net of a lens whose back has `sides`."""
         front = self.front_sides(sides)
-        return tuple(sides if k == lens.number_of("back") or front is None else front for k in lens.freeform)
+        return tuple(sides if k == lens.number_of("back") or front is None else front for k in lens.tailored_numbers)
 
     @property
     def at_full_size(self) -> Task:
@@ -165,49 +150,45 @@ class Task:
 
     def with_imaged_receivers(self, lens: Lens) -> Task:
         """Return the task with its receivers imaged through the surfaces behind the last net, for stage 1."""
-        goals = (replace(goal, receiver=image_screen(lens, goal.receiver)) for goal in self.goals)
+        goals = (replace(goal, screen=image_screen(lens, goal.screen)) for goal in self.goals)
         return replace(self, goals=tuple(goals))
 
     def rrmsd(self, lens: Lens, effort: Effort | None = None) -> float:
         """Return the largest RRMSD over the goals from independent rays, on the CPU; NaN without light on a target.
 
-        The flux tubes used for tailoring would underestimate the RRMSD.  effort: rays to use; None: FLUX_EFFORT for a
-        preview, FINE_EFFORT for a scene with an accuracy or bounds, else `stage_effort`.
+        The flux tubes used for tailoring would underestimate the RRMSD.  effort: rays to use; None: `flux` of the
+        task's effort if it rates no lenses, `fine` for a scene with an accuracy or bounds, else `between_stages`.
         """
-        if effort is None and self.preview:  # only the light on the target counts
-            effort = FLUX_EFFORT
-        if effort is None and (self.knobs.accuracy is not None or self.bounds is not None):
-            effort = FINE_EFFORT
-        effort = effort or self.stage_effort()
+        if effort is None and not self.effort.rates_lenses:  # only the light on the target counts
+            effort = self.effort.flux
+        if effort is None and (self.settings.accuracy is not None or self.bounds is not None):
+            effort = self.effort.fine
+        effort = effort or self.effort.between_stages(self.goals)
         sources = () if self.sampled_sources else self.extended_sources  # centre alone before stage 3
-        draw = sources[-1].draw if sources else None  # samples the task's last source
-        values = rrmsds_by_rays(lens.plain(), self.channels, self.goals, effort, draw=draw)
+        sampler = sources[-1].sampler if sources else None  # samples the task's last source
+        values = rrmsds_by_rays(lens.plain(), self.channels, self.goals, effort, sampler=sampler)
         return math.nan if any(map(math.isnan, values)) else max(values)
-
-    def stage_effort(self, factor: float = 1.0) -> Effort:
-        """Return the `stage_effort` of the goals; factor: of the rays per side."""
-        return stage_effort(self.goals, factor)
 
     def rated(self, lens: Lens, rrmsd: float) -> RatedLens:
         """Return the lens with its figure of merit; rrmsd: its RRMSD by `Task.rrmsd`."""
         figure = rrmsd
         if self.wave is not None:
-            merit = Merit.of(self.channels, lens, WAVEFRONT_TUBES, goals=(), overshoot=0.0, wave=self.wave)
+            merit = Merit.of(self.channels, lens, self.effort.wavefront_tubes, goals=(), overshoot=0.0, wave=self.wave)
             square, pictures = float(merit(merit.landing(lens))[0]), sum(goal.weight for goal in self.goals)
             figure = math.sqrt((pictures * rrmsd**2 + self.wave.weight * square) / (pictures + self.wave.weight))
         return RatedLens(rrmsd, figure, Parameters.of(lens))
 
     def better(self, latest: Lens, before: Lens) -> tuple[Lens, RatedLens]:
-        """Return the better of two lenses with its figures by FINE_EFFORT; `latest` if the difference is insignificant.
+        """Return the better of two lenses with its figures by fine rays; `latest` if the difference is insignificant.
 
-        STAGE_EFFORT does not resolve RRMSDs below about 0.01: with it 0.0070 seemed better than 0.0048.
+        The rays between the stages do not resolve RRMSDs below about 0.01: with it 0.0070 seemed better than 0.0048.
         """
-        now, then = (self.rated(lens, self.rrmsd(lens, FINE_EFFORT)) for lens in (latest, before))
+        now, then = (self.rated(lens, self.rrmsd(lens, self.effort.fine)) for lens in (latest, before))
         return (before, then) if then.beats(now) else (latest, now)
 
     def flux_on_target(self, lens: Lens) -> float:
         """Return the light on the first target as a fraction of the light that meets the lens."""
-        return measure_goal(lens.plain(), self.channels, self.goals[0], FLUX_EFFORT, ghost=None, draw=None).used
+        return measure_goal(lens.plain(), self.channels, self.goals[0], self.effort.flux, ghost=None, sampler=None).used
 
 
 @dataclass(frozen=True)

@@ -152,18 +152,18 @@ def monomials(surface: BSplineSurface, degree: int) -> list[Tensor]:
     return [x[:, None] ** i * y[None, :] ** j for i, j in powers]
 
 
-def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, plane: Receiver, repeats: int = 3) -> Lens:
+def tailor_to_aim(lens: Lens, rays: Rays, aim: Tensor, receiver: Receiver, repeats: int = 3) -> Lens:
     """Return the lens whose last net sends `rays` (…) to `aim` (2, …) on a receiver, by fits of the slopes.
 
     repeats: number of fits; each fit changes the sag, and so the points where the rays meet the face.
     """
-    plane = image_from_last_net(lens, plane)
-    coming = across(rays, lens.interfaces[: lens.freeform[-1]])
+    receiver = image_from_last_net(lens, receiver)
+    coming = across(rays, lens.interfaces[: lens.tailored_numbers[-1]])
     for _ in range(repeats):
-        face = lens.last_freeform
+        face = lens.last_tailored
         at_face, _ = intersect(face.surface, coming, face.outline, face.status_if_missed)
         lit = at_face.alive & (at_face.flux > 0)
-        z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in wanted_slopes(at_face, aim, plane, face.law))
+        z_x, z_y = (torch.where(lit, s, torch.zeros_like(s)) for s in wanted_slopes(at_face, aim, receiver, face.law))
         samples = (*at_face.places, z_x, z_y, lit.to(z_x))
         x, y, z_x, z_y, weight = (t.reshape(-1) for t in samples)
         net = face.net

@@ -47,7 +47,8 @@ from bstcad.optics.trace.reach import MAX_EXIT_ANGLE, limit_refraction, reach_ma
 from bstcad.optics.trace.trace import across, behind, clear_window, is_transmitted
 from bstcad.optics.trace.tubes import rays_to
 from bstcad.optics.trace.unfolding import image_screen
-from bstcad.scene.errors import SceneError
+from bstcad.runs.files import SceneError
+from bstcad.tailoring.effort import GATHERING, Gathering
 from bstcad.tailoring.slope_fit import Fit, blocks, fit_slopes, monomials, with_polynomial
 from bstcad.transport.density import Density, resample_flux
 from bstcad.transport.mapping import Frame, Mapping, Points, TransportMap, nodes, solve
@@ -56,13 +57,11 @@ from bstcad.transport.mapping import Solver as Solver  # exported to packages th
 SUBCELLS = 2  # samples of the light per axis in a transport cell, since a rim may cross the cell
 SUBPIXELS = 8  # number of pixel parts per axis in a transport cell; a pixel has at least one part
 SLOPE_FLOOR = 1e-3  # smallest density of light over slopes, relative to its mean: the solver needs light in black parts
-GATHERING_NET, GATHERING_SAMPLES = 33, 96  # control points per side of g, and samples per side for its fit
+GATHERING_NET = 33  # control points per side of g
 GATHERING_WIDTH = (GATHERING_NET - 1) / (GATHERING_NET - 5)  # width of g / width of the window: end spans lie outside
-GATHERING_FIT = Fit(bending=1e-3, steps=40, degree=5)  # fit of g
 PARABOLOID_FIT = Fit(steps=0, degree=2)  # fit of g by a paraboloid, if no face can send all light to m
 BENDING_DEGREE, BENDING_STEP = 8, 1e-3  # degree of g on a dome; step of its differences / width of the window
 BENT_SHARE = 0.5  # share of a round's b(t) on a dome; with all of it large deflections make the rounds diverge
-PREVIEW_FIT, PREVIEW_SAMPLES = Fit(steps=0, degree=5), 32  # fit and samples per side of g in a preview, 5 times faster
 TARGET_FLOOR = 1e-3  # smallest irradiance of the target in the map of the paper, relative to its mean
 
 Slopes = tuple[Tensor, Tensor]  # ∂z/∂x and ∂z/∂y, of one shape
@@ -97,22 +96,22 @@ def face_grid(source: Emitter, lens: Lens, window: Rectangle, cells: Sides) -> F
     the ray through b crosses this plane at q, minus the losses before and at this face.
     """
     x, y = (t.to(lens.like.device) for t in sampling.grid(window, cells))
-    number = lens.freeform[-1]
+    number = lens.tailored_numbers[-1]
     q_x, q_y, at_face = rays_to(source, lens, x=x, y=y, number=number)
     coming = across(source.rays_through(q_x, q_y, lens.entrance.z, 1.0), lens.interfaces[:number])
     steps = tuple(side / n for side, n in zip((window.width, window.height), as_pair(cells), strict=True))
     xx, xy = torch.gradient(q_x, spacing=steps)
     yx, yy = torch.gradient(q_y, spacing=steps)
-    through = lens.last_freeform.outline.contains(x, y) & coming.alive & at_face.alive
+    through = lens.last_tailored.outline.contains(x, y) & coming.alive & at_face.alive
     lossless = lens.losses is None
-    density = source.irradiance(q_x, q_y, lens.entrance.z) if lossless else behind(coming, lens.last_freeform).flux
+    density = source.irradiance(q_x, q_y, lens.entrance.z) if lossless else behind(coming, lens.last_tailored).flux
     density = density * (xx * yy - xy * yx).abs() * through
     return FaceGrid(window, at_face, density)
 
 
 def lit_window(source: Emitter, lens: Lens, n: int = 128) -> Rectangle:
     """Return the lit rectangle of the last freeform face, with a margin, found on n x n cells; SceneError if unlit."""
-    half_x, half_y = lens.last_freeform.outline.half_extent
+    half_x, half_y = lens.last_tailored.outline.half_extent
     grid = face_grid(source, lens, Rectangle(2 * half_x, 2 * half_y), n)
     lit = grid.density > 0
     if not bool(lit.any()):
@@ -144,14 +143,14 @@ class SlopeMap:
 
 
 def slope_map(
-    lens: Lens, grid: FaceGrid, goal: Goal, previous: SlopeMap | None, solver: Solver, preview: bool = False
+    lens: Lens, grid: FaceGrid, goal: Goal, previous: SlopeMap | None, solver: Solver, effort: Gathering = GATHERING
 ) -> SlopeMap:
     """Return the slope map of one round, for the sag of `lens`.
 
     grid: `square_grid` of the lit window.  previous: map of the last round, which gives b(t); None: b = 0.
-    preview: use a coarser fit of g, which does not change the fixed point.
+    effort: of the fit of g.
     """
-    picture, screen, law = goal.picture, image_screen(lens, goal.receiver), lens.last_freeform.law
+    picture, screen, law = goal.picture, image_screen(lens, goal.screen), lens.last_tailored.law
     t = pixel_corners(screen)
     flat = grid.at_face.chart is HEIGHTS
     if previous:
@@ -159,10 +158,10 @@ def slope_map(
     else:
         b = (np.zeros_like(t[0]), np.zeros_like(t[1])) if flat else straight_points(grid, screen, lit_corners(picture))
     if flat:
-        g = gathering(grid, lens, screen.plane, centroid(picture, screen), preview=preview)
+        g = gathering(grid, lens, screen.receiver, centroid(picture, screen), effort=effort)
     else:
-        g = bending(grid, lens, screen.plane, t, points=b, lit=lit_corners(picture))
-    needed = wanted_slopes(rays_at(grid, b), torch.from_numpy(np.stack(t)), screen.plane, law)
+        g = bending(grid, lens, screen.receiver, t, points=b, lit=lit_corners(picture))
+    needed = wanted_slopes(rays_at(grid, b), torch.from_numpy(np.stack(t)), screen.receiver, law)
     sign = -1.0 if law.reverses or law.eta < 1 else 1.0
     found = transport_slopes(grid, picture, g, needed, points=b, sign=sign, solver=solver)
     if not flat:
@@ -175,7 +174,7 @@ def straight_points(grid: FaceGrid, screen: Screen, lit: np.ndarray) -> Points:
     """Return b for the pixel corners: points of the chart in the directions of the target, scaled to the lit window."""
     aim = torch.from_numpy(np.stack(pixel_corners(screen)))
     centre = Rays(torch.zeros_like(aim[:1]).expand(3, *aim.shape[1:]), aim, aim[0], aim[0], z=grid.at_face.z)
-    x, y, _ = (p.numpy() for p in grid.at_face.chart.coordinates(screen.plane.vector_to(centre, aim)))
+    x, y, _ = (p.numpy() for p in grid.at_face.chart.coordinates(screen.receiver.vector_to(centre, aim)))
     scale = min(grid.window.width, grid.window.height) / 2 / float(np.hypot(x, y)[lit].max())
     return scale * x, scale * y
 
@@ -186,7 +185,7 @@ def square_grid(source: Emitter, lens: Lens, window: Rectangle, n: int) -> FaceG
     grid = face_grid(source, lens, Rectangle(side, side), n * SUBCELLS)
     if grid.at_face.chart is HEIGHTS:
         return grid
-    return replace(grid, density=shared_at_rim(grid.density, lens.last_freeform.outline, grid))
+    return replace(grid, density=shared_at_rim(grid.density, lens.last_tailored.outline, grid))
 
 
 def shared_at_rim(density: Tensor, outline: Outline, grid: FaceGrid) -> Tensor:
@@ -249,7 +248,7 @@ def fit_to_map(
         _, *now = net.relative_sag_and_slope(x[some], y[some])
         b_x, b_y = (p[some].cpu().double().numpy() for p in (x, y))
         p_x, p_y = (s.cpu().double() for s in slopes.slopes(x[some], y[some]))
-        reachable = limit_refraction(rays_at(grid, (b_x, b_y)), (p_x, p_y), lens.last_freeform.law, grazing)
+        reachable = limit_refraction(rays_at(grid, (b_x, b_y)), (p_x, p_y), lens.last_tailored.law, grazing)
         for z, needed, present in zip((z_x, z_y), reachable, now, strict=True):
             z[some] = torch.where(lit[some], needed.to(x), present)
     weight = torch.where(lit, 1.0, fit.unlit).to(x)
@@ -266,23 +265,22 @@ def centroid(picture: np.ndarray, screen: Screen) -> tuple[float, float]:
 
 
 def gathering(
-    grid: FaceGrid, lens: Lens, plane: Receiver, middle: tuple[float, float], preview: bool = False
+    grid: FaceGrid, lens: Lens, receiver: Receiver, middle: tuple[float, float], effort: Gathering
 ) -> BSplineSurface:
     """Return g, the net of GATHERING_NET points per side whose slopes fit p(b, m) best over the lit part of a grid.
 
     The slopes p(b, m) themselves are in general not exactly the gradient of a surface.  middle: m on the receiver.
     """
-    count, fit = (PREVIEW_SAMPLES, PREVIEW_FIT) if preview else (GATHERING_SAMPLES, GATHERING_FIT)
-    few, law = grid.thinned(count), lens.last_freeform.law
+    few, law = grid.thinned(effort.samples), lens.last_tailored.law
     x, y = few.at_face.places
     aim = torch.stack([torch.full_like(x, m) for m in middle])
-    reaches = reach_margin(few.at_face, aim, plane, law=law) >= 0  # False: the slope is a placeholder
-    fit = fit if few.at_face.chart is not HEIGHTS or bool(reaches[few.density > 0].all()) else PARABOLOID_FIT
-    return fit_gathering(few, wanted_slopes(few.at_face, aim, plane, law), fit)
+    reaches = reach_margin(few.at_face, aim, receiver, law=law) >= 0  # False: the slope is a placeholder
+    fit = effort.fit if few.at_face.chart is not HEIGHTS or bool(reaches[few.density > 0].all()) else PARABOLOID_FIT
+    return fit_gathering(few, wanted_slopes(few.at_face, aim, receiver, law), fit)
 
 
 def bending(
-    grid: FaceGrid, lens: Lens, plane: Receiver, corners: Points, *, points: Points, lit: np.ndarray
+    grid: FaceGrid, lens: Lens, receiver: Receiver, corners: Points, *, points: Points, lit: np.ndarray
 ) -> BSplineSurface:
     """Return g whose second derivatives fit those of the slopes p(b, t) in b best, at the pairs b(t) of a round.
 
@@ -292,8 +290,8 @@ def bending(
     """
     half_x, half_y = (GATHERING_WIDTH * size / 2 for size in (grid.window.width, grid.window.height))
     flat = torch.zeros((GATHERING_NET, GATHERING_NET), dtype=torch.float64)
-    net, law = BSplineSurface(0.0, flat, (-half_x, half_x), (-half_y, half_y)), lens.last_freeform.law
-    few = tuple(slice(None, None, max(1, n // GATHERING_SAMPLES)) for n in lit.shape)
+    net, law = BSplineSurface(0.0, flat, (-half_x, half_x), (-half_y, half_y)), lens.last_tailored.law
+    few = tuple(slice(None, None, max(1, n // GATHERING.samples)) for n in lit.shape)
     x, y, *aims = (p[few][lit[few]] for p in (*points, *corners))
     aim, step = torch.from_numpy(np.stack(aims)), BENDING_STEP * grid.window.width
 
@@ -305,7 +303,7 @@ def bending(
         return xx, (xy + yx) / math.sqrt(2), yy
 
     def needed(x: np.ndarray, y: np.ndarray) -> Slopes:
-        return wanted_slopes(rays_at(grid, (x, y)), aim, plane, law)
+        return wanted_slopes(rays_at(grid, (x, y)), aim, receiver, law)
 
     def of_net(heights: Tensor) -> tuple[Tensor, ...]:
         surface = replace(net, heights=heights)
@@ -420,15 +418,17 @@ def map_to_target(source: Emitter, lens: Lens, goal: Goal, n: int, solver: Solve
     of the front onto the plane z = const through its centre: in the coordinates of the target, the map that a surface
     can realise is not close to a gradient.
     """
-    picture, screen = goal.picture, image_screen(lens, goal.receiver)
+    picture, screen = goal.picture, image_screen(lens, goal.screen)
     area = clear_window(source, lens)
     side = max(area.width, area.height)
     x, y = (t.to(lens.like.device) for t in sampling.grid(Rectangle(side, side), n * SUBCELLS))
     flux = source.irradiance(x, y, lens.entrance.z)
     flux = flux * is_transmitted(source.rays_through(x, y, lens.entrance.z, 1.0), lens)
     density = light_density(flux.cpu().numpy().reshape(n, SUBCELLS, n, SUBCELLS).mean((1, 3)), side, lens)
-    if not screen.plane.is_level:
-        target, frame = resample_picture(picture, screen.plane.to_level_plane(*pixel_corners(screen), lens.front.z), n)
+    if not screen.receiver.is_level:
+        target, frame = resample_picture(
+            picture, screen.receiver.to_level_plane(*pixel_corners(screen), lens.front.z), n
+        )
     else:
         width, height = screen.x[1] - screen.x[0], screen.y[1] - screen.y[0]
         target = Density.from_picture(picture, n, width=width, height=height, floor=TARGET_FLOOR)
@@ -440,14 +440,14 @@ def map_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> Transport
     """Return the inverse of the map of `map_to_target` at the corners of the target's pixels."""
     screen = image_screen(lens, screen)
     corners = pixel_corners(screen)
-    if not screen.plane.is_level:
-        corners = screen.plane.to_level_plane(*corners, lens.front.z)
+    if not screen.receiver.is_level:
+        corners = screen.receiver.to_level_plane(*corners, lens.front.z)
     return replace(map_from_face(mapping.inverse(*corners), screen), plane="entrance")
 
 
 def aim_points(mapping: Mapping, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Tensor:
     """Return the points of the screen (2, …), in its unit, to which the map of `map_to_target` sends x, y (…) mm."""
     screen, sent = image_screen(lens, screen), mapping(*(p.detach().cpu().double().numpy() for p in (x, y)))
-    if not screen.plane.is_level:
-        sent = screen.plane.from_level_plane(*sent, lens.front.z)
+    if not screen.receiver.is_level:
+        sent = screen.receiver.from_level_plane(*sent, lens.front.z)
     return torch.stack([torch.from_numpy(np.ascontiguousarray(s)) for s in sent]).to(x)

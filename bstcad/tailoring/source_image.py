@@ -30,7 +30,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.channels import Channel, Draw
+from bstcad.optics.light.channels import Channel, SourceSampler
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.receivers.irradiance import Screen, tent
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
@@ -58,7 +58,7 @@ class ExtendedSource:
 
     source: Emitter  # source of finite size
     centre: tuple[Channel, ...]  # light of the centre of the source, one channel per spectral line
-    draw: Draw  # function that samples points of the source
+    sampler: SourceSampler  # function that samples points of the source
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,17 +212,19 @@ def _hats(side: int, border: int) -> np.ndarray:
 
 
 @torch.no_grad()
-def blur_error(by_images: Tensor, draw: Draw, lens: Lens, screen: Screen, *, border: int, seed: int) -> Tensor:
+def blur_error(
+    by_images: Tensor, sampler: SourceSampler, lens: Lens, screen: Screen, *, border: int, seed: int
+) -> Tensor:
     """Return the error E_rays - B E_0 of a picture, (rows, columns), by two sets of rays; 0 if noise hides it.
 
-    by_images: picture B E_0, divided by the transmitted flux.  draw: samples the source.  border: border of B (pixels).
+    by_images: picture B E_0, divided by the transmitted flux.  sampler: of the source.  border: of B (pixels).
 
     The smoothed differences d_i of E_i and B E_0 in the two sets have an equal error and independent noise.  Their mean
     is therefore scaled by d_1 · d_2 / |(d_1 + d_2) / 2|².
     """
     picture, errors = by_images.cpu(), []
     for k in range(2):
-        points = draw(ERROR_POINTS, seed + ERROR_SEED_OFFSET + k)
+        points = sampler(ERROR_POINTS, seed + ERROR_SEED_OFFSET + k)
         n = max(1, round(side_factor(points) * ERROR_RAYS))
         seed_of_set = seed + ERROR_SEED_OFFSET + k
         [rays] = simulated(lens, points, [screen], n=n, seed=seed_of_set, splits_missed=False)

@@ -30,14 +30,13 @@ from bstcad.optics.surfaces.rays import Rays
 from bstcad.optics.surfaces.sides import as_pair, coarser
 from bstcad.optics.trace.reach import MAX_EXIT_ANGLE
 from bstcad.optics.trace.trace import clear_window, trace
-from bstcad.scene.fronts import CONIC_CONSTANTS
-from bstcad.scene.quality import COARSEST_GRID
-from bstcad.scene.scene import SEARCH_RANGE
 from bstcad.tailoring import slope_map
+from bstcad.tailoring.effort import FrontSearch
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.merit import mean_square_miss
 from bstcad.tailoring.reachable import resample
 from bstcad.tailoring.run import Parameters, StageStep, Steps, Task
+from bstcad.tailoring.settings import CONIC_CONSTANTS, SEARCH_RANGE
 from bstcad.tailoring.slope_fit import Fit, tailor_to_aim
 from bstcad.tailoring.slope_map import SlopeMap
 from bstcad.transport.bfm import TransportStep
@@ -73,18 +72,6 @@ class SlopeRound:
     slopes: SlopeMap  # map of the last round
 
 
-@dataclass(frozen=True)
-class FrontSearch:
-    """Effort of `shaped_front`."""
-
-    cells: int = COARSEST_GRID  # cells per side of the transport map
-    iterations: int = 100  # iterations of the map; stage 1 states its own number
-    repeats: int = 3  # slope fits of the back for each front
-
-
-PREVIEW_NET, PREVIEW_SEARCH = 17, FrontSearch(cells=32, iterations=40, repeats=1)  # points per side; effort in previews
-
-
 def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
     """Yield the steps of stage 1 from a blank, or from a saved state.
 
@@ -93,15 +80,15 @@ def steps(task: Task, lens: Lens, state: SlopeRound | None = None) -> Steps:
     """
     lens = task.heaviest.through(lens)
     if state is None and task.free:
-        net, effort = task.knobs.levels[0], FrontSearch(iterations=task.knobs.transport_iterations)
-        if task.preview:
-            net, effort = coarser(lens.back_net.shape, PREVIEW_NET), PREVIEW_SEARCH
+        few, settings = task.effort.front_net, task.settings
+        net = settings.levels[0] if few is None else coarser(lens.back_net.shape, few)
+        effort = task.effort.front_search or FrontSearch(iterations=settings.transport_iterations)
         source, blank = task.heaviest.source, lens.refined(net)
         shaped = shaped_front(source, blank, task.goals[0], task.free, rim_sags=task.rim_sags, effort=effort)
         lens = lens.with_front(shaped.front)
     for last in follow_slopes(task, lens, state):
         yield last
-    if task.preview:
+    if not task.effort.rates_lenses:
         return
     first, by_rays = last.lens, task.rrmsd(last.lens)
     yield replace(last, state=None, rays_rrmsd=by_rays)
@@ -120,8 +107,8 @@ def is_poor_result(task: Task, lens: Lens, by_rays: float, state: SlopeRound) ->
     by_rays: RRMSD of the lens; if large, it is computed again without detail that the net cannot resolve.
     """
     goal = task.goals[0]
-    few = resample(goal, pixels=max(as_pair(task.knobs.levels[-1])))
-    if by_rays > RETRY_RRMSD and few.receiver.shape != goal.receiver.shape:
+    few = resample(goal, pixels=max(as_pair(task.settings.levels[-1])))
+    if by_rays > RETRY_RRMSD and few.screen.shape != goal.screen.shape:
         by_rays = replace(task, goals=(few,)).rrmsd(lens)
     return not by_rays <= RETRY_RRMSD or state.slopes.moved > RETRY_CHANGE  # NaN: no light on the target
 
@@ -132,16 +119,16 @@ def follow_slopes(task: Task, lens: Lens, state: SlopeRound | None = None) -> St
     All rounds except the last FINE_ROUNDS use coarse grids and nets, which are fast.  Once the map has settled, the
     remaining coarse rounds are skipped.
     """
-    knobs, z = task.knobs, lens.back.z  # z: plane of the back in the blank (mm)
+    settings, z = task.settings, lens.back.z  # z: plane of the back in the blank (mm)
     slopes, done = (None, 0) if state is None else (state.slopes, state.round)
     lens = lens if state is None else state.lens.apply_to(lens)
-    number = min(done, knobs.rounds - 1)
-    while number < knobs.rounds:
+    number = min(done, settings.rounds - 1)
+    while number < settings.rounds:
         if slopes is None or number >= done:
             lens, slopes = _round(task, lens, slopes, number)
             lens = place_back(lens, z, task.min_thickness, task.bounds)  # the next round starts from the shifted back
             task.tidy()
-        number = next_round(number, knobs.rounds, fine=FINE_ROUNDS, settled=slopes.moved <= SETTLED_CHANGE)
+        number = next_round(number, settings.rounds, fine=FINE_ROUNDS, settled=slopes.moved <= SETTLED_CHANGE)
         yield round_step(task, lens, SlopeRound(number, Parameters.of(lens), slopes), slopes.face_points)
 
 
@@ -152,25 +139,26 @@ def next_round(number: int, rounds: int, fine: int, settled: bool) -> int:
 
 def round_step(task: Task, lens: Lens, state: SlopeRound, face_points: Points) -> StageStep:
     """Return the step after a round; face_points: points (mm) of the last tailored face for the pixel corners."""
-    make, progress = partial(task.refined, lens, task.knobs.levels[-1]), ("stage 1", state.round, task.knobs.rounds, "")
+    make = partial(task.refined, lens, task.settings.levels[-1])
+    progress = "stage 1", state.round, task.settings.rounds, ""
     return StageStep(make, state, mapping=state.slopes.mapping, face_points=face_points, progress=progress)
 
 
 def _round(task: Task, lens: Lens, previous: SlopeMap | None, number: int) -> tuple[Lens, SlopeMap]:
     """Run the round of this number (from 0); return the lens and the map to which it is fitted."""
-    knobs, source, goal, left = task.knobs, task.heaviest.source, task.goals[0], task.knobs.rounds - number
-    cells = max(COARSEST_GRID, knobs.transport_grid // 2 ** min(left - 1, 2))
-    m = knobs.levels[max(-left, -len(knobs.levels))] if left <= FINE_ROUNDS else knobs.levels[0]
+    settings, source, goal, left = task.settings, task.heaviest.source, task.goals[0], task.settings.rounds - number
+    cells = max(task.effort.coarsest_grid, settings.transport_grid // 2 ** min(left - 1, 2))
+    m = settings.levels[max(-left, -len(settings.levels))] if left <= FINE_ROUNDS else settings.levels[0]
 
     def progress(s: TransportStep) -> None:
-        task.progress("stage 1", number, knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
+        task.progress("stage 1", number, settings.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
 
     lens = task.refined(lens, m)
     window = slope_map.lit_window(source, lens)
     grid = slope_map.square_grid(source, lens, window, cells)
-    solver = Solver(knobs.transport_iterations, progress=progress)
-    slopes = slope_map.slope_map(lens, grid, goal, previous, solver=solver, preview=task.preview)
-    sides = [min(2 * points, knobs.rays) for points in as_pair(m)]
+    solver = Solver(settings.transport_iterations, progress=progress)
+    slopes = slope_map.slope_map(lens, grid, goal, previous, solver=solver, effort=task.effort.gathering)
+    sides = [min(2 * points, settings.rays) for points in as_pair(m)]
     parts = math.ceil(max(sides) / MAX_RAY_CELLS)
     grid = slope_map.face_grid(source, lens, window, (math.ceil(sides[0] / parts), math.ceil(sides[1] / parts)))
     grazing = MAX_EXIT_ANGLE if task.edge is None else task.edge.angle
@@ -185,14 +173,17 @@ def follow_aims(task: Task, lens: Lens) -> tuple[Lens, Mapping]:
     slope fits converge even if the slopes needed at fixed points of the back depend strongly on the sag: in strong
     lenses near the source, and in glass of low index.  The part of these slopes that is not a gradient is lost.
     """
-    knobs, goal, z = task.knobs, task.goals[0], lens.back.z
+    settings, goal, z = task.settings, task.goals[0], lens.back.z
     for number in range(AIM_ROUNDS):
-        n, m = (COARSEST_GRID, knobs.levels[0]) if number < AIM_ROUNDS - 1 else (knobs.transport_grid, knobs.levels[-1])
+        n, m = settings.transport_grid, settings.levels[-1]
+        if number < AIM_ROUNDS - 1:
+            n, m = task.effort.coarsest_grid, settings.levels[0]
         lens = task.refined(lens, m)
-        side = min(3 * max(as_pair(m)), max(2 * max(as_pair(m)), knobs.rays))  # many rays may leave through the sides
-        counts = {"n": n, "side": side, "iterations": knobs.transport_iterations}
+        points = max(as_pair(m))
+        side = min(3 * points, max(2 * points, settings.rays))  # many rays may leave through the sides
+        counts = {"n": n, "side": side, "iterations": settings.transport_iterations}
         rays, aims, mapping = aimed_rays(task.heaviest.source, lens, goal, **counts)
-        lens = place_back(tailor_to_aim(lens, rays, aims, goal.receiver.plane), z, task.min_thickness, task.bounds)
+        lens = place_back(tailor_to_aim(lens, rays, aims, goal.screen.receiver), z, task.min_thickness, task.bounds)
     return lens, mapping
 
 
@@ -204,7 +195,7 @@ def aimed_rays(
     area = clear_window(source, lens)
     x, y = (t.to(lens.like) for t in sampling.grid(area, side))
     rays = source.rays_through(x, y, lens.entrance.z, area.area / side**2)
-    return rays, slope_map.aim_points(mapping, lens, goal.receiver, x=x, y=y), mapping
+    return rays, slope_map.aim_points(mapping, lens, goal.screen, x=x, y=y), mapping
 
 
 def shaped_front(
@@ -215,12 +206,12 @@ def shaped_front(
     free, rim_sags: parameters of the front and range of its sag, see `best_front`.  The back has the net of `lens`, and
     is fitted to each front: rays keep the aims P_i^t that they have with the front of `lens`.
     """
-    side, plane = 2 * max(lens.back_net.shape), goal.receiver.plane
+    side, receiver = 2 * max(lens.back_net.shape), goal.screen.receiver
     rays, aims, _ = aimed_rays(source, lens, goal, n=effort.cells, side=side, iterations=effort.iterations)
 
     def miss(front: Lens) -> float:
-        fitted = tailor_to_aim(front, rays, aims, plane=plane, repeats=effort.repeats)
-        return float(mean_square_miss(trace(rays, fitted, plane), aims))
+        fitted = tailor_to_aim(front, rays, aims, receiver=receiver, repeats=effort.repeats)
+        return float(mean_square_miss(trace(rays, fitted, receiver), aims))
 
     return lens.with_front(best_front(miss, lens, free, rim_sags).front)
 

@@ -34,8 +34,6 @@ from bstcad.optics.light.channels import Channel, channels_of, points_per_line
 from bstcad.optics.surfaces.sides import as_pair, coarser
 from bstcad.optics.trace.measure import rrmsd_by_tubes, side_factor
 from bstcad.optics.trace.source_images import images
-from bstcad.scene.blank import Bounds
-from bstcad.scene.quality import ResolvedTailoring
 from bstcad.tailoring.folds import Folds, needs_no_folds
 from bstcad.tailoring.grazing import Grazing
 from bstcad.tailoring.machinability import active_bounds, excess, round_weight
@@ -44,6 +42,7 @@ from bstcad.tailoring.minimise import PLATEAU, Best, Iterate, LbfgsState, Pairs,
 from bstcad.tailoring.net_variables import NetVariables, along_light
 from bstcad.tailoring.reachable import resample
 from bstcad.tailoring.run import ROUGH_RAYS, TUBES_PER_SECOND, Parameters, Stage, StageStep, Steps, Task, maker
+from bstcad.tailoring.settings import Bounds, Settings
 from bstcad.tailoring.source_image import ExtendedSource
 
 RoundFractions = tuple[tuple[float, float], ...]  # (tubes per side, evaluations) of rounds, relative to the settings
@@ -94,9 +93,6 @@ CELLS_PER_POINT, CELL_MARGIN, MAX_CELLS = 4.0, 0.25, 1 << 22
 # easily; share of the errors on cells smaller than each further size in the rest.
 CELL_SHARE, CELL_SHARE_POWER, FINER_SHARE = 0.21, 0.33, 0.2
 MIN_EVALUATIONS = 30  # evaluations below which stage 2 has a single round and stage 3 gets twice as many
-COMPARED_NET = 65  # largest number of control points per side in `compare_precisions`, for speed
-COMPARED_TUBES = 128  # tubes per side in `compare_precisions`
-COMPARED_EVALUATIONS = 6  # evaluations in each precision in `compare_precisions`
 # Rounds of stage 3: (size of the source, evaluations), as fractions of the full size and of all evaluations.  Each
 # round measures the error of the blur anew (source_image.py).
 SOURCE_SIZES = ((1 / 3, 1 / 8), (2 / 3, 1 / 8), (1.0, 1 / 4), (1.0, 1 / 4), (1.0, 1 / 4))
@@ -139,7 +135,7 @@ class TubeRound:
         if not self.resolved:
             return math.inf
         cells = min(finest_cells(self.task), 2) * pixels_of(self.task)  # per side
-        return FOUR_POINTS * max(1.0, cells / self.task.knobs.side) ** 2
+        return FOUR_POINTS * max(1.0, cells / self.task.settings.side) ** 2
 
     def takes_over(self, before: TubeRound) -> bool:
         """Return True if L-BFGS keeps the steps stored by the round before: it has nearly the same merit and variables.
@@ -163,17 +159,17 @@ class TubeRound:
         merit = Merit.of(self.channels, lens, self.tubes, goals, overshoot=overshoot, wave=task.wave)
         merit = replace(merit, picture_error=task.merit, shares=self.shares)
         # the blur by a source hides folds; two nets that form several goals converge slowly without them
-        may_fold = task.merit is not None or task.preview or task.several or task.extended_sources
+        may_fold = task.merit is not None or not task.effort.refines_merit or task.several or task.extended_sources
         if not may_fold and any(map(needs_no_folds, task.goals)):
             with torch.no_grad():
                 landed = merit.landing(lens).on_goals
             pairs = zip(task.goals, landed, strict=True)
-            cell = pixels_of(task) / task.knobs.side  # side of the light of a cell of the net, if it is even (pixels)
+            cell = pixels_of(task) / task.settings.side  # side (pixels) of even light of a cell of the net
             folds = (Folds.of(goal, merit.light.sheets, each, cell) for goal, each in pairs)
             merit = replace(merit, folds=tuple(folds))
         if self.source is None:
             return merit
-        return merit.with_blur(self.source, lens, seed=None if task.preview else task.knobs.seed)
+        return merit.with_blur(self.source, lens, seed=task.settings.seed if task.effort.refines_merit else None)
 
     def run(
         self, problem: Problem, variables: NetVariables, position: SearchPosition, total: int,
@@ -200,7 +196,7 @@ class TubeRound:
                     step = replace(step, rrmsd=best.figure)
                     reason = "accuracy" if best.figure <= position.goal_by_tubes else reason
                 if self.ends_distorted and not reason and best.evaluations % COMPARISON_INTERVAL == 0:
-                    rough = self.task.rrmsd(step.lens, self.task.stage_effort(ROUGH_RAYS))
+                    rough = self.task.rrmsd(step.lens, self.task.effort.between_stages(self.task.goals, ROUGH_RAYS))
                     distorted = best.figure < DISTORTION_RATIO * rough
                     reason = "distortion" if distorted else ""
             if iterate.state is not None and not reason:
@@ -235,9 +231,9 @@ def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Steps:
 
     Few tubes resolve the large errors at the start as well as many tubes do.  The last round corrects finer errors.
     """
-    fine = tuple(sheet_sizes(task.knobs, round_shares(task)))
+    fine = tuple(sheet_sizes(task.settings, round_shares(task)))
     if task.refines:
-        return run_rounds((_fine_round(task, fine[-1][0], refining_evaluations(task.knobs), True),), lens, state)
+        return run_rounds((_fine_round(task, fine[-1][0], refining_evaluations(task.settings), True),), lens, state)
     coarse = coarse_rounds(task, lens)
     factor = 1.0 if not coarse else EVALUATION_FACTOR if len(fine) > 1 else SINGLE_ROUND_FACTOR
     last = len(fine) - 1
@@ -246,25 +242,25 @@ def steps(task: Task, lens: Lens, state: TubeSearch | None = None) -> Steps:
     return run_rounds((*coarse, first, *again, *others), lens, state)
 
 
-def refining_evaluations(knobs: ResolvedTailoring) -> int:
+def refining_evaluations(settings: Settings) -> int:
     """Return the number of evaluations of the round that refines an earlier lens."""
-    return math.ceil(REFINING_SHARE * knobs.stage2_iterations)
+    return math.ceil(REFINING_SHARE * settings.stage2_iterations)
 
 
 def _fine_round(task: Task, tubes: int, evaluations: int, is_last: bool) -> TubeRound:
     resolved, cells = resolves_net(task), finest_cells(task)
-    few = tubes < DENSE_TUBES * task.knobs.side
-    ends_early = resolved and few and task.knobs.stage2_iterations <= SHORT_EVALUATIONS
+    few = tubes < DENSE_TUBES * task.settings.side
+    ends_early = resolved and few and task.settings.stage2_iterations <= SHORT_EVALUATIONS
     return TubeRound(
         task, tubes, evaluations, plateau=FEW_TUBES if ends_early else PLATEAU, resolved=resolved,
-        ends_distorted=len(task.goals) > 1 and not task.preview and not is_last,
+        ends_distorted=len(task.goals) > 1 and task.effort.divides_rounds and not is_last,
         shares=shares_on_cells(task, cells if is_last or cells <= 2 else cells // 2),
     )  # fmt: skip
 
 
 def pixels_of(task: Task) -> float:
     """Return the pixels per side of the square with as many pixels as the largest target."""
-    return max(math.sqrt(math.prod(goal.receiver.shape)) for goal in task.goals)
+    return max(math.sqrt(math.prod(goal.screen.shape)) for goal in task.goals)
 
 
 def finest_cells(task: Task) -> int:
@@ -274,10 +270,10 @@ def finest_cells(task: Task) -> int:
     bright, its pixels have more cells of the net: ten for letters.  Half pixels are rated in any case, and are the
     smallest cells for several goals, with which two nets converge faster.
     """
-    if task.merit is not None or task.preview:
+    if task.merit is not None or not task.effort.refines_merit:
         return 1
-    wanted = math.log2(CELLS_PER_POINT * task.knobs.side / pixels_of(task))
-    most = math.log2(MAX_CELLS / max(math.prod(goal.receiver.shape) for goal in task.goals)) / 2
+    wanted = math.log2(CELLS_PER_POINT * task.settings.side / pixels_of(task))
+    most = math.log2(MAX_CELLS / max(math.prod(goal.screen.shape) for goal in task.goals)) / 2
     most = min(most, 1.0) if task.several else most
     return 1 << max(0, math.floor(min(max(wanted + CELL_MARGIN, 1.0), most)))
 
@@ -287,7 +283,7 @@ def shares_on_cells(task: Task, cells: int) -> tuple[float, ...]:
     lit = max(float(goal.picture.sum() ** 2 / (goal.picture**2).sum()) for goal in task.goals)  # pixels, if even
     share = CELL_SHARE
     if not all(map(needs_no_folds, task.goals)):
-        share *= max(1.0, task.knobs.side**2 / lit) ** -CELL_SHARE_POWER
+        share *= max(1.0, task.settings.side**2 / lit) ** -CELL_SHARE_POWER
     shares, rest = [], 1.0
     for level in range(cells.bit_length() - 1):
         shares.append(rest * (1 - (share if level == 0 else FINER_SHARE)))
@@ -301,9 +297,10 @@ def coarse_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
     If the map has not settled, as for a lamp or a wall close to the lens, light has to move far.  This needs many
     evaluations, each in a thirtieth of the time of a full one; the tubes need not resolve the full net's cells.
     """
-    limit = min(max(task.goals[0].receiver.shape) - 1, task.knobs.side // 2)  # pixels that the net can resolve
+    limit = min(max(task.goals[0].screen.shape) - 1, task.settings.side // 2)  # pixels that the net can resolve
     rounds = [TubeRound(task, tubes, count, pixels=pixels) for pixels, tubes, count in COARSE_ROUNDS if pixels <= limit]
-    if not rounds or task.merit is not None or task.several or task.preview or not task.knobs.stage2_iterations:
+    one_round = not task.effort.divides_rounds or not task.settings.stage2_iterations
+    if not rounds or one_round or task.merit is not None or task.several:
         return ()  # several goals: two nets would distort between so few tubes
     coarse, tubes = with_pixels(task, LARGE_PIXELS), COARSE_ROUNDS[0][1]
     [goal] = coarse.goals
@@ -318,15 +315,15 @@ def with_pixels(task: Task, pixels: int) -> Task:
 
 def round_shares(task: Task) -> RoundFractions | None:
     """Return the rounds of a task; None: `sheet_sizes` chooses dense, finer or sparse rounds."""
-    if task.preview:
+    if not task.effort.divides_rounds:
         return ((1.0, 1.0),)
     if not task.several:
-        few = DENSE_ROUNDS[0][0] * task.knobs.rays < DENSE_TUBES * task.knobs.side  # in the first round
-        few = few and task.knobs.stage2_iterations <= SHORT_EVALUATIONS
+        few = DENSE_ROUNDS[0][0] * task.settings.rays < DENSE_TUBES * task.settings.side  # in the first round
+        few = few and task.settings.stage2_iterations <= SHORT_EVALUATIONS
         return SHORT_ROUNDS if few and resolves_net(task) else None
     if len(task.goals) == 1:
         return WAVEFRONT_ROUNDS
-    larger = max(1.0, task.knobs.side / PICTURES_SIDE)
+    larger = max(1.0, task.settings.side / PICTURES_SIDE)
     return tuple((tubes, larger * share) for tubes, share in PICTURES_ROUNDS)
 
 
@@ -337,23 +334,23 @@ def resolves_net(task: Task) -> bool:
     round early (FEW_TUBES).  Fewer tubes do not correct how this distorts the net between the tubes: a portrait
     with 1025 control points, two tubes per cell, has an RRMSD of 0.022 with all three, and of 0.018 without.
     """
-    return task.bounds is None and not task.several and _are_dense(task.knobs)
+    return task.bounds is None and not task.several and _are_dense(task.settings)
 
 
-def _are_dense(knobs: ResolvedTailoring) -> bool:
-    return knobs.rays >= DENSE_TUBES * knobs.side
+def _are_dense(settings: Settings) -> bool:
+    return settings.rays >= DENSE_TUBES * settings.side
 
 
-def sheet_sizes(knobs: ResolvedTailoring, shares: RoundFractions | None = None) -> Iterator[tuple[int, int]]:
-    """Yield (tubes per side, evaluations) of each round; tubes: at least min(knobs.side, knobs.rays)."""
+def sheet_sizes(settings: Settings, shares: RoundFractions | None = None) -> Iterator[tuple[int, int]]:
+    """Yield (tubes per side, evaluations) of each round; tubes: at least min(settings.side, settings.rays)."""
     if shares is None:
-        finer = round(FINER_ROUNDS[-1][0] * knobs.rays) <= MAX_TUBES
-        shares = DENSE_ROUNDS if _are_dense(knobs) else FINER_ROUNDS if finer else SPARSE_ROUNDS
-    if knobs.stage2_iterations < MIN_EVALUATIONS:
+        finer = round(FINER_ROUNDS[-1][0] * settings.rays) <= MAX_TUBES
+        shares = DENSE_ROUNDS if _are_dense(settings) else FINER_ROUNDS if finer else SPARSE_ROUNDS
+    if settings.stage2_iterations < MIN_EVALUATIONS:
         shares = ((1.0, 1.0),)
     for part, share in shares:
-        tubes = min(round(part * knobs.rays), max(knobs.rays, MAX_TUBES))
-        yield max(tubes, min(knobs.rays, knobs.side)), round(share * knobs.stage2_iterations)
+        tubes = min(round(part * settings.rays), max(settings.rays, MAX_TUBES))
+        yield max(tubes, min(settings.rays, settings.side)), round(share * settings.stage2_iterations)
 
 
 def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None = None) -> Steps:
@@ -362,7 +359,7 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
     The stage ends when its evaluations are used up, on a plateau of the last round, or when the RRMSD by rays
     (`Task.rrmsd`) reaches tailoring.accuracy with the source at its full size.
     """
-    accuracy, given = rounds[0].task.knobs.accuracy or 0.0, Parameters.of(lens)  # 0: no accuracy is required
+    accuracy, given = rounds[0].task.settings.accuracy or 0.0, Parameters.of(lens)  # 0: no accuracy is required
     first = SearchPosition(0, 0, 0, accuracy, sheet_from=given, search_from=given)
     position = first if state is None else state.position
     total = sum(each.evaluations for each in rounds)
@@ -408,7 +405,7 @@ def run_rounds(rounds: Sequence[TubeRound], lens: Lens, state: TubeSearch | None
             elif reason != "evaluations":
                 break
         del merit, problem  # free the sheet before the next one is made
-        by_rays = None if task.preview else measured or task.rrmsd(lens)
+        by_rays = (measured or task.rrmsd(lens)) if task.effort.rates_lenses else None
         full = task.channels == rounds[-1].task.channels  # True: the light of the source at full size
         if by_rays is not None and by_rays <= accuracy:
             reason = "accuracy"  # reached according to rays, perhaps not according to tubes
@@ -423,7 +420,7 @@ def _overshoot_weight(task: Task, lens: Lens) -> float:
 
     Within w of the border some light falls outside with any lens, and pulling it inside would blur the edge.
     """
-    return task.knobs.overshoot / (1 + max(image_widths(task, lens)) ** 2)
+    return task.settings.overshoot / (1 + max(image_widths(task, lens)) ** 2)
 
 
 def image_widths(task: Task, lens: Lens) -> list[float]:
@@ -434,7 +431,7 @@ def image_widths(task: Task, lens: Lens) -> list[float]:
     if task.extended_sources:
         source = replace(task.extended_sources[-1].source, wavelength=light.source.wavelength)
         few = channels_of(source, lambda _: light.index, SECOND_MOMENT_POINTS)  # with the second moments of the source
-    return [images(few, lens, goal.receiver, IMAGE_POSITIONS).width() for goal in task.goals]
+    return [images(few, lens, goal.screen, IMAGE_POSITIONS).width() for goal in task.goals]
 
 
 @dataclass(frozen=True)
@@ -479,11 +476,11 @@ def variables_of(task: Task, lens: Lens, pixels: int | None = None, level: float
     if pixels is not None:
         lens = lens.with_nets(net.refined(coarser(net.shape, pixels + 1)) for net in nets)
     source, lens = task.heaviest.source, task.heaviest.through(lens)
-    weights = [local_weight(source, lens, task.goals, number) for number in lens.freeform]
+    weights = [local_weight(source, lens, task.goals, number) for number in lens.tailored_numbers]
     if pixels is not None:
         return NetVariables(tuple(map(CoarseVariable.of, nets, lens.nets, weights)))
     blocks = tuple(SobolevVariable.of(net, weight, level=level) for net, weight in zip(nets, weights, strict=True))
-    if lens.shapes_two_faces and len(task.goals) > 1:
+    if lens.has_two_tailored_faces and len(task.goals) > 1:
         return NetVariables(blocks, *along_light(source, lens, task.goals))
     return NetVariables(blocks)
 
@@ -536,7 +533,7 @@ def with_stage3(before: Stage | None, task: Task, lens: Lens, state: Any = None)
         lens, state = last.lens, None
     rounds = stage3_rounds(task, lens)
     if task.refines:
-        rounds = (replace(rounds[-1], evaluations=refining_evaluations(task.knobs)),)
+        rounds = (replace(rounds[-1], evaluations=refining_evaluations(task.settings)),)
     elif before is None:
         rounds = (*coarse_rounds(task, lens), *rounds)
     for step in run_rounds(rounds, lens, state and state.tube_search):
@@ -544,7 +541,7 @@ def with_stage3(before: Stage | None, task: Task, lens: Lens, state: Any = None)
 
 
 def stage3_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
-    """Return the rounds of stage 3, one per entry of SOURCE_SIZES; in a preview, one round.
+    """Return the rounds of stage 3, one per entry of SOURCE_SIZES, or one round.
 
     lens: lens at the start.  Cells narrower than half of the source's image through it are not rated: it blurs them.
     """
@@ -552,11 +549,11 @@ def stage3_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
         replace(task, channels=channels, sampled_sources=(), extended_sources=(source,))
         for channels, source in zip(task.sampled_sources, task.extended_sources, strict=True)
     ]
-    knobs, screens = task.knobs, [goal.receiver for goal in task.goals]
-    if task.preview:
+    settings, screens = task.settings, [goal.screen for goal in task.goals]
+    if not task.effort.divides_rounds:
         source = task.extended_sources[-1]
-        return (TubeRound(lights[-1], knobs.rays, knobs.stage2_iterations, "stage 3", source=source),)
-    counts = stage3_sheet_sizes(knobs, (max(each.columns for each in screens), max(each.rows for each in screens)))
+        return (TubeRound(lights[-1], settings.rays, settings.stage2_iterations, "stage 3", source=source),)
+    counts = stage3_sheet_sizes(settings, (max(each.columns for each in screens), max(each.rows for each in screens)))
     cells, seen = finest_cells(task), [width for width in image_widths(lights[-1], lens) if width > 0]  # else no light
     while seen and cells > 1 and cells * min(seen) > 2:
         cells //= 2
@@ -567,17 +564,17 @@ def stage3_rounds(task: Task, lens: Lens) -> tuple[TubeRound, ...]:
     )
 
 
-def stage3_sheet_sizes(knobs: ResolvedTailoring, pixels: tuple[int, int]) -> Iterator[tuple[int, int]]:
+def stage3_sheet_sizes(settings: Settings, pixels: tuple[int, int]) -> Iterator[tuple[int, int]]:
     """Yield (tubes per side, evaluations) of each round of stage 3; pixels: columns and rows of the target.
 
     A sheet of n tubes per side has n √(m_x / m_y) along x and n √(m_y / m_x) along y over a net of m_x x m_y points.
     """
-    few = knobs.stage2_iterations < MIN_EVALUATIONS
-    total = knobs.stage2_iterations * (2 if few else 1)  # L-BFGS starts anew in each round
-    (m_x, m_y), (columns, rows) = as_pair(knobs.levels[-1]), pixels
+    few = settings.stage2_iterations < MIN_EVALUATIONS
+    total = settings.stage2_iterations * (2 if few else 1)  # L-BFGS starts anew in each round
+    (m_x, m_y), (columns, rows) = as_pair(settings.levels[-1]), pixels
     oblong = math.sqrt(m_x / m_y)
     for_pixels = TUBES_PER_PIXEL * max(columns / oblong, rows * oblong)
-    tubes = min(knobs.rays, math.ceil(max(TUBES_PER_CELL * knobs.side, for_pixels)))
+    tubes = min(settings.rays, math.ceil(max(TUBES_PER_CELL * settings.side, for_pixels)))
     for _, share in SOURCE_SIZES:
         yield tubes, round(share * total)
 
@@ -600,18 +597,18 @@ def compare_precisions(task: Task, lens: Lens) -> PrecisionComparison:
 
     Rounding can change where a line search ends, so the lenses may differ by more than rounding and be equally good.
     """
-    lens = lens.with_nets(net.refined(coarser(net.shape, COMPARED_NET)) for net in lens.nets)
+    lens = lens.with_nets(net.refined(coarser(net.shape, task.effort.compared_net)) for net in lens.nets)
     (merit, gradient, single), (exact_merit, exact_gradient, double) = (
         _tailor_briefly(task, lens.to(d)) for d in (torch.float32, torch.float64)
     )
-    n, goal = round(side_factor(task.channels) * (COMPARED_TUBES + 1)), task.goals[0]
+    n, goal = round(side_factor(task.channels) * (task.effort.compared_tubes + 1)), task.goals[0]
     rrmsd = [rrmsd_by_tubes(end, task.channels, goal, n=n) for end in (single, double)]
     pairs = zip(single.nets, double.nets, strict=True)
     return PrecisionComparison(
         control_points=max(max(net.shape) for net in lens.nets),
         merit=_relative(abs(merit - exact_merit), abs(merit), abs(exact_merit)),
         gradient=_relative(*(float(each.norm()) for each in (gradient - exact_gradient, gradient, exact_gradient))),
-        evaluations=COMPARED_EVALUATIONS,
+        evaluations=task.effort.compared_evaluations,
         rrmsd_float64=rrmsd[1],
         rrmsd_float32=rrmsd[0],
         heights=max(float((a.heights - b.heights).abs().max()) for a, b in pairs),
@@ -624,12 +621,12 @@ def _relative(difference: float, *sizes: float) -> float:
 
 
 def _tailor_briefly(task: Task, lens: Lens) -> tuple[float, Tensor, Lens]:
-    """Return merit and gradient at the start, and the lens after COMPARED_EVALUATIONS, in the precision of `lens`."""
-    n = min(COMPARED_TUBES, task.knobs.rays)
-    merit = Merit.of(task.channels, lens, n, task.goals[:1], overshoot=task.knobs.overshoot)
+    """Return merit and gradient at the start, and the lens after a few evaluations, in the precision of `lens`."""
+    n = min(task.effort.compared_tubes, task.settings.rays)
+    merit = Merit.of(task.channels, lens, n, task.goals[:1], overshoot=task.settings.overshoot)
     merit = replace(merit, picture_error=task.merit)
     problem, variables = Problem(lens, merit), variables_of(task, lens)
     value, gradients, _ = problem([net.heights for net in lens.nets])
-    *_, last = minimise_merit(lens, problem, variables, COMPARED_EVALUATIONS)
+    *_, last = minimise_merit(lens, problem, variables, task.effort.compared_evaluations)
     flat = torch.cat([g.reshape(-1).double().cpu() for g in gradients])
     return value, flat, with_best_nets(lens, variables, last.best).plain()

@@ -30,8 +30,8 @@ from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.optics.surfaces.rays import Rays
 from bstcad.optics.trace.reach import limit_refraction, slopes_towards
-from bstcad.scene.quality import COARSEST_GRID
 from bstcad.tailoring import slope_map, stage1
+from bstcad.tailoring.effort import GATHERING
 from bstcad.tailoring.light_behind import LightBehind, light_for_task, without_crossings
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.run import Parameters, Steps, Task
@@ -65,32 +65,32 @@ def steps(task: Task, lens: Lens, state: stage1.SlopeRound | None = None) -> Ste
     only the last net (stage1.py).
     """
     lens = task.heaviest.through(lens)
-    if not (lens.shapes_two_faces and task.several):
-        alone = replace(task.refined(lens, task.knobs.levels[-1]), shaped=lens.freeform[-1:])
+    if not (lens.has_two_tailored_faces and task.several):
+        alone = replace(task.refined(lens, task.settings.levels[-1]), tailored=lens.tailored_numbers[-1:])
         yield from stage1.steps(task, alone, state)
         return
     for last in follow_rays(task, lens, state if isinstance(state, FrontRound) else None):
         yield last
-    if not task.preview:
+    if task.effort.rates_lenses:
         yield replace(last, state=None, rays_rrmsd=task.rrmsd(last.lens))
 
 
 def follow_rays(task: Task, lens: Lens, state: FrontRound | None) -> Steps:
     """Yield a step per round: coarse rounds until the map has settled, then FINE_PAIR_ROUNDS fine ones."""
     task = task.with_imaged_receivers(lens)
-    knobs, z = task.knobs, lens.back.z
-    near = min(task.goals, key=lambda goal: goal.receiver.plane.throw(0.0))
-    light = without_crossings(light_for_task(task), near.receiver, lens.back, knobs.transport_grid)
+    settings, z = task.settings, lens.back.z
+    near = min(task.goals, key=lambda goal: goal.screen.receiver.throw(0.0))
+    light = without_crossings(light_for_task(task), near.screen, lens.back, settings.transport_grid)
     slopes, b, done = (None, None, 0) if state is None else (state.slopes, state.back, state.round)
     lens = lens if state is None else state.lens.apply_to(lens)
-    number = min(done, knobs.rounds - 1)
-    while number < knobs.rounds:
+    number = min(done, settings.rounds - 1)
+    while number < settings.rounds:
         if slopes is None or b is None or number >= done:
-            left = knobs.rounds - number
+            left = settings.rounds - number
             fine = left <= FINE_PAIR_ROUNDS
             halvings = 0 if left == 1 else 1 if fine else 2
-            cells = max(COARSEST_GRID, knobs.transport_grid // 2**halvings)
-            level = knobs.levels[max(-1 - halvings, -len(knobs.levels))] if fine else knobs.levels[0]
+            cells = max(task.effort.coarsest_grid, settings.transport_grid // 2**halvings)
+            level = settings.levels[max(-1 - halvings, -len(settings.levels))] if fine else settings.levels[0]
             lens = task.refined(lens, level)
             fit = stage1.FINE_FACE_FIT if fine else stage1.COARSE_FACE_FIT
             q = None if slopes is None else slopes.face_points
@@ -98,7 +98,7 @@ def follow_rays(task: Task, lens: Lens, state: FrontRound | None) -> Steps:
             lens = place_back(lens, z, task.min_thickness, task.bounds)
             task.tidy()
         settled = slopes.moved <= SETTLED_FRONT
-        number = stage1.next_round(number, knobs.rounds, fine=FINE_PAIR_ROUNDS, settled=settled)
+        number = stage1.next_round(number, settings.rounds, fine=FINE_PAIR_ROUNDS, settled=settled)
         yield stage1.round_step(task, lens, FrontRound(number, Parameters.of(lens), slopes, b), b)
 
 
@@ -106,22 +106,22 @@ def _round(
     task: Task, lens: Lens, light: LightBehind, q: Points | None, *, number: int, cells: int, fit: Fit
 ) -> tuple[Lens, SlopeMap, Points]:
     """Run a round; return the lens, the map of its front, and b(t) for the pixel corners of the first target."""
-    source, front = task.heaviest.source, lens.shaping("front")
+    source, front = task.heaviest.source, lens.with_tailored("front")
     window, met = slope_map.lit_window(source, front), light.intersect(lens.back)
-    b_x, b_y = light.sampled_at(task.goals[0].receiver, met[:2])
+    b_x, b_y = light.sampled_at(task.goals[0].screen, met[:2])
 
     def progress(s: TransportStep) -> None:
-        task.progress("stage 1", number, task.knobs.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
+        task.progress("stage 1", number, task.settings.rounds, f"{s.grid}² cells, mass error {s.mass_error:.4f}")
 
     grid = slope_map.square_grid(source, front, window, cells)
-    solver = Solver(task.knobs.transport_iterations, progress=progress)
+    solver = Solver(task.settings.transport_iterations, progress=progress)
     slopes = front_map(front, grid, window, light.picture, b=met, q=q, solver=solver)
-    front_side, back_side = (min(2 * max(net.shape), task.knobs.rays) for net in lens.nets)
+    front_side, back_side = (min(2 * max(net.shape), task.settings.rays) for net in lens.nets)
     grid = slope_map.face_grid(source, front, window, front_side)
     lens = lens.with_front(slope_map.fit_to_map(front, slopes, grid, fit).front)
     window = slope_map.lit_window(source, lens)
     grid = slope_map.face_grid(source, lens, window, back_side)
-    law = lens.last_freeform.law
+    law = lens.last_tailored.law
     out = light.directions_at(lens.back, *sampling.grid(window, grid.shape))
     needed = limit_refraction(grid.at_face, slopes_towards(grid.at_face, out, law), law)
     x, y = (p.reshape(-1) for p in sampling.grid(window, grid.shape))
@@ -157,7 +157,7 @@ def front_map(
 def _slopes_at(rays: Rays, aims: Tensor, lens: Lens) -> Slopes:
     """Return the slopes of the front that send rays to points (3, …) mm in space."""
     path = aims - _in_space(rays)
-    return slopes_towards(rays, path / torch.sqrt((path * path).sum(0)), lens.last_freeform.law)
+    return slopes_towards(rays, path / torch.sqrt((path * path).sum(0)), lens.last_tailored.law)
 
 
 def _in_space(rays: Rays) -> Tensor:
@@ -166,7 +166,7 @@ def _in_space(rays: Rays) -> Tensor:
 
 def _gathering(grid: FaceGrid, lens: Lens, back: Tensor, stretch: np.ndarray, shift: np.ndarray) -> BSplineSurface:
     """Return g (see the module) fitted to the lit part of a grid; back: b (3, …) mm; r(q) = stretch q + shift."""
-    few = grid.thinned(slope_map.GATHERING_SAMPLES)
+    few = grid.thinned(GATHERING.samples)
     x, y, z = _in_space(few.at_face).cpu().double()
     height = float(total(back[2]) / back[2].numel())
     r = torch.stack([stretch[0] * x + shift[0], stretch[1] * y + shift[1], torch.full_like(x, height)])
@@ -178,4 +178,4 @@ def _gathering(grid: FaceGrid, lens: Lens, back: Tensor, stretch: np.ndarray, sh
         nudge[axis] = step
         shifted = _slopes_at(few.at_face, r + nudge, lens)[axis]
         quotient += float(total((shifted - p[axis])[lit]) / lit.sum()) / (2 * step)
-    return slope_map.fit_gathering(few, (p[0] - r[0] * quotient, p[1] - r[1] * quotient), slope_map.GATHERING_FIT)
+    return slope_map.fit_gathering(few, (p[0] - r[0] * quotient, p[1] - r[1] * quotient), GATHERING.fit)

@@ -34,7 +34,7 @@ Sharpness = Callable[[Jet, Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
-class Passes:
+class ToolPasses:
     """Spacing of neighbouring passes, and the height of the highest cusp between them by the formula."""
 
     pitch: float  # mm
@@ -51,7 +51,7 @@ def flat_pitch(radius: float, cusp: float, pitch: float | None, fractions: tuple
     return _passes(1 / radius, cusp, pitch, limits=(fractions[0] * radius, fractions[1] * radius)).pitch
 
 
-def spiral_passes(tool: RoundTool, cusp: float, pitch: float | None) -> Passes:
+def spiral_passes(tool: RoundTool, cusp: float, pitch: float | None) -> ToolPasses:
     """Return the passes of a spiral whose cusps in the plane of the nose are at most `cusp` (mm), or of this pitch."""
 
     def sharpness(jet: Jet, x: Tensor, y: Tensor) -> Tensor:
@@ -66,7 +66,7 @@ def spiral_passes(tool: RoundTool, cusp: float, pitch: float | None) -> Passes:
     return _passes(_sharpest(tool, sharpness), cusp, pitch, (low, high))
 
 
-def raster_passes(tool: RoundTool, cusp: float, pitch: float | None, along: str) -> Passes:
+def raster_passes(tool: RoundTool, cusp: float, pitch: float | None, along: str) -> ToolPasses:
     """Return the passes of lines along x or y whose cusps are at most `cusp` (mm), or of this pitch (mm)."""
 
     def sharpness(jet: Jet, x: Tensor, y: Tensor) -> Tensor:
@@ -76,10 +76,10 @@ def raster_passes(tool: RoundTool, cusp: float, pitch: float | None, along: str)
     return _passes(_sharpest(tool, sharpness), cusp, pitch, (low, high))
 
 
-def _passes(sharpest: float, cusp: float, pitch: float | None, limits: tuple[float, float]) -> Passes:
+def _passes(sharpest: float, cusp: float, pitch: float | None, limits: tuple[float, float]) -> ToolPasses:
     """Return the passes for the largest 8 h / p² (1/mm); limits: smallest and largest pitch from a cusp (mm)."""
     p = pitch or min(max(math.sqrt(8 * cusp / sharpest), limits[0]), limits[1])
-    return Passes(p, p * p * sharpest / 8)
+    return ToolPasses(p, p * p * sharpest / 8)
 
 
 def _sharpest(tool: RoundTool, sharpness: Sharpness) -> float:

@@ -35,7 +35,7 @@ Solver = Callable[[Tensor, tuple[NetFrame, Search], np.ndarray, np.ndarray], tup
 
 
 @dataclass(frozen=True)
-class Shape:
+class MachinedShape:
     """Extremes of a face inside its outline and in the strip around it."""
 
     slope: float  # largest |∇z|
@@ -82,14 +82,14 @@ class MachinedFace:
         return [Spans.of(self.net, *part).jet(positions) for part in parts]
 
     @cached_property
-    def shape(self) -> Shape:
+    def shape(self) -> MachinedShape:
         """Extremes of slope and curvature, at five positions along each side of a span."""
         slope, valley, ridge = 0.0, -math.inf, -math.inf
         for jet in self.jets(bspline.QUARTERS):
             concave, convex = jet.curvatures
             slope = max(slope, float(jet.slope.max()))
             valley, ridge = max(valley, float(concave.max())), max(ridge, -float(convex.min()))
-        return Shape(slope, valley, bend=max(abs(valley), abs(ridge)))
+        return MachinedShape(slope, valley, bend=max(abs(valley), abs(ridge)))
 
     def refuse_steep(self, steepest: float, tool: str) -> None:
         """Raise ValueError if a part of the face is steeper than this tool reaches (degrees)."""

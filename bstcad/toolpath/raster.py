@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bstcad.toolpath import chords, cusps
-from bstcad.toolpath.cusps import Passes
+from bstcad.toolpath.cusps import ToolPasses
 from bstcad.toolpath.cutting import ROUTER, Cutting
 from bstcad.toolpath.machined_face import MachinedFace, RoundTool
 
@@ -30,7 +30,7 @@ PLUNGE = 1 / 3  # feed of moves straight down, as a fraction of the feed
 
 
 @dataclass(frozen=True)
-class Pass:
+class ToolPass:
     """Moves in contact with the part: the tool comes down over the first point, and goes up after the last one."""
 
     points: np.ndarray  # x, y and z of the lowest point of the ball (n, 3), mm
@@ -41,10 +41,10 @@ class Pass:
 class Raster:
     """Passes of a raster, in the order of the cut, with points rounded as they are written."""
 
-    passes: tuple[Pass, ...]
+    passes: tuple[ToolPass, ...]
     tool: RoundTool
     cutting: Cutting  # completed settings
-    spacing: Passes  # spacing of the finishing lines, and their cusp
+    spacing: ToolPasses  # spacing of the finishing lines, and their cusp
     top: float  # z of the face's frame at Z = 0 of the passes, the top of the blank (mm)
     bottom: float  # z of the face's frame at the bottom of the blank, the outermost point of the other face (mm)
 
@@ -95,11 +95,11 @@ def raster(face: MachinedFace, levels: tuple[float, float], wanted: Cutting) -> 
     def tip(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return tool.ball(x, y) - tool.radius - top
 
-    passes: list[Pass] = list(_roughing(face, cutting, top)) if stock else []
+    passes: list[ToolPass] = list(_roughing(face, cutting, top)) if stock else []
     chords.refuse_many(_places(face, spacing.pitch, tool.spacing(tolerance)))
     zigzag = np.concatenate(list(_lines(tool, spacing.pitch, cutting.along)))
     passes.append(
-        Pass(_straightened(_followed(zigzag, tip, tool.spacing(tolerance), tolerance), tolerance), rough=False)
+        ToolPass(_straightened(_followed(zigzag, tip, tool.spacing(tolerance), tolerance), tolerance), rough=False)
     )
     places = chords.digits(tolerance)
     written = tuple(replace(each, points=np.round(each.points, places)) for each in passes)
@@ -161,7 +161,7 @@ def _straightened(points: np.ndarray, tolerance: float) -> np.ndarray:
     return points[chords.bends(at, points[:, 2], corner, chords.STRAIGHT * tolerance)]
 
 
-def _roughing(face: MachinedFace, cutting: Cutting, top: float) -> Iterator[Pass]:
+def _roughing(face: MachinedFace, cutting: Cutting, top: float) -> Iterator[ToolPass]:
     """Yield the passes that take the blank down to the stock on the face, level by level from Z = 0."""
     stock, depth = cutting.roughing
     larger = RoundTool(face, cutting.radius + stock)
@@ -176,7 +176,7 @@ def _roughing(face: MachinedFace, cutting: Cutting, top: float) -> Iterator[Pass
         above, floor = -(level - 1) * depth, -level * depth
         for line in lines:
             for run in _runs(line, above=above, floor=floor):
-                yield Pass(_straightened(run, ROUGH_TOLERANCE * stock), rough=True)
+                yield ToolPass(_straightened(run, ROUGH_TOLERANCE * stock), rough=True)
 
 
 def _runs(line: np.ndarray, above: float, floor: float) -> Iterator[np.ndarray]:

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from bstcad.toolpath import chords, cusps
-from bstcad.toolpath.cusps import Passes
+from bstcad.toolpath.cusps import ToolPasses
 from bstcad.toolpath.cutting import LATHE, Cutting
 from bstcad.toolpath.machined_face import MachinedFace, RoundTool
 
@@ -37,7 +37,7 @@ class Spiral:
     z: np.ndarray  # z of the nose's lowest point (mm)
     tool: RoundTool
     cutting: Cutting  # completed settings
-    passes: Passes  # pitch p (mm per turn) and cusp
+    passes: ToolPasses  # pitch p (mm per turn) and cusp
     slope_along_cut: float  # largest slope of the path along the cut, for the clearance of the tool
     slope_at_axis: float  # slope of the face on the axis, which the nose touches beyond the axis by r sin(atan slope)
 

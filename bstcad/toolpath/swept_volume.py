@@ -24,7 +24,7 @@ import torch
 
 from bstcad.optics.numerics.reductions import on_threads
 from bstcad.runs.kernel_cache import compiled_kernel
-from bstcad.toolpath.cusps import Passes
+from bstcad.toolpath.cusps import ToolPasses
 from bstcad.toolpath.machined_face import MachinedFace
 from bstcad.toolpath.raster import Raster
 from bstcad.toolpath.spiral import Spiral, nose_height
@@ -134,7 +134,7 @@ def _deepest_places(path: np.ndarray, height: Height) -> tuple[np.ndarray, np.nd
 
 
 def _swept(
-    face: MachinedFace, measure: Measure, deepest: tuple[np.ndarray, np.ndarray], work: float, passes: Passes
+    face: MachinedFace, measure: Measure, deepest: tuple[np.ndarray, np.ndarray], work: float, passes: ToolPasses
 ) -> Swept:
     """Return the distances at samples of the face, and the deepest gouge by a local search.
 

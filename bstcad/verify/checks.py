@@ -10,8 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -24,16 +23,13 @@ from bstcad.cad import mesh as meshes
 from bstcad.optics.lens import quadrature
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.passes import Face
-from bstcad.optics.light.channels import Channel
 from bstcad.optics.receivers.goal import Goal, worst
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.optics.trace.measure import (
-    FULL,
     RESOLVED,
     Effort,
     Light,
     SpectralLine,
-    measure_goals,
     spectral_lines,
     squared_distance,
     tubes_of,
@@ -44,12 +40,11 @@ from bstcad.scene.accept import Accept
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.errors import SceneError
 from bstcad.scene.mount import Part, as_cut
-from bstcad.scene.real_source import image_diameters, real_size
-from bstcad.scene.scene import Scene
 from bstcad.step_text import part21
 from bstcad.step_text.part21 import StepText
 from bstcad.verify import jobs, text_checks
 from bstcad.verify.light_limits import LightValue, light_values
+from bstcad.verify.nominal import Nominal
 from bstcad.verify.verdict import Check
 
 if TYPE_CHECKING:
@@ -61,13 +56,11 @@ VERIFY_SEED = 1_000_003  # offset of the seed, for rays that tailoring has not u
 # RMS difference relative to its RMS, for the rounding of another processor.
 STORED_NOISE, STORED_TOLERANCE = 3.0, 2e-3
 TARGET_TOLERANCE = 1e-3  # largest change of the target since design.npz / brightest pixel: picture libraries change
-DEFAULT_RRMSD_LIMIT = 0.25  # limit of the RRMSD in remarks, plans and tolerance studies if accept.rrmsd is not set
 LINE_TUBES = 1031  # smallest number of tubes per side for the picture of one line of a spectrum
 CLEAR_APERTURE_TOLERANCE = 1e-3  # largest distance (mm) between the rims of measured and designed apertures
 MIN_MOUNT_LOSS = 1e-3  # smallest fraction of light cut away by a mount that a failed check states as its reason
 MAX_FLANGE_LIGHT = 1e-3  # largest fraction of the light through the clear apertures that may meet the flange
 WAVEFRONT = "wavefront error, RMS in waves, piston and tilt removed"
-DRAFT_ACCURACY = 0.01  # relative standard error of the RRMSD at which ray tracing ends, for draft quality
 MAX_FLOOR = 0.1  # largest rounding error of the wavefront error / accept.wavefront that leaves the verdict certain
 TIME_LIMIT, TIME_LIMIT_PER_MB = 120.0, 3.0  # timeout of OCC (s) and its increase per MB, 100 times the usual time
 
@@ -75,54 +68,6 @@ R = TypeVar("R")
 Lines = tuple[SpectralLine, ...]  # pictures of the lines of a spectrum on one target
 OnLight = Callable[[Light, Lines, int], None]  # function of the light on a target, its Lines, and its index
 FINE_GRID = ", on a grid four times finer than the net"  # suffix of the names of checks on such a grid
-
-
-@dataclass(frozen=True)
-class Nominal:
-    """The design against which the files are checked."""
-
-    scene: Scene
-    lens: Lens  # designed lens, float64
-    goals: tuple[Goal, ...]  # goals with the pictures of the scene
-    # pictures of the goals in design.npz, (rows, columns); None: those of `goals`
-    stored: tuple[np.ndarray, ...] | None = field(default=None, kw_only=True)
-    # for each goal, the irradiance (rows, columns) in design.npz, None if it has none, and its error, NaN if not
-    # stated; (): no design.npz was read
-    lit: tuple[tuple[np.ndarray | None, float], ...] = field(default=(), kw_only=True)
-
-    @cached_property
-    def channels(self) -> tuple[Channel, ...]:
-        """Channels of the scene's light; their points on an extended source are not the points used in tailoring."""
-        return self.scene.verification_channels()
-
-    @property
-    def heaviest(self) -> Channel:
-        """Channel with the largest weight, whose wavelength is the unit of wavefront errors."""
-        return max(self.channels, key=lambda channel: channel.weight)
-
-    def effort(self, given: Effort | None = None) -> Effort:
-        """Return the effort of measuring this design, smaller for a draft; given: upper limit (None: FULL)."""
-        given, tailoring = given or FULL, self.scene.tailoring
-        accuracy = DRAFT_ACCURACY if tailoring.quality == "draft" else FULL.accuracy
-        return replace(given, seed=tailoring.seed, accuracy=max(given.accuracy, accuracy))
-
-    def light(self, lens: Lens, goal: Goal, effort: Effort) -> Light:
-        """Return the light of a lens on a target."""
-        [light] = self.lights(lens, [goal], effort)
-        return light
-
-    def lights(self, lens: Lens, goals: Sequence[Goal], effort: Effort) -> list[Light]:
-        """Return the light of a lens on each target, by the same rays."""
-        images = self._source_images(lens, goals) if effort.cells > 1 else ()
-        ghost, draw = self.scene.ghost, self.scene.draw
-        return measure_goals(lens, self.channels, goals, effort, ghost=ghost, draw=draw, images=images)
-
-    def _source_images(self, lens: Lens, goals: Sequence[Goal]) -> Sequence[float]:
-        """Return the diameter (pixels) of the image of the real source on each target; () if its size is simulated."""
-        if (size := real_size(self.scene.source)) is None:
-            return ()
-        centre = replace(self.heaviest, source=self.heaviest.source.central, weight=1.0)
-        return image_diameters(size, centre, lens, [goal.receiver for goal in goals])
 
 
 @dataclass(frozen=True)
@@ -226,7 +171,7 @@ def verify(
     )
     proof = Proof(checks, made_lens, lights, shape, stability=stability, wavefront=wavefront, values=values)
     goal = nominal.goals[proof.worst]
-    blurred = blur(nominal.channels, made_lens, goal.receiver, goal.picture)
+    blurred = blur(nominal.channels, made_lens, goal.screen, goal.picture)
     return replace(proof, blur=blurred, lines=lines[proof.worst], at_bounds=at_bounds or None)
 
 
@@ -258,7 +203,7 @@ def _measure_targets(lens: Lens, nominal: Nominal, effort: Effort, on_light: OnL
     lights = nominal.lights(lens, nominal.goals, effort)
     for number, (goal, light) in enumerate(zip(nominal.goals, lights, strict=True)):
         if not light.rrmsd >= 0:
-            if nominal.scene.draw is not None and nominal.scene.draw.largest_side is not None:
+            if nominal.scene.sampler is not None and nominal.scene.sampler.largest_side is not None:
                 few = f"so few of the rays fall on {goal.words} that an eighth of them may give no picture"
                 raise SceneError(f"source.rays: {few}; give a file with more rays, or widen lens or target")
             name = "lens.step" if nominal.scene.mount is None else "part.step"
@@ -271,8 +216,8 @@ def _measure_targets(lens: Lens, nominal: Nominal, effort: Effort, on_light: OnL
 
 def _with_design_facts(lens: Lens, designed: Lens) -> Lens:
     """Return the re-read lens with data that no file states: elements around it, and which of two nets are tailored."""
-    shaped = designed.shaped if lens.front.is_net else None
-    return replace(lens, before=designed.before, behind=designed.behind, shaped=shaped)
+    shaped = designed.tailored if lens.front.is_net else None
+    return replace(lens, before=designed.before, behind=designed.behind, tailored=shaped)
 
 
 def _mounted_lens(read: Future[Lens], bare: Lens, nominal: Nominal, path: Path) -> tuple[Lens, list[Check], str]:
@@ -315,7 +260,7 @@ def _stability(
     lens: Lens, nominal: Nominal, lights: Sequence[Light], shape: Mapping[str, float | None]
 ) -> tuple[dict[str, float | int | None], list[Check]]:
     """Return figures of stability (record.Contents), and checks of total internal reflection and of finite values."""
-    margin = margins(nominal.channels, lens, nominal.goals[0].receiver, nominal.scene.tailoring.seed + VERIFY_SEED)
+    margin = margins(nominal.channels, lens, nominal.goals[0].screen, nominal.scene.tailoring.seed + VERIFY_SEED)
     keys = (f"{face}radius_min_{kind}" for face in ("", "front_") for kind in ("concave", "convex"))
     radii = [radius for key in keys if (radius := shape.get(key))]
     non_finite = margin.non_finite + sum(int((~np.isfinite(light.picture)).sum()) for light in lights)
@@ -372,8 +317,8 @@ def _ripple_rrmsd(lens: Lens, nominal: Nominal) -> dict[str, float]:
     """Return the RRMSD due to the ripple of the back alone, and of a tailored front alone, by keys of Proof.shape."""
     light = nominal.heaviest
     channel = replace(light, source=light.source.central, weight=1.0)
-    faces: dict[Face, str] = {"back": "", "front": "front_"} if lens.shapes("front") else {"back": ""}
-    screen = nominal.goals[0].receiver
+    faces: dict[Face, str] = {"back": "", "front": "front_"} if lens.is_tailored("front") else {"back": ""}
+    screen = nominal.goals[0].screen
     return {f"{key}ripple_rrmsd": rrmsd_of_ripple(channel, lens, screen, face) for face, key in faces.items()}
 
 
@@ -389,7 +334,9 @@ def bound_checks(
     found: dict[str, list[tuple[float, Extreme, str]]] = {}
     radius, degrees, kind = asked.tool_radius, asked.max_slope, "convex" if asked.mould else "concave"
     if radius is not None or degrees is not None:
-        surveys = [(survey, "")] * lens.shapes("back") + [(survey_front, " of the front")] * lens.shapes("front")
+        surveys = [(survey, "")] * lens.is_tailored("back") + [(survey_front, " of the front")] * lens.is_tailored(
+            "front"
+        )
         for surveyed, of in surveys:
             bending = surveyed(lens, **{kind: radius}, slope=degrees)
             if radius is not None:

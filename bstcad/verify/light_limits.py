@@ -74,7 +74,7 @@ def light_values(
         goal, light = goals[k], lights[k]
         wanted = goal.picture if goal.whole is None else goal.whole  # with the part that no face can light
         pictures = [each.numpy() for each in light.sets]
-        sets[k] = LightSets.of(goal.receiver, pictures, light.on_screen, target=wanted)
+        sets[k] = LightSets.of(goal.screen, pictures, light.on_screen, target=wanted)
     found = [
         _point_value(scene, point, f"{k + 1}", on=sets[point.target], of=goals[point.target].suffix)
         for k, point in enumerate(accept.point)
@@ -87,7 +87,7 @@ def light_values(
         found.append(_cut_off_value(scene, accept.cut_off, sets[number], of=goals[number].suffix))
     if accept.glare is not None:
         fields = (
-            FarField(tuple(channels), ghost=scene.ghost, draw=scene.draw, seed=SEED + k * SETS)
+            FarField(tuple(channels), ghost=scene.ghost, sampler=scene.sampler, seed=SEED + k * SETS)
             for k in range(GLARE_TABLES)
         )
         largest = glare([field.table(lens, RAYS // 3) for field in fields])

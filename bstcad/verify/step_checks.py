@@ -88,7 +88,7 @@ def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, .
         *_face_checks(reread.stated, reread),
         *_edge_checks(reread, nominal),
         *_form_checks(reread, nominal.back_net, form, points),
-        *(_form_checks(reread, nominal.front_net, form, points, of="front") if nominal.shapes("front") else ()),
+        *(_form_checks(reread, nominal.front_net, form, points, of="front") if nominal.is_tailored("front") else ()),
         *_front_checks(reread.front, nominal, form),
     )
 
@@ -295,7 +295,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
     down = np.array([0.0, 0.0, mount.origin(lens.front_vertex)])
     net = lens.back_net.control_points() - down
     of_front = []
-    if lens.shapes("front"):
+    if lens.is_tailored("front"):
         name, read = f"{PART_FILE}: deviation of the control points of the front", text_checks.net_of_front(text)
         of_front.append(net_check(name, read, lens.front_net.control_points() - down, id="control-points"))
     properties = _properties(path, _stamp(path)) if text.properties.of_shape else None

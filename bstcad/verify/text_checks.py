@@ -35,7 +35,7 @@ def lens_checks(text: StepText, lens: Lens) -> list[Check]:
     checks = structure_checks(text, lens.back_net.shape)
     name, back = f"{SOURCE}: deviation of the control points", lens.back_net.control_points()
     checks.append(net_check(name, text.surface.control_points, back, id="control-points"))
-    if lens.front.is_net and (text.front is not None or lens.shapes("front")):
+    if lens.front.is_net and (text.front is not None or lens.is_tailored("front")):
         name, front = f"{SOURCE}: deviation of the control points of the front", lens.front_net.control_points()
         checks.append(net_check(name, net_of_front(text), front, id="control-points"))
     return checks

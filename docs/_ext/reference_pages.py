@@ -1,4 +1,4 @@
-"""The generated pages of docs/reference: keys of a scene by the schema, commands by typer, JSON files by records."""
+"""Generated pages of docs/reference (keys of a scene, commands, JSON files), and tables that other pages include."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ import re
 import tokenize
 import tomllib
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "reference"
+TABLES = ROOT / "docs" / "_made"  # folder of the tables that pages include
+NOUNS = ("Surface", "Chart", "Emitter", "Receiver", "FittedFront", "FileContent")  # classes whose kinds house.md lists
 RECORDS = {  # JSON file: (module, names of its records), with the record of the file first
     "report.json": [
         ("report/record.py", ["Contents", "LineFigures", "LeftOut"]),
@@ -39,6 +41,10 @@ RECORDS = {  # JSON file: (module, names of its records), with the record of the
         ("planning/results.py", ["TradeoffTable", "TableKnob", "Calibration", "Preset", "KnobPoint"]),
         ("planning/cold_run.py", ["ColdRun", "HistoryPoint"]),
     ],
+    "compensation.json": [
+        ("manufacture/shop/production.py", ["RoundFigures", "CloudFigures", "DeviationFigures", "RoundLight"])
+    ],
+    "state.json": [("app/design_process.py", ["State"])],
 }
 
 
@@ -214,19 +220,132 @@ def cell(text: str) -> str:
     return "".join(parts)
 
 
-def write(page: str, text: str) -> None:
-    """Write a page, if it changes."""
-    path = PAGES / page
+# ---- arrays of a design ----------------------------------------------------------------------------------------------
+
+
+def arrays() -> str:
+    """Return the table of the arrays of design.npz: name, shape, meaning."""
+    from bstcad.designs.folder import ARRAYS
+
+    rows = [f"| `{name}` | {shape} | {cell(meaning)} |" for name, (shape, meaning) in ARRAYS.items()]
+    return "\n".join(["| array | shape | meaning |", "|---|---|---|", *rows]) + "\n"
+
+
+# ---- tables of the house ---------------------------------------------------------------------------------------------
+
+
+def rooms() -> str:
+    """Return a table of the parts of the package, by AT_TOP and MAY_IMPORT of tests/test_architecture.py, from below.
+
+    The contents of a part are the first lines of the docstrings of its __init__.py, or of its files.
+    """
+    from tests.test_architecture import AT_TOP, MAY_IMPORT
+
+    page = ["| part | contents | may import, besides itself |", "|---|---|---|"]
+    for part, others in MAY_IMPORT.items():
+        if part == "bstcad":
+            continue
+        files = {name: f"{name}.py" for name in sorted(AT_TOP.get(part, ()))}
+        said = [f"`{file}`: {first_line(file)}" for file in files.values()]
+        said = said or [first_line(f"{part.replace('.', '/')}/__init__.py")]
+        page.append(f"| `{part}` | {' '.join(said)} | {listed(others)} |")
+    return "\n".join(page) + "\n"
+
+
+def libraries() -> str:
+    """Return the table ONLY of tests/test_architecture.py: the parts that may import a library."""
+    from tests.test_architecture import ONLY
+
+    rows = [f"| {name} | {listed(parts)} |" for name, parts in ONLY.items()]
+    return "\n".join(["| library | may be imported by |", "|---|---|", *rows]) + "\n"
+
+
+def listed(parts: set[str]) -> str:
+    """Return the names of parts as code, without that of bstcad/__init__.py."""
+    return ", ".join(f"`{part}`" for part in sorted(parts - {"bstcad"})) or "nothing"
+
+
+def first_line(file: str) -> str:
+    """Return the first line of the docstring of a file of the package."""
+    docstring = ast.get_docstring(ast.parse((ROOT / "bstcad" / file).read_text(encoding="utf-8"))) or ""
+    return cell(docstring.partition("\n")[0])
+
+
+def kinds() -> str:
+    """Return a table of the classes of the package that derive from each of NOUNS: noun, class, file, docstring."""
+    classes = [
+        (node, file.relative_to(ROOT / "bstcad").as_posix())
+        for file in sorted((ROOT / "bstcad").rglob("*.py"))
+        for node in ast.parse(file.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef)
+    ]
+    page = ["| noun | kind | file | what it is |", "|---|---|---|---|"]
+    for noun in NOUNS:
+        known = {noun}
+        while derived := [
+            (node, file)
+            for node, file in classes
+            if node.name not in known and known & {ast.unparse(base).rpartition(".")[2] for base in node.bases}
+        ]:
+            known |= {node.name for node, _ in derived}
+            for node, file in derived:
+                if not node.name.startswith("_"):
+                    said = (ast.get_docstring(node) or "").partition("\n\n")[0]
+                    page.append(f"| `{noun}` | `{node.name}` | `{file}` | {cell(' '.join(said.split()))} |")
+    return "\n".join(page) + "\n"
+
+
+# ---- grades of manufacture -------------------------------------------------------------------------------------------
+
+
+def grades() -> str:
+    """Return the limits of all grades, a row per limit with the errors that it bounds, and their finish."""
+    from dataclasses import fields
+
+    from bstcad.manufacture.tolerance.grades import GRADES, ToleranceGrade, limit_of
+    from bstcad.optics.trace.finish import Finish
+    from bstcad.scene.quality import FINISH_KEYS, Name
+
+    names: dict[str, list[str]] = {}
+    for name in typing.get_args(Name):
+        if not name.endswith(("_x", "_y")):
+            names.setdefault(limit_of(name), []).append(f"`{name}`")
+    page = [f"| limit | errors | {' | '.join(f'`{name}`' for name in GRADES)} |", "|---|---|" + "--:|" * len(GRADES)]
+    for field, said in field_comments(ToleranceGrade, [f.name for f in fields(ToleranceGrade)]).items():
+        values = [getattr(grade, field) for grade in GRADES.values()]
+        if field not in ("words", "finish"):
+            page.append(f"| {cell(said)} | {', '.join(names.get(field, []))} | {numbers(values)} |")
+    for key, said in field_comments(Finish, FINISH_KEYS).items():
+        page.append(f"| {cell(said)} | `{key}` | {numbers(getattr(grade.finish, key) for grade in GRADES.values())} |")
+    return "\n".join(page) + "\n"
+
+
+def field_comments(record: type, names: Iterable[str]) -> dict[str, str]:
+    """Return the comments of fields of a record by their names."""
+    found = dict(re.findall(r"^    (\w+): [^#\n]+#[: ]*(.+)$", inspect.getsource(record), re.M))
+    return {name: found[name] for name in names if name in found}
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Return numbers as cells of a table; an infinite or absent one is empty."""
+    return " | ".join(f"{value:g}" if value and value < float("inf") else "" for value in values)
+
+
+def write(path: Path, text: str) -> None:
+    """Write a page or a table, if it changes."""
+    path.parent.mkdir(exist_ok=True)
     if not path.exists() or path.read_text(encoding="utf-8") != text:
         path.write_text(text, encoding="utf-8")
 
 
 def make(app: Any = None) -> None:
-    """Write the generated pages."""
+    """Write the generated pages and tables."""
     for page, text in (
         ("scene-keys.md", scene_keys()), ("command-line.md", command_line()), ("json-files.md", json_files())
     ):  # fmt: skip
-        write(page, text)
+        write(PAGES / page, text)
+    for table in (arrays, rooms, libraries, kinds, grades):
+        write(TABLES / f"{table.__name__}.md", table())
 
 
 def plain_text(app: Any, what: str, name: str, of: Any, options: Any, lines: list[str]) -> None:

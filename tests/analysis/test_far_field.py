@@ -12,8 +12,8 @@ import bstcad
 from bstcad.analysis.far_field import SEED, FarField, default_grid, grid_of
 from bstcad.optics.lens.losses import FresnelLoss, Losses
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.directions import Directions
 from bstcad.optics.receivers.irradiance import Screen, leaving
 from bstcad.optics.surfaces.outlines import Circle
@@ -30,7 +30,7 @@ PLATE = lens_of(net(lambda x, y: 0 * x, 22.0, 17, half=11.0), Plane(20.0), Circl
 
 def test_the_intensity_of_a_lambertian_behind_a_plate_is_its_own():
     """I = cos γ / π of the flux up to the angle that the plate's rim leaves; the sum is the flux that passes."""
-    source = Point((0.0, 0.0, 0.0))
+    source = PointSource((0.0, 0.0, 0.0))
     table = FarField((Channel(source, 1.5),), lumens=100.0).table(PLATE, rays=1024)
     gamma = np.radians(np.arange(1.0, 20.0))
     assert table.candela[:, 1:20].mean(0) == pytest.approx(100 * np.cos(gamma) / math.pi, rel=0.01)
@@ -40,7 +40,7 @@ def test_the_intensity_of_a_lambertian_behind_a_plate_is_its_own():
 
 def test_a_tilted_beam_is_where_its_direction_is():
     """C counts from x towards -y: the beam of a tilt about x and y lies at atan2(-n_y, n_x)."""
-    source = Collimated(Circle(8.0), tilt=(10.0, 15.0))
+    source = CollimatedSource(Circle(8.0), tilt=(10.0, 15.0))
     table = FarField((Channel(source, 1.5),)).table(PLATE, rays=512)
     n_x, n_y, n_z = source.axes[2]
     k, j = np.unravel_index(table.candela.argmax(), table.candela.shape)
@@ -50,7 +50,7 @@ def test_a_tilted_beam_is_where_its_direction_is():
 
 def test_the_flux_of_the_table_is_that_of_the_ledger_with_the_ghost():
     """Losses at faces are taken, the light reflected twice is contained; the sum is exact for the same rays."""
-    channel = Channel(Point((0.0, 0.0, 0.0)), 1.5, losses=Losses(FresnelLoss(587.6)))
+    channel = Channel(PointSource((0.0, 0.0, 0.0)), 1.5, losses=Losses(FresnelLoss(587.6)))
     screen = Screen(0.0, *2 * ((-90.0, 90.0),), pixels=720, surface=Directions("C"))
     [light] = simulated(PLATE, (channel,), [screen], 256, seed=SEED)
     ghost = ghost_light(PLATE, (channel,), screen, 256 // GHOST_DIVISOR, SEED)

@@ -10,7 +10,7 @@ import pytest
 from bstcad.analysis.leaving_rays import rays_behind
 from bstcad.optics.lens.losses import FresnelLoss, Losses
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen, leaving
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.surfaces import Plane
@@ -20,8 +20,8 @@ from tests.lenses import lens_of, wavy
 LENS = lens_of(wavy(), Plane(12.0), Circle(9.0), 1.5)
 SCREEN = Screen(200.0, (-150.0, 150.0), (-150.0, 150.0), pixels=12)
 CHANNELS = (
-    Channel(Point((0.0, 0.0, 0.0)), 1.5, 0.7),
-    Channel(Point((1.0, -2.0, 0.0), wavelength=450.0), 1.52, 0.3),
+    Channel(PointSource((0.0, 0.0, 0.0)), 1.5, 0.7),
+    Channel(PointSource((1.0, -2.0, 0.0), wavelength=450.0), 1.52, 0.3),
 )
 
 

@@ -22,8 +22,8 @@ from bstcad.analysis.light import (
 )
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
@@ -43,8 +43,8 @@ def lens_of(sag=None, front=FRONT, outline=BLOCK, m=33, z=10.0, **more):
 class TestDrawnRays:
     TARGET = LevelPlane(300.0)
     EXACT = 1e-9  # mm; the trace stops at 1e-12 of the lens's size, the way to the screen makes a hundred times more
-    BEAM = Collimated(Circle(6.0), z=-5.0)
-    LAMP = Point((0.4, 0.0, -30.0))
+    BEAM = CollimatedSource(Circle(6.0), z=-5.0)
+    LAMP = PointSource((0.4, 0.0, -30.0))
     SOURCES = pytest.mark.parametrize("source", [BEAM, LAMP], ids=["beam", "lamp"])
     ROUGH = lens_of(
         lambda x, y: 0.05 * torch.sin(x / 2) * torch.cos(y / 3) - 0.01 * (x * x + y * y), front=Sphere(2.0, 0.01)
@@ -69,7 +69,9 @@ class TestDrawnRays:
     def test_rays_that_do_not_arrive_are_not_drawn(self):
         steep = lens_of(lambda x, y: 2.0 * x, Plane(-10.0))  # beyond the critical angle everywhere
         assert fan(self.BEAM, steep, self.TARGET).shape == (0, 4, 3)
-        near = fan(Point((0.0, 0.0, -2.0)), lens_of(front=Plane(0.0)), self.TARGET)  # the sides take the outer rays
+        near = fan(
+            PointSource((0.0, 0.0, -2.0)), lens_of(front=Plane(0.0)), self.TARGET
+        )  # the sides take the outer rays
         assert 0 < len(near) <= FAN_RAYS and np.isfinite(near).all()
 
     def test_a_bundle_carries_the_light_that_arrives(self):
@@ -105,27 +107,27 @@ class TestUsed:
 
     @pytest.mark.parametrize("aperture", [Circle(5.0), Rectangle(8.0, 4.0), Circle(12.0)])
     def test_a_beam_meets_both_faces_of_a_plate_as_it_is(self, aperture):
-        for patch in self.faces(Collimated(aperture)):
+        for patch in self.faces(CollimatedSource(aperture)):
             assert patch.shape == aperture.shape and patch.half_extent == pytest.approx(aperture.half_extent, rel=0.01)
 
     @pytest.mark.parametrize("outline", [WIDE, Circle(12.0)])
     def test_light_that_fills_a_face_needs_all_of_it(self, outline):
-        assert set(self.faces(Collimated(outline), outline)) == {None}
+        assert set(self.faces(CollimatedSource(outline), outline)) == {None}
 
     def test_a_cone_widens_through_a_plate_as_snell_says(self):
         angle = math.radians(20.0)
-        front, back = self.faces(Point(profile="uniform", half_angle=20.0))
+        front, back = self.faces(PointSource(profile="uniform", half_angle=20.0))
         radius, inside = 10.0 * math.tan(angle), 10.0 * math.tan(math.asin(math.sin(angle) / INDEX))
         assert (front.radius, back.radius) == pytest.approx((radius, radius + inside), rel=self.GRID)
 
     def test_a_lamp_of_some_size_needs_more_and_a_strip_of_light_is_not_round(self):
-        front, _ = self.faces(Point(profile="uniform", half_angle=20.0, diameter=2.0))
+        front, _ = self.faces(PointSource(profile="uniform", half_angle=20.0, diameter=2.0))
         assert front.radius == pytest.approx(10.0 * math.tan(math.radians(20.0)) + 1, rel=self.GRID)
-        strip, _ = self.faces(Collimated(Rectangle(12.0, 1.0)), Rectangle(24.0, 1.0))
+        strip, _ = self.faces(CollimatedSource(Rectangle(12.0, 1.0)), Rectangle(24.0, 1.0))
         assert strip.shape == "rectangle" and strip.width == pytest.approx(12.0, rel=self.GRID)
 
     def test_a_mirror_has_one_face_that_light_meets(self):
-        lamp = Point(position=(0.0, 0.0, 50.0), profile="uniform", half_angle=10.0)
+        lamp = PointSource(position=(0.0, 0.0, 50.0), profile="uniform", half_angle=10.0)
         [face] = self.faces(lamp, reflects=True)
         assert face.radius == pytest.approx(30.0 * math.tan(math.radians(10.0)), rel=self.GRID)
 
@@ -133,7 +135,7 @@ class TestUsed:
 class TestMargins:
     CRITICAL = math.degrees(math.asin(1 / INDEX))
     SCREEN = Screen(1000.0, (-500.0, 500.0), (-500.0, 500.0), 16)
-    BEAM = Collimated(Circle(4.0), z=0.0)
+    BEAM = CollimatedSource(Circle(4.0), z=0.0)
 
     @staticmethod
     def wedge(degrees):
@@ -153,7 +155,7 @@ class TestMargins:
 
     def test_newtons_slope_behind_a_point_source(self):
         """F' = d_z - d_x tan α; least for the ray that leans most along the rise."""
-        found = self.of(self.wedge(30.0), Point((0.0, 0.0, 0.0)), n=256)
+        found = self.of(self.wedge(30.0), PointSource((0.0, 0.0, 0.0)), n=256)
         in_glass = math.asin(math.sin(math.atan(5.0 / 5.0)) / INDEX)  # at most: at the front's rim
         least = math.cos(in_glass) - math.sin(in_glass) * math.tan(math.radians(30.0))
         assert least < found.newton_slope_min < 1.0 and found.tir_margin_deg < self.CRITICAL - 30.0
@@ -184,7 +186,7 @@ class TestBlur:
         """Points that cover a disc evenly, each a channel."""
         k = np.arange(count) + 0.5
         r, turn = diameter / 2 * np.sqrt(k / count), k * math.pi * (3 - math.sqrt(5))
-        source = Point((0.0, 0.0, self.FAR), profile="lambertian")
+        source = PointSource((0.0, 0.0, self.FAR), profile="lambertian")
         places = zip(r * np.cos(turn), r * np.sin(turn), strict=True)
         return tuple(Channel(replace(source, position=(x, y, self.FAR)), index, 1 / count) for x, y in places)
 

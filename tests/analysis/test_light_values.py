@@ -11,7 +11,7 @@ import torch
 
 from bstcad.analysis.light_values import LightSets, glare
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.directions import Directions
 from bstcad.optics.receivers.irradiance import Screen, landed_flux
 from bstcad.optics.surfaces.outlines import Circle
@@ -21,7 +21,7 @@ from bstcad.optics.trace.trace import trace, window
 from bstcad.photometry.intensity import Intensity
 from tests.lenses import lens_of, wavy
 
-SOURCE = Point((0.0, 0.0, 0.0))
+SOURCE = PointSource((0.0, 0.0, 0.0))
 LENS = lens_of(wavy(z=24.0), Plane(20.0), Circle(10.0), 1.5)
 SCREENS = {
     "plane": Screen(100.0, (-36.0, 24.0), (-24.0, 24.0), (60, 48)),
@@ -45,7 +45,7 @@ def light_and_own_rays(screen):
     jitter = (torch.rand((2, OWN_SIDE, OWN_SIDE), generator=chance, dtype=torch.float64) - 0.5) / OWN_SIDE
     x = (area.width * (cell[:, None] + jitter[0])).reshape(-1)
     y = (area.height * (cell + jitter[1])).reshape(-1)
-    landed = trace(SOURCE.rays_through(x, y, LENS.entrance.z, area.area / OWN_SIDE**2), LENS, screen.plane)
+    landed = trace(SOURCE.rays_through(x, y, LENS.entrance.z, area.area / OWN_SIDE**2), LENS, screen.receiver)
     return screen, found, (*landed.position.numpy(), landed_flux(landed).numpy())
 
 
@@ -54,7 +54,7 @@ def size_of_disc(screen, at, radius):
     fine = (np.arange(400) + 0.5) / 200 - 1
     x, y = np.meshgrid(at[0] + radius * fine, at[1] + radius * fine)
     inside = (x - at[0]) ** 2 + (y - at[1]) ** 2 < radius**2
-    if screen.plane.unit == "mm":
+    if screen.receiver.unit == "mm":
         return inside.sum() * (radius / 200) ** 2
     return (inside * np.cos(np.radians(y))).sum() * math.radians(radius / 200) ** 2
 

@@ -11,8 +11,8 @@ from bstcad.analysis.neglected_effects import Reference, Spline, blur_by_gaussia
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Plane
@@ -20,8 +20,8 @@ from tests.lenses import tilted
 
 INDEX, THICKNESS = 1.5, 4.0
 SMOOTH = 100.0  # pixels that a control cell lights
-BEAM = Collimated(Rectangle(11.0, 11.0), z=-5.0)
-LAMP = Point((0.0, 0.0, -50.0), profile="uniform", half_angle=4.0)
+BEAM = CollimatedSource(Rectangle(11.0, 11.0), z=-5.0)
+LAMP = PointSource((0.0, 0.0, -50.0), profile="uniform", half_angle=4.0)
 SCREEN = Screen(1000.0, (-8.0, 8.0), (-6.0, 6.0), (64, 48))
 
 
@@ -156,6 +156,6 @@ class TestPictures:
 
 
 def test_a_narrow_beam_on_a_wide_lens_is_followed_where_it_is():
-    source = Collimated(Circle(1.0), z=-5.0)
+    source = CollimatedSource(Circle(1.0), z=-5.0)
     found = reference(source=source)
     assert (found.flux > 0).mean() > 0.4

@@ -7,7 +7,7 @@ import pytest
 
 from bstcad.analysis.steepness import MAX_SLOPE_DEG, needed_steepness
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.outlines import Circle
@@ -31,7 +31,7 @@ def found(half, at_back=True):
     origins = HALF * share * (1.0 if at_back else 12.0 / HEIGHT)  # the same rays on the plane of the dome's vertex
     x = y = half * ends
     goal = Goal("target", screen, EVEN)
-    return share, needed_steepness(Point(), LENS, goal, x=x, y=y, origins=origins, at_back=at_back)
+    return share, needed_steepness(PointSource(), LENS, goal, x=x, y=y, origins=origins, at_back=at_back)
 
 
 @pytest.mark.parametrize("at_back", [True, False])
@@ -56,5 +56,5 @@ def test_a_dark_target_needs_nothing():
     screen = Screen(FAR, (-1.0, 1.0), (-1.0, 1.0), PIXELS)
     ends = np.linspace(-1, 1, PIXELS + 1)
     origins = np.zeros((PIXELS + 1, PIXELS + 1, 2))
-    none = needed_steepness(Point(), LENS, Goal("target", screen, 0 * EVEN), x=ends, y=ends, origins=origins)
+    none = needed_steepness(PointSource(), LENS, Goal("target", screen, 0 * EVEN), x=ends, y=ends, origins=origins)
     assert none.share == none.steepest == 0.0

@@ -10,7 +10,7 @@ import pytest
 from bstcad.app import dome_offer
 from bstcad.app.followers import take_change
 from bstcad.app.scene_text import changed
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.runs.files import SentenceError
 from bstcad.scene.scene import of_text
 from tests.app.conftest import PATIENCE, SEEN
@@ -121,7 +121,7 @@ def test_a_front_about_the_lamp_stays_about_the_lamp(lamp):
 
 def test_the_light_in_a_cone_is_the_integral_of_the_lamp_s_intensity():
     """Lambertian: sin² of the angle, for a lamp beside the axis the flux through the tilted disc of the same rim."""
-    lamp = Point()
+    lamp = PointSource()
     for angle in (40.0, 69.0, 85.0):
         found = dome_offer.flux_within(lamp, angle, 20.0)
         assert found == pytest.approx(math.sin(math.radians(angle)) ** 2, abs=2e-4)  # cells at the rim of the grid
@@ -132,6 +132,7 @@ def test_the_light_in_a_cone_is_the_integral_of_the_lamp_s_intensity():
     assert found == pytest.approx(beside, abs=5e-4)
 
 
+@pytest.mark.thorough
 def test_the_page_offers_a_dome_which_one_press_makes_and_which_has_a_preview(open_page, shared):
     page = open_page(shared.address)
     path = shared.folder / "lamp.toml"

@@ -21,6 +21,7 @@ from bstcad.app.scene_text import changed, is_same, typed
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import _validated
 from bstcad.scene.schema import rows, toml
+from tests import suite
 
 ROOT = Path(__file__).parents[2]
 TEXTS = {path.stem: path.read_text(encoding="utf-8") for path in sorted((ROOT / "templates").glob("*.toml"))}
@@ -61,7 +62,7 @@ def test_every_key_can_be_reached():
     assert [row.key for row in rows() if not ways_to(row, TEXTS["disk"])] == []
 
 
-@pytest.mark.parametrize("name", DATA)
+@pytest.mark.parametrize("name", suite.in_turns(DATA, 3))
 def test_a_field_says_what_the_schema_says_and_what_the_scene_has(name):
     told = {}
     for row in rows():
@@ -91,12 +92,12 @@ def values(table, prefix=""):
             yield from of_part
 
 
-@pytest.mark.parametrize("name", DATA)
+@pytest.mark.parametrize("name", suite.in_turns(DATA, 3))
 def test_every_value_of_a_scene_is_in_its_form(name):
     assert {field.key for field in form(DATA[name]).fields() if field.is_set} == {*values(DATA[name])}
 
 
-@pytest.mark.parametrize("name", DATA)
+@pytest.mark.parametrize("name", suite.in_turns(DATA, 3))
 def test_what_is_added_is_there_and_goes_again(name):
     found = form(DATA[name])
     for addition in [*found.additions, *(each for group in found.groups() for each in group.additions)]:
@@ -196,7 +197,7 @@ def is_valid(text, found):
     return valid_text.found
 
 
-@pytest.mark.parametrize("name", DATA)
+@pytest.mark.parametrize("name", suite.in_turns(DATA, 3))
 def test_the_html_is_sound(name):
     found = form(DATA[name])
     elements = is_valid(html(found, {}), found)

@@ -85,6 +85,7 @@ def test_a_dropped_picture_is_a_scene_whose_crop_is_dragged_and_moved_by_keys(op
     text_has(page, "width = 80.0, height = 53.33")
 
 
+@pytest.mark.thorough
 def test_a_change_is_seen_in_every_window_and_kept_beside_the_file_until_it_is_saved(open_page, shared):
     page, other = open_page(shared.address), open_page(shared.address)
     path = open_scene(page, shared, "both")
@@ -106,6 +107,7 @@ def test_a_change_is_seen_in_every_window_and_kept_beside_the_file_until_it_is_s
     assert path.read_bytes() == before.replace(b"100.0", b"60.5").replace(b"48", b"64")  # comments and all
 
 
+@pytest.mark.thorough
 def test_the_picture_as_made_stands_beside_the_picture_as_designed(open_page, shared):
     page = open_page(shared.address)
     open_scene(page, shared, "printed")
@@ -164,6 +166,7 @@ def test_a_wrong_entry_stays_in_its_field_and_no_lens_is_made_of_it(open_page, s
     assert page.inner_text("#comes-to") == ""
 
 
+@pytest.mark.thorough
 def test_a_damaged_scene_opens_with_its_fault(open_page, shared):
     page = open_page(shared.address)
     for text in ("name = ", SMALL.replace("kind", "knd", 1)):
@@ -173,6 +176,7 @@ def test_a_damaged_scene_opens_with_its_fault(open_page, shared):
         assert page.input_value("#text") == text and page.is_disabled("#make")
 
 
+@pytest.mark.thorough
 def test_the_keyboard_alone_leads_from_the_start_to_a_changed_preview(open_page, shared):
     page = open_page(shared.address)
     tab_to(page, "document.activeElement.dataset.letters !== undefined")
@@ -185,6 +189,7 @@ def test_the_keyboard_alone_leads_from_the_start_to_a_changed_preview(open_page,
     assert page.evaluate("document.activeElement.dataset.key") == "target.z"  # the focus stays
 
 
+@pytest.mark.thorough
 def test_enter_in_the_letters_makes_their_scene(open_page, shared):
     page = open_page(shared.address)
     page.press("#side", "Enter")
@@ -195,6 +200,7 @@ def test_enter_in_the_letters_makes_their_scene(open_page, shared):
     text_has(page, "width = 40.0, height = 40.0")
 
 
+@pytest.mark.thorough
 def test_time_left_falls_between_two_lines_and_no_pause_counts(open_page, shared, small_design):
     """A stage of ten steps had its fourth one 6 s ago, and had paused for 1000 s before; so 9 s - 6 s are left."""
     folder = shutil.copytree(small_design.folder, shared.folder / "timed")
@@ -220,6 +226,7 @@ def test_time_left_falls_between_two_lines_and_no_pause_counts(open_page, shared
     shutil.rmtree(run.folder)
 
 
+@pytest.mark.thorough
 def test_a_design_goes_on_without_its_page(open_page, shared, tmp_path):
     page = open_page(shared.address)
     open_scene(page, shared, "made")

@@ -29,7 +29,8 @@ from skimage.data import astronaut
 
 from bstcad.cad import mesh as meshes
 from bstcad.cad import step_reading, step_writing
-from bstcad.designs.folder import Made, write_geometry
+from bstcad.designs.folder import write_geometry
+from bstcad.designs.made import Made
 from bstcad.designs.pipeline import design
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
@@ -43,6 +44,7 @@ from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.tailoring.stage2 import Problem
 from bstcad.transport import Density, solve
 from bstcad.verify import checks
+from bstcad.verify.nominal import Nominal
 from tests.benchmarks.cold import TEMPLATES
 
 TEMPLATE = TEMPLATES / "caustic_portrait.toml"
@@ -226,7 +228,7 @@ def _reading(read: Callable[[Path], Any], m: int) -> Work:
 def _proof(m: int = NET, pixels: int = PIXELS) -> Work:
     made = _made(m, pixels)
     place = _written(m)
-    wanted = checks.Nominal(made.scene, made.lens, made.goals)
+    wanted = Nominal(made.scene, made.lens, made.goals)
     return partial(checks.verify, Path(place.name), wanted, effort=PROOF)
 
 

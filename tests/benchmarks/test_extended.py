@@ -35,14 +35,14 @@ ROUND = 30  # evaluations of stage 2 a round of feedback, from the lens of the r
 
 def task_of(scene):
     """The task of a scene as `pipeline.design` has it, and the blank."""
-    knobs = scene.tailoring.resolved(scene.lens.back.control_points)
+    settings = scene.tailoring.resolved(scene.lens.back.control_points)
     scaled = [scene.with_source_scaled(share) for share, _ in stage2.SOURCE_SIZES]
     light, least = scene.with_source_scaled(0.0).channels(), scene.lens.min_thickness
     task = Task(
-        light, scene.goals, knobs, least, sampled_sources=tuple(each.channels() for each in scaled),
-        extended_sources=tuple(ExtendedSource(each.source, light, each.draw) for each in scaled),
+        light, scene.goals, settings, least, sampled_sources=tuple(each.channels() for each in scaled),
+        extended_sources=tuple(ExtendedSource(each.source, light, each.sampler) for each in scaled),
     )  # fmt: skip
-    return task, scene.flat_lens(knobs.levels[0])
+    return task, scene.flat_lens(settings.levels[0])
 
 
 def driven(task, steps):
@@ -52,7 +52,7 @@ def driven(task, steps):
 def judge(scene, lens):
     """(RRMSD, its standard error) by points of the source that nobody tailored with."""
     target = scene.target
-    light = measure(lens, scene.verification_channels(), target.screen, target.irradiance(), draw=scene.draw)
+    light = measure(lens, scene.verification_channels(), target.screen, target.irradiance(), sampler=scene.sampler)
     return light.rrmsd, light.standard_error
 
 
@@ -60,14 +60,14 @@ def feedback(task, lens, power, seconds):
     """Lenses of the rounds that fit into so many seconds of the processor."""
     [goal], began, whole = task.goals, time.process_time(), task.at_full_size
     target = wanted = goal.picture
-    few = task.knobs.model_copy(update={"stage2_iterations": ROUND})
+    few = replace(task.settings, stage2_iterations=ROUND)
     while time.process_time() - began < seconds:
-        tubes = round(2 * side_factor(whole.channels) * task.knobs.rays)
-        made = tubes_picture(lens, whole.channels, goal.receiver, tubes)
+        tubes = round(2 * side_factor(whole.channels) * task.settings.rays)
+        made = tubes_picture(lens, whole.channels, goal.screen, tubes)
         made = made.numpy() * (wanted.sum() / float(made.sum()))
         target = target * np.clip(wanted / np.maximum(made, 1e-6 * wanted.max()), 0.2, 5.0) ** power
         target = target / target.sum()
-        corrected = replace(task, goals=(replace(goal, picture=target),), knobs=few, sampled_sources=())
+        corrected = replace(task, goals=(replace(goal, picture=target),), settings=few, sampled_sources=())
         lens = driven(corrected, stage2.steps(corrected, lens))
         yield lens
 

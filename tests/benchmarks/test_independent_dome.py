@@ -14,7 +14,7 @@ from OCP.TColStd import TColStd_Array1OfInteger, TColStd_Array1OfReal
 from scipy.interpolate import BSpline
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.sphere_light import SphereLight
 from bstcad.optics.receivers.directions import Directions
 from bstcad.optics.receivers.irradiance import Screen
@@ -85,7 +85,7 @@ def test_a_step_file_of_occ_gives_the_net_and_its_knots_back(tmp_path):
 )
 def test_a_wavy_dome_makes_the_picture_of_the_independent_judge(profile, place, receiver, extent, waves):
     """A lamp at and beside the centre, on a plane and in directions; the difference is that of counted rays."""
-    source, dome = Point(place, profile=profile, half_angle=70.0), wavy_dome(65, *waves)
+    source, dome = PointSource(place, profile=profile, half_angle=70.0), wavy_dome(65, *waves)
     light = SphereLight(source, Z, CHART, HALF)
     clear = Circle(INNER), Circle(RIM)
     lens = Lens(Sphere(Z + INNER, -1 / INNER), dome, Circle(RIM), N, clear=clear)

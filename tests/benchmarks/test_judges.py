@@ -160,7 +160,7 @@ def test_the_ghost_lands_where_batoid_has_it(sphere):
     program.refract(back.surface, theirs, glass, air, back.frame)
     x, y, arrived = batoid.land(theirs, screen)
     out, _ = trace_ghost(rays, replace(lens, losses=Losses(FresnelLoss(scene.source.wavelength))))
-    ours = screen.plane.to(out)
+    ours = screen.receiver.to(out)
     both = (kept & ours.alive).numpy() & arrived
     off = np.hypot(*(ours.position[:2].numpy()[:, both] - np.stack([x, y])[:, both]))
     rms = float(np.sqrt(np.mean(off**2)))

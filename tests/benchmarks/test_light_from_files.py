@@ -56,7 +56,7 @@ def test_a_diode_to_an_even_line(line, pixels):
     design, report = line
     assert report.rrmsd <= 0.05 and report.light_on_target >= 0.8
     goal = design.scene.changed({"target.pixels": list(pixels)}).goals[0]
-    light = bstcad.measure(design.lens, design.scene.channels(), goal.receiver, goal.picture)
+    light = bstcad.measure(design.lens, design.scene.channels(), goal.screen, goal.picture)
     print(f"on {pixels} pixels: RRMSD {light.rrmsd:.4f}")
     assert light.rrmsd <= 0.05
 
@@ -89,7 +89,7 @@ def test_an_intensity_file_is_reached_and_comes_back_by_other_packages(tmp_path)
     given = wanted()
     (tmp_path / "wanted.ldt").write_bytes(eulumdat.write(given, Luminaire("wanted")))
     scene = over_directions(intensity=str(tmp_path / "wanted.ldt"))
-    assert isinstance(scene.target.screen.plane, Directions)
+    assert isinstance(scene.target.screen.receiver, Directions)
     design, report = designed(scene, tmp_path / "intensity")
     assert report.rrmsd <= 0.03
     lumens = 900 * leaving(report.flux)
@@ -154,7 +154,9 @@ def test_a_lens_is_judged_by_rays_as_by_the_source_that_made_them(rays_of_led, t
     design, _ = designed(led, tmp_path / "led")
     given = led.changed({"source.diameter": None, "source.rays": str(rays_of_led)})
     light, own = (
-        bstcad.measure(design.lens, scene.channels(), scene.target.screen, scene.target.irradiance(), draw=scene.draw)
+        bstcad.measure(
+            design.lens, scene.channels(), scene.target.screen, scene.target.irradiance(), sampler=scene.sampler
+        )
         for scene in (led, given)
     )
     for name, found in (("source", light), ("rays", own)):

@@ -12,6 +12,7 @@ from bstcad.scene.scene import load
 from tests.benchmarks import accuracy, published
 from tests.benchmarks.independent import judge
 from tests.benchmarks.mitsuba_caustic import VERTICES, control_net
+from tests.hard_cases.conftest import by_case
 
 KNOWN, PUBLISHED = accuracy.known(), published.known()
 
@@ -20,6 +21,19 @@ def test_each_page_is_what_its_records_give():
     """Else: python -m tests.benchmarks.accuracy --only, or published --only, which writes it anew."""
     assert accuracy.PAGE.read_text(encoding="utf-8") == accuracy.page(KNOWN)
     assert published.PAGE.read_text(encoding="utf-8") == published.page(PUBLISHED, KNOWN)
+
+
+def test_figures_of_both_precisions_share_a_row_of_the_hard_cases():
+    figures = {
+        ("7. A plane.", "error, float32: sag"): (2e-7, 1e-6, "mm"), ("7. A plane.", "miss"): (0.0, 0.0, ""),
+        ("7. A plane.", "error, float64: sag"): (3e-16, 1e-15, "mm"),
+        ("2. A ray.", "slope, float64"): (1e-16, 1e-15, ""),
+    }  # fmt: skip
+    assert by_case(figures) == [
+        ["2. A ray", "slope, float64", "1e-16", "1e-15"],
+        ["7. A plane", "error, float32; float64: sag", "2e-07; 3e-16 mm", "1e-06; 1e-15 mm"],
+        ["", "miss", "0", "0"],
+    ]
 
 
 def test_every_piece_is_recorded_with_its_circumstances_and_pictures():

@@ -33,7 +33,7 @@ def test_four_tiles_of_a_large_plate(tmp_path):
     lens = bstcad.design(scene, progress=False).lens.plain()
     source, screen = scene.light.central, scene.target.screen
     whole, other = (
-        collect(trace(source.rays_through(x, y, lens.front.z, area), lens, screen.plane), screen)[0]
+        collect(trace(source.rays_through(x, y, lens.front.z, area), lens, screen.receiver), screen)[0]
         for x, y, area in (rays_over(lens.outline, RAYS, seed) for seed in (1, 2))
     )
     volume, light = 0.0, torch.zeros_like(whole)

@@ -19,7 +19,7 @@ from bstcad.optics.surfaces.charts import SphereChart
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.radial import RadialSurface
 from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere
-from bstcad.scene.mount import Flange, Mount, Part, Round
+from bstcad.scene.mount import CircleRim, Flange, Mount, Part
 from bstcad.step_text import part21
 from bstcad.verify import step_checks
 from tests.cad.test_trimming import uses, worst_gap
@@ -165,7 +165,7 @@ def test_an_upright_facet_of_a_steep_dome_is_no_wall():
 def test_a_flange_adds_its_volume_alone():
     lens, high = dome(), 0.3
     z = on_base(lens).front.around.z
-    body = mounting.body(Flange(outline=Round(shape="circle", diameter=36.0), z=z, thickness=high))
+    body = mounting.body(Flange(outline=CircleRim(shape="circle", diameter=36.0), z=z, thickness=high))
     part = mounting.mounted(body, [mounting.PlacedLens(lens)])
     x, y, _ = lens.back.rim(lens.outline).T  # trapezoids of a periodic curve
     inside = (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2
@@ -216,7 +216,7 @@ def test_a_part_is_read_back_in_the_chart_of_its_design(tmp_path):
     lens = on_base(dome(half=80.0, m=25), 0.5)
     lens = replace(lens, clear=(lens.front.outline, lens.outline))
     for z in (0.5, -0.4):
-        plate = Flange(outline=Round(shape="circle", diameter=40.0), z=z, thickness=1.2 if z < 0 else 0.9)
+        plate = Flange(outline=CircleRim(shape="circle", diameter=40.0), z=z, thickness=1.2 if z < 0 else 0.9)
         mount = Mount(datum="flange", flange=plate)
         mounting.write_if_it_fits(lens, mount, tmp_path / "part.step", "dome", Part())
         found = step_checks.lens_of_part(tmp_path, lens, mount)

@@ -14,14 +14,14 @@ from bstcad.cad.solid_properties import of_solid
 from bstcad.cad.walls import Draft
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.surfaces import Sphere, sag
-from bstcad.scene.mount import LAND, Box, Round
+from bstcad.scene.mount import LAND, Box, CircleRim
 from bstcad.step_text import part21
 from tests.cad.test_mounting import disc
 from tests.cad.test_trimming import occ_volume, plate, stadium, uses, waves, worst_gap
 
 LEAN = Draft(4.0, bevel=0.25)
 RIMS = {
-    "circle": Round(shape="circle", diameter=7.0),
+    "circle": CircleRim(shape="circle", diameter=7.0),
     "rectangle": Box(shape="rectangle", width=8.0, height=6.0),
     "rounded": Box(shape="rectangle", width=8.0, height=6.0, corner_radius=1.2),
 }
@@ -168,8 +168,8 @@ STEEP = replace(plate(), front=Sphere(-4.0, 0.24), back=waves(half=(4.0, 4.0)), 
     [
         (plate(), CIRCLE, [], Draft(bevel=3.9), "bevel: at .* mm no wall is left between z = 3"),
         (plate(), CIRCLE, [], Draft(1.0, 3.6), "draft and bevel: at .* mm the walls meet before"),
-        (plate(), Round(shape="circle", diameter=7.9), [], Draft(1.0, 3.8), "draft and bevel: at .* no wall is"),
-        (plate(), Round(shape="circle", diameter=3.0), [], Draft(25.0), "draft: at .* mm the walls meet before"),
+        (plate(), CircleRim(shape="circle", diameter=7.9), [], Draft(1.0, 3.8), "draft and bevel: at .* no wall is"),
+        (plate(), CircleRim(shape="circle", diameter=3.0), [], Draft(25.0), "draft: at .* mm the walls meet before"),
         (plate(), Box(shape="rectangle", width=8, height=2), [], Draft(20.0), "draft: at .* the walls meet"),
         (plate(), ROUNDED, [], Draft(25.0), "draft: at .* mm the walls meet before"),
         (plate(), stadium(), [], LEAN, "draft and bevel: at .* the rim has a corner that is too sharp, or not between"),
@@ -178,7 +178,7 @@ STEEP = replace(plate(), front=Sphere(-4.0, 0.24), back=waves(half=(4.0, 4.0)), 
     ],
 )  # fmt: skip
 def test_walls_that_cannot_lean_are_refused_in_one_sentence(lens, rim, holes, lean, words):
-    rim = wire(rim) if isinstance(rim, Round | Box) else rim
+    rim = wire(rim) if isinstance(rim, CircleRim | Box) else rim
     with pytest.raises(ValueError, match=words) as refused:
         lens_solid(lens, rim, holes, lean)
     assert "\n" not in str(refused.value)

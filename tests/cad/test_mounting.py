@@ -9,7 +9,7 @@ import pytest
 
 from bstcad.cad import patches, step_writing
 from bstcad.cad.mounting import PlacedLens, body, mounted
-from bstcad.scene.mount import Box, Flange, Round
+from bstcad.scene.mount import Box, CircleRim, Flange
 from bstcad.step_text import part21
 from tests.cad.test_trimming import FRONTS, occ_volume, plate, stadium, uses, worst_gap
 from tests.exact_volume import exact_volume
@@ -84,7 +84,7 @@ def test_an_array_is_one_part():
     assert occ_volume(part.solid, 1e-5) == pytest.approx(wanted, rel=1e-5)
 
 
-OUTLINES = [Round(shape="circle", diameter=26.0), Box(shape="rectangle", width=26.0, height=22.0),
+OUTLINES = [CircleRim(shape="circle", diameter=26.0), Box(shape="rectangle", width=26.0, height=22.0),
             Box(shape="rectangle", width=26.0, height=22.0, corner_radius=3.0)]  # fmt: skip
 
 
@@ -112,7 +112,7 @@ def test_a_flange_s_bevels_are_at_45_degrees_whatever_its_walls_lean(outline, dr
 
 
 @pytest.mark.parametrize(("draft", "bevel"), [(0.0, 0.0), (1.0, 0.2)])
-@pytest.mark.parametrize("outline", [Round(shape="circle", diameter=20.0), *(
+@pytest.mark.parametrize("outline", [CircleRim(shape="circle", diameter=20.0), *(
     Box(shape="rectangle", width=20.0, height=16.0, corner_radius=corner) for corner in (0.0, 2.0)
 )])  # fmt: skip
 def test_every_face_of_a_flanged_lens_has_its_name_in_step(outline, draft, bevel):

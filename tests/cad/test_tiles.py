@@ -19,7 +19,7 @@ from bstcad.cad.tiles import tiles_of
 from bstcad.cad.tiling import Tiling
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.quadrature import of_lens
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.receivers.irradiance import Screen, collect
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Conic, Plane, Recess, Sphere
@@ -62,7 +62,7 @@ def light_of_tile(tile, lens, path, source, screen, start):
     x, y, area = start
     inside = torch.from_numpy(shapely.contains_xy(own, x.numpy(), y.numpy()))
     again = Lens(lens.front, step_reading.freeform_surface(faces["back"]), lens.outline, lens.index)
-    landed = trace(source.rays_through(x[inside], y[inside], lens.front.z, area), again, screen.plane)
+    landed = trace(source.rays_through(x[inside], y[inside], lens.front.z, area), again, screen.receiver)
     return collect(landed, screen)[0]
 
 
@@ -131,10 +131,10 @@ def test_cells_cover_the_outline(outline):
 
 
 def test_the_light_of_the_tiles_is_that_of_the_lens(tmp_path):
-    lens, source = lens_of("plane", m=33), Collimated(PLATE)
+    lens, source = lens_of("plane", m=33), CollimatedSource(PLATE)
     screen = Screen(120.0, (-30.0, 30.0), (-30.0, 30.0), 24)
     whole, other = (
-        collect(trace(source.rays_through(x, y, 8.0, area), lens, screen.plane), screen)[0]
+        collect(trace(source.rays_through(x, y, 8.0, area), lens, screen.receiver), screen)[0]
         for x, y, area in (rays_over(PLATE, 400, seed) for seed in (1, 2))
     )
     same, new = torch.zeros_like(whole), torch.zeros_like(whole)

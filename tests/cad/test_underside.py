@@ -18,7 +18,7 @@ from bstcad.optics.lens import quadrature
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Conic, Recess, Sphere
-from bstcad.scene.mount import Flange, Mount, Round
+from bstcad.scene.mount import CircleRim, Flange, Mount
 from bstcad.verify import step_checks
 from tests.lenses import half_over, net
 
@@ -110,7 +110,7 @@ def test_a_flange_holds_it(z, tmp_path):
     """The flange's lower face lies in the plane of the underside, above it or below."""
     made = lens()
     level = made.front.around.z + (z or 0.0)
-    flange = Flange(outline=Round(shape="circle", diameter=60.0), z=level, thickness=2.5)
+    flange = Flange(outline=CircleRim(shape="circle", diameter=60.0), z=level, thickness=2.5)
     part = part_of(made, Mount(flange=flange))
     assert part.solid.isValid()
     ring = math.pi * (30.0**2 - 25.0**2) * 2.5

@@ -22,7 +22,7 @@ from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Sphere, sag
 from bstcad.runs import files
-from bstcad.scene.mount import Box, Flange, Mount, Round, Screws
+from bstcad.scene.mount import Box, CircleRim, Flange, Mount, Screws
 
 RECTANGLE, CIRCLE = Rectangle(8.0, 6.0), Circle(3.0)
 
@@ -154,7 +154,7 @@ AREA = 1e-9  # mm²
 LABEL = Label("lamp", 'A disc, "even" & <bright>')
 FLANGED = Mount(
     datum="flange",
-    rim=Round(shape="circle", diameter=15.0),
+    rim=CircleRim(shape="circle", diameter=15.0),
     flange=Flange(
         outline=Box(shape="rectangle", width=26.0, height=24.5, corner_radius=3.0), z=15.5, thickness=1.5, draft=1.0,
         bevel=0.2, screws=Screws(count=4, diameter=2.2, circle=26.0, first=45.0), holes=((1, 11, 0.9), (9.5, 0, 1.3)),
@@ -166,7 +166,7 @@ CASES = {  # outline of the lens, mount, area (mm²) of each edge by layer
         "HOLES": [math.pi * 0.45**2, math.pi * 0.65**2],
     }),
     "round flange of a square lens": (Rectangle(12.0, 9.0), Mount(flange=Flange(
-        outline=Round(shape="circle", diameter=31.0), z=1.0, thickness=2.0)), {
+        outline=CircleRim(shape="circle", diameter=31.0), z=1.0, thickness=2.0)), {
         "RIM": [108.0], "FLANGE": [math.pi * 15.5**2],
     }),
     "rim alone": (Circle(10.0), Mount(rim=Box(shape="rectangle", width=9.0, height=12.0, corner_radius=0.7)), {
@@ -211,7 +211,7 @@ def test_holes_lie_where_the_part_has_them_and_are_marked():
 
 
 def test_the_circle_of_the_screws_is_drawn_where_it_lies_in_the_flange():
-    flange = Flange(outline=Round(shape="circle", diameter=31.0), z=1.0, thickness=2.0,
+    flange = Flange(outline=CircleRim(shape="circle", diameter=31.0), z=1.0, thickness=2.0,
                     screws=Screws(count=3, diameter=2.0, circle=26.0))  # fmt: skip
     mount = Mount(flange=flange)
     [pitch] = [mark for mark in entities_of(Circle(10.0), mount)["CENTRES"] if mark.dxftype() == "CIRCLE"]

@@ -10,8 +10,8 @@ from scipy.interpolate import CubicHermiteSpline
 from bstcad.exports import grid_sag
 from bstcad.exports.grid_sag import MAX_SHIFT, GridLight, GridSag, shift_by_patches, table_note
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
@@ -19,7 +19,7 @@ from bstcad.optics.surfaces.surfaces import Plane, sag
 from tests.exports.test_exports import read_zemax
 
 OUTLINE, THROW = Rectangle(8.0, 6.0), 200.0  # mm
-BEAM = GridLight(Collimated(OUTLINE), (Screen(4.0 + THROW, (-20.0, 20.0), (-15.0, 15.0), (160, 120)),))
+BEAM = GridLight(CollimatedSource(OUTLINE), (Screen(4.0 + THROW, (-20.0, 20.0), (-15.0, 15.0), (160, 120)),))
 
 
 def wavy(shape=(21, 17), past=2, outline=OUTLINE):
@@ -65,7 +65,7 @@ def test_the_light_moves_as_far_as_is_stated(points):
 def test_where_the_lens_reaches_into_the_end_spans_the_grid_gets_finer(outline):
     """There the net is no polynomial in x: it takes a grid of some cells a span, still through all knots."""
     lens = wavy((21, 21), past=0, outline=outline)
-    grid = GridSag.of(lens, lens.back, light=replace(BEAM, source=Collimated(outline)))
+    grid = GridSag.of(lens, lens.back, light=replace(BEAM, source=CollimatedSource(outline)))
     cells = np.array(lens.back.pitch) / grid.grid.step
     assert cells == pytest.approx(cells.round()) and cells[0] >= 2
     assert 0 < grid.shift.maximum <= MAX_SHIFT * grid.shift.pixel
@@ -76,10 +76,10 @@ def test_light_of_a_point_and_a_face_before_it_are_judged_too():
     """Rays that run askew meet the patches where they meet the face."""
     lens = wavy()
     lens = replace(lens, front=lens.back.moved(1.0), back=Plane(4.0))
-    throw = GridLight(Point((0.0, 0.0, -30.0), half_angle=5.0, profile="uniform"), BEAM.screens)
+    throw = GridLight(PointSource((0.0, 0.0, -30.0), half_angle=5.0, profile="uniform"), BEAM.screens)
     exact, coarse = (GridSag.of(lens, lens.front, points, throw).shift for points in (None, 21))
     assert exact.maximum < 1e-9 < 1e-3 < coarse.rms < coarse.maximum
-    beside = replace(throw, source=Point((300.0, 0.0, -30.0), half_angle=1.0, profile="uniform"))
+    beside = replace(throw, source=PointSource((300.0, 0.0, -30.0), half_angle=1.0, profile="uniform"))
     assert GridSag.of(lens, lens.front, 21, beside).shift is None
     assert "no light reaches the target" in table_note(lens, lens.front, "sag.csv", points=21, light=beside)
 

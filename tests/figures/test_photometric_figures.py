@@ -96,7 +96,7 @@ def test_illuminance_has_the_flux_of_the_target():
 
 @pytest.mark.parametrize("lumens, expected", [(None, ["polar", "isocandela"]), (9.0, ["polar", "isocandela", "cone"])])
 def test_a_lamp_of_known_flux_has_a_cone_diagram(lumens, expected):
-    far = SimpleNamespace(lumens=lumens, draw=None, table=lambda lens, rays: beam())
+    far = SimpleNamespace(lumens=lumens, sampler=None, table=lambda lens, rays: beam())
     drawn = figures.draw_far_field(far, None, ANGLES)
     assert list(drawn) == expected and all(len(data) < 300_000 for data in drawn.values())
     far.table = lambda lens, rays: Intensity("C", AROUND, ALONG, np.zeros((72, 91)))

@@ -6,7 +6,7 @@ pytest tests/hard_cases -q --stability docs/stability.md     (make stability)
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
@@ -42,13 +42,26 @@ def pytest_sessionfinish(session):
     page = session.config.getoption("--stability", default=None)
     if not page or not session.testscollected or session.testsfailed:
         return
-    rows, before = [], ""  # in the order of the cases, which are first lines of docstrings: "7. A plane …"
-    figures = session.config.stash[FIGURES].items()
-    for (case, what), values in sorted(figures, key=lambda entry: int(entry[0][0].partition(".")[0])):
-        value, bound, unit = values
-        rows.append(
-            ["" if case == before else case.rstrip("."), what, *(f"{v:.2g} {unit}".strip() for v in (value, bound))]
-        )
-        before = case
-    content = markdown.table(("case", "figure", "measured", "bound"), rows, words=("figure",))
+    content = markdown.table(
+        ("case", "figure", "measured", "bound"), by_case(session.config.stash[FIGURES]), words=("figure",)
+    )
     markdown.write(Path(page), "<!-- figures: cases -->", content)
+
+
+def by_case(figures: Mapping[tuple[str, str], tuple[float, float, str]]) -> list[list[str]]:
+    """Return rows of case, figure, measured and bound, in the order of the cases: "7. A plane …".
+
+    Figures of float32 and of float64 that have one name otherwise share a row.
+    """
+    rows, before = [], ""
+    for (case, what), values in sorted(figures.items(), key=lambda entry: int(entry[0][0].partition(".")[0])):
+        coarse, exact = (case, what.replace("float64", "float32")), (case, what.replace("float32", "float64"))
+        name, found = what, [values]
+        if coarse != exact and {coarse, exact} <= figures.keys():
+            if (case, what) == exact:
+                continue
+            name, found = what.replace("float32", "float32; float64"), [values, figures[exact]]
+        cells = ("; ".join(f"{each[k]:.2g}" for each in found) for k in range(2))
+        rows.append(["" if case == before else case.rstrip("."), name, *(f"{c} {values[2]}".strip() for c in cells)])
+        before = case
+    return rows

@@ -19,7 +19,7 @@ import pytest
 import torch
 
 from bstcad.optics.kernels import forward
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen, collect
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.bspline import BSplineSurface
@@ -49,7 +49,7 @@ Z = 200.0
 def good(dtype) -> Rays:
     """143 rays: an odd number, so that one more leaves each of two threads what it had."""
     x, y = (p.reshape(-1)[:143] for p in stratified(Rectangle(12.0, 12.0), 12, 0, dtype))
-    return Point().rays_through(x, y, 15.0, 1.0)
+    return PointSource().rays_through(x, y, 15.0, 1.0)
 
 
 def with_ray(rays: Rays, other: Rays, place: int) -> Rays:
@@ -101,7 +101,7 @@ def test_all_others_land_and_pull_as_without_it(bad, engine, dtype):
 @pytest.mark.parametrize("beside", [(40.0, 0.0), (9.99, -9.99), (1e9, 1e9), (NAN, 0.0), (INF, 0.0)], ids=str)
 def test_the_forward_kernel_lets_no_ray_change_another(beside):
     """Outside the lens, out at a side, beyond the beam, not a number: the others of its block land where they did."""
-    lens, source = lens_of(wavy(depth=2.0)), Point()
+    lens, source = lens_of(wavy(depth=2.0)), PointSource()
     x, y = (p.reshape(-1) for p in stratified(Rectangle(12.0, 12.0), 30, 0))
     whole = forward.land(source, lens, LevelPlane(Z), x, y)
     x[300], y[300] = beside
@@ -154,7 +154,7 @@ def test_the_surface_is_not_evaluated_for_20_164_rays_because_of_one(way, dtype,
     """Places at which sag and slopes are asked for, which no busy machine changes: at most a hundredth more."""
     lens = lens_of(wavy(dtype))
     x, y = (p.reshape(-1) for p in stratified(Rectangle(13.0, 13.0), 142, 0, dtype))
-    rays = trace.to_first_net(Point().rays_through(x, y, 15.0, 1.0), lens)
+    rays = trace.to_first_net(PointSource().rays_through(x, y, 15.0, 1.0), lens)
     direction, asked, evaluate = rays.direction.clone(), [], BSplineSurface.relative_sag_and_slope
     direction[:, 7000] = torch.nn.functional.normalize(torch.tensor(way, dtype=torch.float64), dim=0)
 

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from bstcad.optics.lens.interfaces import MIN_COS_REFRACTION, Refract
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.bspline import BSplineSurface
@@ -140,7 +140,7 @@ def test_tubes_across_the_angle(dtype, holds):
     """A bowl whose rim reflects a cone's light: tubes carry what rays find to leave, but for those on the border."""
     back = wavy(dtype, m=33, depth=5.0, ripple=0.0)
     lens = lens_of(replace(back, heights=back.heights.requires_grad_()), Plane(15.0), Circle(9.0), 1.6)
-    n, source, screen = 61, Point(profile="uniform", half_angle=30.0), Screen(60.0, (-1e9, 1e9), (-1e9, 1e9), 8)
+    n, source, screen = 61, PointSource(profile="uniform", half_angle=30.0), Screen(60.0, (-1e9, 1e9), (-1e9, 1e9), 8)
     told = simulated(source, lens, screen, 400, 0).flux
     leaves = told["on target"] + told["off target"]
     assert told["total internal reflection"] > 0.02

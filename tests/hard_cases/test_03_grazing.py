@@ -17,7 +17,7 @@ import torch
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens.interfaces import Refract
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
@@ -87,7 +87,7 @@ def test_along_the_axis_at_the_equator(curvature, dtype, holds):
     """A beam wider than the sphere: outside it is flagged; inside it refracts by the sphere's own normal."""
     radius = torch.tensor([10.0 * (1 + offset) for offset in OFFSETS], dtype=torch.float64).to(dtype)
     lens = Lens(Sphere(15.0, curvature), wavy(dtype, z=40.0), WIDE, N)
-    rays = Collimated(Circle(30.0)).rays_through(radius, torch.zeros_like(radius), 0.0, 1.0)
+    rays = CollimatedSource(Circle(30.0)).rays_through(radius, torch.zeros_like(radius), 0.0, 1.0)
     inside = trace.to_first_net(rays, lens)
     c = float(torch.tensor(curvature, dtype=dtype))
     left = 1 - (c * radius.double()) ** 2  # cos² of incidence
@@ -101,7 +101,7 @@ def test_along_the_axis_at_the_equator(curvature, dtype, holds):
     figure = f"error of the direction refracted near a sphere's equator, times the cosine of incidence, {NAMES[dtype]}"
     holds(figure, largest(off * cosine), 8 * eps(dtype))
     if dtype == torch.float64:
-        found = forward.land(Collimated(Circle(30.0)), lens, LevelPlane(300.0), radius, torch.zeros_like(radius))
+        found = forward.land(CollimatedSource(Circle(30.0)), lens, LevelPlane(300.0), radius, torch.zeros_like(radius))
         plain = from_first_net_plain(inside, lens, LevelPlane(300.0))
         assert torch.equal(found.status, plain.status)
 

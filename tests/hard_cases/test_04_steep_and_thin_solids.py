@@ -32,6 +32,7 @@ from bstcad.optics.surfaces.surfaces import Plane, Sphere
 from bstcad.scene.scene import MESH_TOLERANCE
 from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks
+from tests import suite
 from tests.exact_volume import exact_volume
 
 SLOPE, EDGE = 64.0, 0.05  # degrees, before the ripple; mm
@@ -69,7 +70,7 @@ class Written:
     area: float  # mm², of all faces
 
 
-@pytest.fixture(scope="module", params=LENSES)
+@pytest.fixture(scope="module", params=suite.in_turns(LENSES, 2))
 def written(request, tmp_path_factory) -> Written:
     lens = steep(*LENSES[request.param])
     path = tmp_path_factory.mktemp("steep") / "lens.step"

@@ -17,7 +17,7 @@ import torch
 
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.outlines import Circle
@@ -91,7 +91,7 @@ def test_all_forms_choose_the_same_root(depth, number, degrees):
 
 def test_the_forward_kernel_chooses_it_too():
     """A near source before a plane front: rays in the glass up to 38° off the axis, waves steeper than that allows."""
-    source, lens = Point((1.0, 0.5, 12.0)), Lens(Plane(15.0), waves(2.5, 12.0), SQUARE, N)
+    source, lens = PointSource((1.0, 0.5, 12.0)), Lens(Plane(15.0), waves(2.5, 12.0), SQUARE, N)
     x, y = uniform((2, 3000), 5, -9.9, 9.9)
     rays = source.rays_through(x, y, 15.0, 1.0)
     in_glass = trace.to_first_net(rays, lens)

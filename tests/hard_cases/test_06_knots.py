@@ -16,7 +16,7 @@ import torch
 
 from bstcad.optics.kernels import forward, spline
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces import bspline
 from bstcad.optics.surfaces.bspline import BSplineSurface
@@ -142,7 +142,7 @@ def test_the_forward_kernel_at_knots_and_corners():
     at = (around_knots(m, torch.float64) * (2 * half / (m - 1)) - half).reshape(-1)
     line = torch.cat([at, torch.tensor([half + 1e-9, -1e6, 1e6], dtype=torch.float64)])
     x, y = (p.reshape(-1).contiguous() for p in torch.meshgrid(line, line, indexing="ij"))
-    source = Collimated(Rectangle(3 * half, 3 * half))
+    source = CollimatedSource(Rectangle(3 * half, 3 * half))
     found = forward.land(source, lens, LevelPlane(120.0), x, y)
     with tracing("plain") as through_back:
         plain = through_back(to_first_net(source.rays_through(x, y, 8.0, 1.0), lens), lens, 120.0)

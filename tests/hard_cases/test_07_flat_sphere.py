@@ -14,8 +14,8 @@ from decimal import Decimal, localcontext
 import pytest
 import torch
 
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.rays import Status
@@ -69,7 +69,7 @@ def test_sag_and_slope_have_all_their_digits(curvature, dtype, holds):
 
 
 @DTYPES
-@pytest.mark.parametrize("source", [Point(), Collimated(Circle(12.0))], ids=("point", "collimated"))
+@pytest.mark.parametrize("source", [PointSource(), CollimatedSource(Circle(12.0))], ids=("point", "collimated"))
 def test_no_curvature_is_the_plane_to_the_bit(source, dtype):
     """Closed form and kernels: a sphere of curvature 0, or too small for any sag, traces as the plane does."""
     x, y = (p[:150] * 0.5 for p in disc(dtype))

@@ -15,8 +15,8 @@ import pytest
 import torch
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
@@ -38,7 +38,7 @@ def scene(dtype, shift=0.0, kind="point", distance=15.0) -> tuple:
     """(source, lens): sags within 0.05 mm, so that even the nearest screen lies behind the lens."""
     back = wavy(dtype, m=9, depth=-0.04, ripple=0.01, z=20.0 + shift)
     start = 15.0 + shift - distance
-    source = Point((0.25, -0.5, start)) if kind == "point" else Collimated(Circle(12.0), z=start)
+    source = PointSource((0.25, -0.5, start)) if kind == "point" else CollimatedSource(Circle(12.0), z=start)
     return source, lens_of(back, Sphere(15.0 + shift, -0.02))
 
 
@@ -50,7 +50,7 @@ def exactly(source, lens: Lens, x, y, z: float) -> list:
     """Landings (x, y) in sixty digits of the rays through (x, y) of the plane of the front's vertex."""
     found = []
     for p, q in zip(x, y, strict=True):
-        if isinstance(source, Point):
+        if isinstance(source, PointSource):
             start, through = source.position, (p, q, lens.front.z)
             way = [exact.number(b) - exact.number(a) for a, b in zip(start, through, strict=True)]
         else:
@@ -126,5 +126,5 @@ def test_a_scene_scaled_by_a_power_of_two_lands_scaled_to_the_bit(scale, dtype):
         back = replace(back, heights=s * back.heights, x=ends, y=ends)
         lens = lens_of(back, Sphere(15.0 * s, -0.02 / s), Rectangle(20.0 * s, 20.0 * s))
         x, y = s * uniform((2, 100), 3, -8.0, 8.0).to(dtype)
-        results.append([landed.position / s for _, landed in engines(Point(), lens, x, y, 500.0 * s)])
+        results.append([landed.position / s for _, landed in engines(PointSource(), lens, x, y, 500.0 * s)])
     assert all(torch.equal(a, b) and torch.isfinite(a).all() for a, b in zip(*results, strict=True))

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.numerics import ops, reductions
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
@@ -56,7 +56,7 @@ def test_a_traced_pixel_counts_twenty_million_rays(holds, dtype):
     heights = torch.zeros((5, 5), dtype=dtype)
     lens = Lens(Plane(5.0), BSplineSurface(8.0, heights, (-10.0, 10.0), (-10.0, 10.0)), Rectangle(20.0, 20.0), 1.5)
     n = 4473
-    found = simulated(Collimated(Rectangle(18.0, 18.0)), lens, SCREEN, n, 0)
+    found = simulated(CollimatedSource(Rectangle(18.0, 18.0)), lens, SCREEN, n, 0)
     assert found.rays == n * n > HITS and float(found.box.sum()) == float(found.box[2, 2])
     bound = n * n / reductions.MAX_PARTS * ROUND
     holds("2e7 hits in one pixel, traced: error of the flux", abs(float(found.box[2, 2]) - 1), bound, "of it")

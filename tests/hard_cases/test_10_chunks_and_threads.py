@@ -24,8 +24,8 @@ from bstcad.designs import pipeline
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.wavefront import SphericalWave
 from bstcad.optics.numerics import ops
 from bstcad.optics.receivers.goal import Goal
@@ -43,12 +43,12 @@ from bstcad.tailoring.baselines.paper import TentMerit
 from bstcad.tailoring.merit import Merit, SobolevVariable
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.transport.density import Density
-from tests import two_faces
+from tests import domes, two_faces
 from tests.conftest import DISK, SMALL
 from tests.tracing import launch, simulated, simulated_plain
 
 ROOT = Path(__file__).parent.parent.parent
-SOURCE = Point(position=(1.0, -2.0, 0.0), profile="uniform", half_angle=35.0)
+SOURCE = PointSource(position=(1.0, -2.0, 0.0), profile="uniform", half_angle=35.0)
 GAUSSIAN = {"profile": "gaussian", "half_angle_1e2": 30.0}
 SCREEN = Screen(300.0, (-70.0, 90.0), (-80.0, 60.0), 192)  # 36 864 pixels: torch shares sums of more than 32 768
 FURTHER = replace(SCREEN, z=600.0, x=(-150.0, 170.0), y=(-160.0, 140.0))
@@ -75,7 +75,7 @@ def of_two_faces(dtype) -> dict[str, torch.Tensor]:
     """Merit and gradients of two nets for two pictures of lossy light, and for a wave beside them."""
     back = lens(dtype).back
     front = replace(back, z=15.0, heights=-0.1 * back.heights.flip(0, 1))
-    held = Lens(front, back, Circle(10.0), 1.5, shaped=(0, 1))
+    held = Lens(front, back, Circle(10.0), 1.5, tailored=(0, 1))
     light = (Channel(SOURCE, held.index, losses=Losses(FresnelLoss(587.6), AbsorptionLoss(0.01))),)
     goals = [Goal("target", screen, target().numpy(), weight) for screen, weight in ((SCREEN, 1.0), (FURTHER, 2.0))]
     found = {}
@@ -119,7 +119,7 @@ def everything() -> dict[str, torch.Tensor]:
     back = lens().back
     x, y = sampling.grid(Rectangle(20.0, 20.0), 300)
     flat = (p.reshape(-1) for p in (x, y, 0.3 * torch.sqrt(1.5 + x / 7), 0.001 * x * y, x * x))  # no polynomial
-    beam = Collimated(Circle(12.0), profile="gaussian", radius_1e2=9.0)
+    beam = CollimatedSource(Circle(12.0), profile="gaussian", radius_1e2=9.0)
     rays = tubes.rays_to(SOURCE, lens(), *tubes.corners(Circle(9.0), 300))
     return image_and_gradient() | {
         "a polynomial and a fit": fit_slopes(back, *flat, Fit(degree=3)).heights,
@@ -143,26 +143,48 @@ def apart(name: str, found: torch.Tensor, wanted: torch.Tensor) -> float:
     return float(difference.norm() / wanted.norm())
 
 
+def use_threads(n: int) -> None:
+    """Set the number of threads of torch and numba."""
+    torch.set_num_threads(n)
+    numba.set_num_threads(min(n, numba.config.NUMBA_NUM_THREADS))
+
+
 @pytest.fixture
 def threads():
-    """Sets the number of threads of torch and numba; put back afterwards."""
+    """Return `use_threads`; the numbers are put back afterwards."""
     before = torch.get_num_threads(), numba.get_num_threads()
-
-    def use(n: int) -> None:
-        torch.set_num_threads(n)
-        numba.set_num_threads(min(n, numba.config.NUMBA_NUM_THREADS))
-
-    yield use
+    yield use_threads
     torch.set_num_threads(before[0])
     numba.set_num_threads(before[1])
 
 
-def test_threads_of_one_process_change_no_bit(threads):
-    threads(1)
-    wanted = everything()
-    threads(7)
-    for name, found in everything().items():
-        assert torch.equal(found, wanted[name]), name
+def said_in_a_process(expression: str, threads: int, **variables: str) -> str:
+    """Return what an expression of this module says in a process with so many threads of each library."""
+    counts = {f"{library}_NUM_THREADS": str(threads) for library in ("NUMBA", "OMP", "MKL", "OPENBLAS")}
+    code = f"import bstcad, {__name__} as m; print(m.{expression})"
+    given = os.environ | counts | variables | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=given, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def changed_by_threads() -> list[str]:
+    """Return the names of results and designs that are other ones on one thread than on several."""
+    results, digests = [], []
+    for n in (1, 4, 7):
+        use_threads(n)
+        results.append(everything())
+        digests.append({name: digest_of_a_design(name, n) for name in QUICK_DESIGNS} if n < 7 else {})
+    changed = [name for name in results[0] if not all(torch.equal(results[0][name], found[name]) for found in results)]
+    return changed + [name for name in QUICK_DESIGNS if digests[0][name] != digests[1][name]]
+
+
+def test_threads_of_one_process_change_no_bit():
+    """A process of its own has threads enough; those that run the suite share the cores.
+
+    A picture and a wave have more corners than one thread of torch takes: 32 768.
+    """
+    assert said_in_a_process("changed_by_threads()", 4) == "[]"
 
 
 def test_strips_and_bands(holds, monkeypatch):
@@ -213,17 +235,6 @@ def test_one_thread_and_other_strips_make_the_same_design(threads, monkeypatch, 
         assert np.array_equal(found, wanted["control_points"])
 
 
-def test_any_number_of_threads_makes_the_same_two_faces(threads):
-    """A picture and a wave have more corners than one thread of torch takes: 32 768."""
-    quick = {"tailoring": two_faces.SMALL["tailoring"] | {"rays": 190, "rounds": 2, "stage2_iterations": 4}}
-    scene, found = load(DISK, two_faces.SMALL | two_faces.WITH_WAVE | quick), []
-    for n in (1, 4):
-        threads(n)
-        made = pipeline.design(scene, device="cpu", options=pipeline.DesignOptions(compare_later=True))
-        found.append([net.control_points() for net in made.lens.nets])
-    assert all(np.array_equal(*each) for other in found[1:] for each in zip(found[0], other, strict=True))
-
-
 PROCESSORS = {  # environment variables by which BLAS, torch and numba take the processor for another one
     "as it is": {}, "MKL_CBWR=COMPATIBLE": {"MKL_CBWR": "COMPATIBLE"}, "MKL_CBWR=AVX2": {"MKL_CBWR": "AVX2"},
     "torch without vector units": {"ATEN_CPU_CAPABILITY": "default"}, "any, to numba": {"NUMBA_CPU_NAME": "generic"},
@@ -238,10 +249,19 @@ TAILORED = {  # a front that is searched for; two nets for two pictures, and for
 }
 
 
+FEW_STEPS = {"rays": 190, "rounds": 2, "stage2_iterations": 4}
+QUICK_DESIGNS = {
+    "two faces": two_faces.SMALL | two_faces.WITH_WAVE | {"tailoring": two_faces.SMALL["tailoring"] | FEW_STEPS},
+    "dome": domes.SMALL | {"tailoring": domes.SMALL["tailoring"] | FEW_STEPS},
+}
+
+
 def digest_of_a_design(name: str, threads: int) -> str:
     """The control points of a design on so many threads."""
-    torch.set_num_threads(threads)
-    nets = pipeline.design(load(DISK, TAILORED[name]), device="cpu").lens.nets
+    use_threads(threads)
+    options = pipeline.DesignOptions(compare_later=True)
+    scene = load(DISK, (TAILORED | QUICK_DESIGNS)[name])
+    nets = pipeline.design(scene, device="cpu", options=options).lens.nets
     return hashlib.sha256(b"".join(net.control_points().tobytes() for net in nets)).hexdigest()
 
 
@@ -250,12 +270,9 @@ def digest_of_a_design(name: str, threads: int) -> str:
 @pytest.mark.parametrize("name", TAILORED)
 def test_any_processor_and_any_number_of_threads(name, processor):
     """Other processors round otherwise, but each the same on any number of threads; processes of their own."""
-    digests = {}
-    for threads in (1, 2, 4):
-        counts = {f"{library}_NUM_THREADS": str(threads) for library in ("NUMBA", "OMP", "MKL", "OPENBLAS")}
-        code = f"import bstcad, {__name__} as m; print(m.digest_of_a_design({name!r}, {threads}))"
-        given = os.environ | counts | PROCESSORS[processor] | {"PYTHONPATH": str(ROOT)}
-        done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=given, capture_output=True, text=True)
-        digests[threads] = done.stdout.strip()
+    digests = {
+        threads: said_in_a_process(f"digest_of_a_design({name!r}, {threads})", threads, **PROCESSORS[processor])
+        for threads in (1, 2, 4)
+    }
     print(f"{name}, {processor}: {digests}")
     assert len(set(digests.values())) == 1 and all(len(digest) == 64 for digest in digests.values()), digests

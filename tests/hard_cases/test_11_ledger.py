@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.numerics import ops
 from bstcad.optics.receivers import irradiance
 from bstcad.optics.receivers.irradiance import Screen
@@ -25,7 +25,7 @@ from bstcad.optics.surfaces.surfaces import Sphere
 from bstcad.optics.trace import trace, tubes
 from tests.tracing import from_first_net_plain, launch, simulated, simulated_plain, stratified
 
-SOURCE = Point(position=(1.0, -2.0, 3.0), profile="gaussian", half_angle_1e2=30.0)
+SOURCE = PointSource(position=(1.0, -2.0, 3.0), profile="gaussian", half_angle_1e2=30.0)
 LINES = {  # fates of rays by line of the ledger
     "on target": (Status.ALIVE,),
     "off target": (Status.ALIVE, Status.TURNED_BACK),
@@ -66,7 +66,7 @@ def border(picture: torch.Tensor) -> torch.Tensor:
 def traced(dtype) -> Landed:
     """Every ray of `simulate` with its fate, by the plain form."""
     held = lens(dtype)
-    return from_first_net_plain(trace.to_first_net(launch(SOURCE, held, RAYS, 0), held), held, SMALL.plane)
+    return from_first_net_plain(trace.to_first_net(launch(SOURCE, held, RAYS, 0), held), held, SMALL.receiver)
 
 
 def counted(rays: Landed, screen: Screen) -> dict[str, float]:

@@ -17,7 +17,7 @@ import torch
 
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.receivers import irradiance
 from bstcad.optics.receivers.irradiance import Screen, rrmsd
 from bstcad.optics.receivers.receivers import LevelPlane
@@ -32,7 +32,7 @@ from bstcad.verify import checks
 from tests.tracing import simulated, simulated_plain
 
 APERTURE = Rectangle(20.0, 18.0)
-SOURCE = Collimated(APERTURE, profile="gaussian", radius_1e2=11.0)
+SOURCE = CollimatedSource(APERTURE, profile="gaussian", radius_1e2=11.0)
 SCREEN = Screen(300.0, (-8.13, 7.41), (-7.07, 7.77), 24)  # within the beam; no pixel border is one of a cell
 SEEDS = 4
 NOISE = "standard error of the RRMSD, times five"

@@ -18,7 +18,8 @@ from bstcad.designs.pipeline import design
 from bstcad.optics.trace.measure import Effort
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
-from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT
+from bstcad.verify.nominal import DEFAULT_RRMSD_LIMIT
+from tests import suite
 from tests.conftest import draws_nothing
 from tests.hard_cases.designs import DESIGNS, overrides
 
@@ -38,7 +39,9 @@ def marked(name):
     return pytest.param(name, marks=pytest.mark.bench) if DESIGNS[name].bench else name
 
 
-@pytest.mark.parametrize("name", [marked(name) for name, hard in DESIGNS.items() if not hard.refused])
+@pytest.mark.parametrize(
+    "name", suite.in_turns([marked(name) for name, hard in DESIGNS.items() if not hard.refused], 4)
+)
 def test_it_comes_through(name, tmp_path, monkeypatch):
     hard, pictures, folder = DESIGNS[name], tmp_path / "pictures", tmp_path / "lens"
     pictures.mkdir()
@@ -78,7 +81,7 @@ def test_it_comes_through(name, tmp_path, monkeypatch):
     assert all(sentence in page for sentence in said) and ("<h2>Remarks</h2>" in page) is bool(said)
 
 
-@pytest.mark.parametrize("name", [name for name, hard in DESIGNS.items() if hard.refused])
+@pytest.mark.parametrize("name", suite.in_turns([name for name, hard in DESIGNS.items() if hard.refused], 2))
 def test_it_is_refused_in_one_sentence(name, tmp_path):
     with pytest.raises(SceneError, match=DESIGNS[name].refused) as refusal:
         design(load(*overrides(name, tmp_path, ROUGH)), device="cpu")

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from bstcad.optics.lens.interfaces import Refract
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import LEDGER, Screen
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
@@ -69,9 +69,9 @@ def test_what_is_asked_for_is_kept_and_comes_back(tmp_path_factory, overrides):
 DEPTH = st.floats(-1.5, 1.5)
 CURVATURE = st.floats(-0.03, 0.03)
 SOURCES = st.sampled_from([
-    Point(), Point((0.5, -1.0, 3.0), profile="uniform", half_angle=35.0),
-    Point((-1.0, 0.25, 0.0), profile="gaussian", half_angle_1e2=25.0), Collimated(Circle(12.0)),
-    Collimated(Rectangle(18.0, 12.0), profile="gaussian", radius_1e2=8.0),
+    PointSource(), PointSource((0.5, -1.0, 3.0), profile="uniform", half_angle=35.0),
+    PointSource((-1.0, 0.25, 0.0), profile="gaussian", half_angle_1e2=25.0), CollimatedSource(Circle(12.0)),
+    CollimatedSource(Rectangle(18.0, 12.0), profile="gaussian", radius_1e2=8.0),
 ])  # fmt: skip
 OUTLINES = st.sampled_from([SQUARE, Circle(9.0), Rectangle(18.0, 14.0)])
 
@@ -125,9 +125,9 @@ def test_a_mirrored_scene_lands_mirrored(depth, curvature, seed, axis):
     mirrored = replace(lens, back=replace(lens.back, heights=lens.back.heights.flip(k).contiguous()))
     points = uniform((2, 100), seed, -8.0, 8.0)
     place = [0.5, -0.75, 1.0]
-    landed = trace.trace(Point(tuple(place)).rays_through(*points, 15.0, 1.0), lens, LevelPlane(500.0))
+    landed = trace.trace(PointSource(tuple(place)).rays_through(*points, 15.0, 1.0), lens, LevelPlane(500.0))
     place[k], points[k] = -place[k], -points[k]
-    other = trace.trace(Point(tuple(place)).rays_through(*points, 15.0, 1.0), mirrored, LevelPlane(500.0))
+    other = trace.trace(PointSource(tuple(place)).rays_through(*points, 15.0, 1.0), mirrored, LevelPlane(500.0))
     assert torch.equal(landed.status, other.status)
     back = other.position.clone()
     back[k] = -back[k]

@@ -15,6 +15,7 @@ from bstcad.planning.tradeoff import Knob
 from bstcad.runs import environment
 from bstcad.runs.cluster import Cluster
 from bstcad.runs.processes import ExitStatus
+from tests import suite
 
 ROOT = Path(__file__).parent.parent.parent
 EFFORT = Effort(256)
@@ -22,6 +23,7 @@ SEED = (("tailoring.seed", 1),)
 REFUSED = (("lens.back.control_points", 3),)
 
 
+@suite.in_turn(0, 2)
 @pytest.mark.bench  # half a minute
 def test_a_sweep_of_cold_runs_measures_each_and_tells_why_one_failed(tiny, tmp_path, monkeypatch):
     """The base, which is run with another seed too, and a setting that is refused."""
@@ -124,6 +126,7 @@ def test_a_fault_of_a_thread_is_told():
 # --- on workers -------------------------------------------------------------------------------------------------------
 
 
+@suite.in_turn(1, 2)
 def test_a_worker_runs_the_command_as_this_machine_does(tiny):
     with (
         distributed.LocalCluster(

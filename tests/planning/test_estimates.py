@@ -16,6 +16,7 @@ from bstcad.planning.estimates import coarse_lens, diagnosis, left_out
 from bstcad.report.record import LEFT_OUT
 from bstcad.scene.scene import load
 from bstcad.tailoring.run import Hooks
+from tests import suite
 from tests.conftest import DISK, SMALL
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
@@ -42,7 +43,7 @@ def of(found):
     return diagnosis(scene, found.making, proof, found.goals[0].picture), found.making
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", suite.in_turns(SCENES, 3))
 def test_every_kind_of_design_has_one(name):
     found, making = of(pipeline.design(load(DISK, TINY | SCENES[name])))
     assert sum(part["error"] for part in found["remaining_error"]["parts"]) == pytest.approx(1)

@@ -22,6 +22,8 @@ from bstcad.planning.prediction import (
 )
 from bstcad.scene.scene import load
 from bstcad.scene.target import MIN_PIXELS
+from bstcad.tailoring import effort as efforts
+from tests import suite
 
 NET, PIXELS = "lens.back.control_points", "target.pixels"
 THU = load("templates/thu.toml")
@@ -33,7 +35,7 @@ def tiny(monkeypatch):
     """Pilots that take a second or so."""
     for name, value in TINY.items():
         monkeypatch.setattr(prediction, name, value)
-    monkeypatch.setattr("bstcad.tailoring.run.FINE_EFFORT", Effort(128, accuracy=0.0, witness=False))
+    monkeypatch.setattr(efforts, "FULL", replace(efforts.FULL, fine=Effort(128, accuracy=0.0, witness=False)))
 
 
 def pilot(scene, *, slower=1.0, factor=4.0):
@@ -128,7 +130,7 @@ def test_a_pilot_that_waited_for_the_compiler_is_designed_again(tiny, monkeypatc
     assert len(calls) == 3
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", suite.in_turns(SCENES, 3))
 def test_every_scene_is_predicted(name, tiny):
     template, changes = SCENES[name]
     scene = load(f"templates/{template}.toml", {"tailoring.quality": "draft"} | changes)

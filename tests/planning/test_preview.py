@@ -18,6 +18,7 @@ from bstcad.planning.preview import Outdated, PreviewSize, preview
 from bstcad.report.units import quantity
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
+from tests import suite
 from tests.planning.conftest import typical_pilot
 
 SMALL = {"tailoring.quality": "draft", "lens.back.control_points": 129, "target.pixels": 64}
@@ -34,7 +35,11 @@ BENCH = pytest.mark.bench
 
 
 @pytest.mark.parametrize(
-    ("name", "lit"), [("caustic_portrait", True), pytest.param("mirror", True, marks=BENCH), ("off_axis", False)]
+    ("name", "lit"),
+    [
+        *suite.in_turns([pytest.param("caustic_portrait", True), pytest.param("off_axis", False)], 2),
+        pytest.param("mirror", True, marks=BENCH),
+    ],
 )
 def test_a_preview_is_near_the_finished_draft(name, lit):
     """The light and the thickness are near; radius, slope and tool are not stated by so few points.
@@ -70,7 +75,7 @@ def test_a_preview_depends_on_the_scene_alone():
 @pytest.mark.parametrize(
     "name",
     [
-        "led", "two_pictures",
+        *suite.in_turns(["led", "two_pictures"], 2),
         *(pytest.param(name, marks=BENCH) for name in ("sun_caustic", "machinable_letters", "collimated_portrait")),
     ],
 )  # fmt: skip

@@ -159,6 +159,7 @@ def test_the_lens_turns_by_keys_buttons_and_mouse_and_comes_back(opened):
     assert changed(start, seen(page)) < 0.01 and page.said == []
 
 
+@pytest.mark.thorough
 def test_two_fingers_zoom_and_a_page_still_scrolls_under_one(opened):
     page = opened(has_touch=True, viewport={"width": 390, "height": 844})
     page.locator("canvas").scroll_into_view_if_needed()
@@ -347,6 +348,7 @@ def test_a_lens_drawn_anew_keeps_the_view_and_what_was_made_for_it(opened, bench
     assert changed(start, settled(page)) == 0 and page.said == []
 
 
+@pytest.mark.thorough
 def test_a_lens_comes_back_as_it_is_by_then_when_the_context_was_lost(opened, bench):
     page = opened(path=bench)
     page.evaluate("shown.look('way')")

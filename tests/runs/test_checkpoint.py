@@ -186,3 +186,10 @@ class TestKeeper:
         for _ in range(2):
             keeper.withdraw()
             assert list(path.parent.iterdir()) == []
+
+
+@pytest.mark.parametrize("array", [np.array([0.0, math.nan]), torch.tensor([math.inf], dtype=torch.float64)])
+def test_a_state_with_a_number_that_is_not_finite_is_refused(path, array):
+    checkpoint.write(path, PURPOSE, {**STATE, "single": array})
+    with pytest.raises(SceneError, match="is not a checkpoint of bstcad"):
+        checkpoint.read(path, dict)

@@ -15,6 +15,7 @@ import pytest
 from bstcad.designs.pipeline import DesignState
 from bstcad.runs import checkpoint, signals
 from bstcad.scene.scene import load
+from tests import suite
 from tests.conftest import DISK, SMALL
 
 ROOT = Path(__file__).parent.parent.parent
@@ -63,7 +64,7 @@ def _heard():
 
 
 @pytest.mark.bench
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", suite.in_turns([signal.SIGTERM, signal.SIGHUP], 2))
 def test_in_the_middle_it_flushes_a_checkpoint_and_resume_goes_on(number, scene, tmp_path):
     """The signal comes from `kill`, a supervisor or a closed terminal, the last to every process of the group."""
     stopped = generate(scene, tmp_path / "lens")

@@ -101,7 +101,7 @@ def test_a_target_of_directions_is_changed_and_written(scene, tmp_path):
     assert over.target.unit == "degrees" and "\nz = " not in over.toml().partition("[target]")[2].partition("[")[0]
     assert bstcad.load(saved(over, tmp_path / "over")) == over
     plane = over.changed({"target.kind": "plane", "target.z": 500.0, "target.angles": None})
-    assert plane.target.screen.plane.is_level
+    assert plane.target.screen.receiver.is_level
     with pytest.raises(SceneError, match=r"^target\.z: "):
         over.changed({"target.kind": "plane", "target.angles": None})
     file = str(tmp_path / "wanted.ldt")
@@ -145,8 +145,8 @@ def test_rays_give_size_flux_and_light_and_are_copied(ray_scene, tmp_path):
         (0.0, 0.0, -20.0), abs=0.1
     ) and "3000 rays of led.tm25ray" in source.words(0)
     again = bstcad.load(saved(ray_scene, tmp_path / "copy"))
-    assert again == ray_scene and again.draw.largest_side == ray_scene.draw.largest_side
-    [one], [other] = (scene.draw(8, 5) for scene in (ray_scene, again))
+    assert again == ray_scene and again.sampler.largest_side == ray_scene.sampler.largest_side
+    [one], [other] = (scene.sampler(8, 5) for scene in (ray_scene, again))
     assert np.array_equal(one.source.order.order, other.source.order.order) and one.source.part == other.source.part
     assert ray_scene.changed({"source.lumens": 70.0}).source.luminous_flux == 70.0
     assert not any("rays" in doubt for doubt in ray_scene.warnings())
@@ -171,7 +171,7 @@ def test_a_lamp_whose_rays_start_at_a_point_has_a_preview(ray_scene, tmp_path):
     rays = replace(rays_of(20_000), position=np.zeros((20_000, 3), np.float32))
     (tmp_path / "point.tm25ray").write_bytes(tm25.write(rays, Luminaire()))
     scene = ray_scene.changed({"source.rays": str(tmp_path / "point.tm25ray")})
-    assert scene.source.extent is None and scene.draw is not None
+    assert scene.source.extent is None and scene.sampler is not None
     seen = preview(scene, PreviewSize(pixels=24, net=17, tubes=36, rounds=1, evaluations=2, blurred=1))
     assert all(np.isfinite(picture).all() for pictures in seen.pictures for picture in pictures)
 

@@ -188,7 +188,7 @@ def test_the_wheel_holds_the_templates_and_what_is_beside_the_code(tmp_path):
     names = set(zipfile.ZipFile(built).namelist())
     assert {f"bstcad/templates/{name}.toml" for name in TEMPLATES} < names
     assert "bstcad/templates/flanged_lens.py" in names and "bstcad/report/report.html.j2" in names
-    assert {f"bstcad/scene/{name}" for name in ("lights.toml", "plate.toml.j2", "schema.json")} < names
+    assert {f"bstcad/scene/{name}" for name in ("lights.toml", "plate.toml.j2")} < names
     code = {path.relative_to(ROOT).as_posix() for path in (ROOT / "bstcad").rglob("*.py")}
     assert code < names and not any(name.startswith("tests") for name in names)
     with zipfile.ZipFile(built) as archive:

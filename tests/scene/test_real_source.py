@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.surfaces import Plane
@@ -22,7 +22,7 @@ SCREENS = [Screen(z, (-20.0, 20.0), (-20.0, 20.0), 80) for z in (206.0, 406.0)] 
 
 @pytest.mark.parametrize(("real", "degrees"), [(0.3, 0.3), (None, 0.1)])
 def test_the_image_of_parallel_light_is_its_divergence_times_the_distance(real, degrees):
-    source = Collimated(Circle(4.0), real_divergence=real)
+    source = CollimatedSource(Circle(4.0), real_divergence=real)
     size = real_size(source)
     assert size.assumed is (real is None) and size.size == degrees
     found = image_diameters(size, Channel(source, 1.5), PLATE, SCREENS)
@@ -31,9 +31,9 @@ def test_the_image_of_parallel_light_is_its_divergence_times_the_distance(real, 
 
 
 def test_a_lamp_has_a_diameter_and_a_simulated_size_is_not_counted_twice():
-    lamp = Point((0.0, 0.0, -100.0), profile="uniform", half_angle=4.0, real_diameter=2.0)
+    lamp = PointSource((0.0, 0.0, -100.0), profile="uniform", half_angle=4.0, real_diameter=2.0)
     size = real_size(lamp)
     [found] = image_diameters(size, Channel(lamp, 1.5), PLATE, SCREENS[:1])
     assert found == pytest.approx(2.0 * 200 / 104 / 0.5, rel=0.05)  # 6 mm of glass count as 4; a disc seen at a slant
-    assert real_size(Point((0.0, 0.0, -100.0), profile="uniform", half_angle=4.0, diameter=1.0)) is None
+    assert real_size(PointSource((0.0, 0.0, -100.0), profile="uniform", half_angle=4.0, diameter=1.0)) is None
     assert torch.isclose(sum(torch.tensor(c.weight) for c in size.channels(Channel(lamp, 1.5))), torch.tensor(1.0))

@@ -1,6 +1,7 @@
 """Scenes: what a file or a script says is what the engine gets, and a scene goes through its file unchanged."""
 
 import math
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from bstcad.scene.blank import Back, LensBlank
 from bstcad.scene.errors import SceneError, line_of, toml_positions
 from bstcad.scene.fronts import PlaneFront, SphereFront
 from bstcad.scene.lamp import Point
-from bstcad.scene.mount import LENS_COLOUR, MIRROR_COLOUR, Box, Part, Round
+from bstcad.scene.mount import LENS_COLOUR, MIRROR_COLOUR, Box, CircleRim, Part
 from bstcad.scene.picture import Picture
 from bstcad.scene.quality import PRESETS, VERIFICATION_POINTS, Tailoring, coarse_to_fine
 from bstcad.scene.scene import Scene, load
@@ -410,14 +411,14 @@ def test_a_ghost_brings_the_reflections_of_its_faces_by_the_coating_that_is_name
 
 @pytest.mark.parametrize("quality", PRESETS)
 def test_every_knob_gets_a_value(quality):
-    knobs = Tailoring(quality=quality).resolved(513)
-    assert {key for key, value in knobs.model_dump().items() if value is None} == {"accuracy", "max_time", "solution"}
-    assert knobs.levels == (33, 129, 513)
+    settings = Tailoring(quality=quality).resolved(513)
+    assert {key for key, value in asdict(settings).items() if value is None} == {"accuracy", "max_time", "solution"}
+    assert settings.levels == (33, 129, 513)
     each_way = 2**0.5 if quality == "draft" else 2  # rays a control cell: at least two
-    assert knobs.rays >= each_way * 513 and knobs.stage2_iterations > 0
+    assert settings.rays >= each_way * 513 and settings.stage2_iterations > 0
     assert Tailoring(quality=quality, method="integration").resolved(65).stage2_iterations == 0
-    knobs = Tailoring(quality=quality, rays=300, levels=(9, 65), rounds=2).resolved(65)  # the scene goes before
-    assert (knobs.rays, knobs.levels, knobs.rounds) == (300, (9, 65), 2)
+    settings = Tailoring(quality=quality, rays=300, levels=(9, 65), rounds=2).resolved(65)  # the scene goes before
+    assert (settings.rays, settings.levels, settings.rounds) == (300, (9, 65), 2)
 
 
 @pytest.mark.parametrize(("quality", "m", "cells"), [
@@ -436,8 +437,8 @@ def test_levels_grow_to_the_net_asked_for():
 def test_a_target_that_is_tilted_by_nothing_is_level():
     level, tilted = load(THU), load(THU, {"target.tilt": "[0, 0]"})
     assert level == tilted and level.toml() == tilted.toml() and "tilt" not in level.toml()
-    assert level.target.screen.plane == LevelPlane(1000.0)
-    plane = load(THU, {"target.tilt": "[0, 40.5]"}).target.screen.plane
+    assert level.target.screen.receiver == LevelPlane(1000.0)
+    plane = load(THU, {"target.tilt": "[0, 40.5]"}).target.screen.receiver
     assert plane == TiltedPlane((200.0, 200.0, 1000.0), (0.0, 40.5))
 
 
@@ -449,7 +450,7 @@ def test_a_tilted_plane_passes_the_lens_by_so_much(outline, tilt):
     scene = scene.changed({"lens.outline": outline})
     turns = np.linspace(0.0, 2 * np.pi, 3601)
     rim = (12.0 * np.cos(turns), 12.0 * np.sin(turns)) if outline.is_round else outline.rim_points()
-    highest = max(scene.target.screen.plane.height((x, y, 25.0)) for x, y in zip(*rim, strict=True))
+    highest = max(scene.target.screen.receiver.height((x, y, 25.0)) for x, y in zip(*rim, strict=True))
     room, key = scene.clearance(25.0)
     assert room == pytest.approx(-highest, rel=1e-5) and key == "target.z"
 
@@ -470,7 +471,7 @@ def test_a_part_is_of_the_lens_s_material_unless_the_scene_says_another(path, ch
 
 
 @pytest.mark.parametrize("outline", [
-    Round(shape="circle", diameter=7.0),
+    CircleRim(shape="circle", diameter=7.0),
     Box(shape="rectangle", width=8.0, height=6.0),
     Box(shape="rectangle", width=8.0, height=6.0, corner_radius=1.5),
 ])  # fmt: skip

@@ -14,7 +14,7 @@ from bstcad import commands
 from bstcad.analysis.shape import describe
 from bstcad.designs.folder import scene_files
 from bstcad.designs.pipeline import DesignState, purpose
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.surfaces.key import Key
 from bstcad.report.prescription import prescription
 from bstcad.runs import checkpoint, files
@@ -38,7 +38,7 @@ TableFile = Annotated[Table, *from_file(Table, lambda path: Table(path.name, pat
 
 
 @dataclass(frozen=True)
-class Lamp(Point):
+class Lamp(PointSource):
     """A point source with a table of intensities."""
 
     table: Annotated[TableFile | None, Key("The intensities.")] = None

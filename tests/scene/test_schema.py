@@ -84,9 +84,15 @@ def test_an_unknown_key_ends_with_2_and_the_nearest(capsys):
         assert said.startswith(f"bstcad: {asked}: unknown key; {words}") and said.count("\n") == 1
 
 
-def test_the_kept_schema_is_that_of_the_models(capsys):
-    """After a change of a model: python -m bstcad.scene.scene."""
+def test_the_kept_schema_is_that_of_the_models_and_is_made_again(monkeypatch, capsys):
+    """Under the hash of another version, or damaged, it is made again; it is read without its records."""
     assert schema.of_model(Scene) == schema.schema()
+    [kept] = (Path(schema.__file__).parent / "__pycache__").glob("schema-*.json")
+    kept.write_text("{")
+    text = schema.schema_text()
+    assert json.loads(text) == schema.schema() and kept.read_text() == text
+    monkeypatch.setattr(schema.subprocess, "run", None)
+    assert schema.schema_text() == text
     assert cli.run(["schema"]) == 0
     assert json.loads(capsys.readouterr().out) == schema.schema()
 

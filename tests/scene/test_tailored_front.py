@@ -126,7 +126,7 @@ def test_a_net_in_proportion_has_its_share_of_spans(net, of, to, found):
 def test_the_flat_lens_has_two_flat_nets_in_proportion(disk, points, final, coarse):
     scene = with_front(disk, **({} if points is None else {"control_points": points}))
     whole, first = scene.flat_lens(65), scene.flat_lens(33, as_wide_as=65)
-    assert whole.freeform == (0, 1) and whole.nets == (whole.front, whole.back)
+    assert whole.tailored_numbers == (0, 1) and whole.nets == (whole.front, whole.back)
     assert whole.front.shape == final and first.front.shape == coarse and first.back.shape == (33, 33)
     assert whole.front.z == 15.0 and not whole.front.heights.any() and whole.front.heights.dtype == torch.float64
     assert (first.front.x, first.front.y) == (whole.front.x, whole.front.y)  # as wide as the last
@@ -138,9 +138,9 @@ def test_the_flat_lens_has_two_flat_nets_in_proportion(disk, points, final, coar
 
 def test_the_front_may_be_tailored_alone(disk):
     lens = with_front(disk, {"lens.back.optimise": False}).flat_lens(33)
-    assert lens.freeform == (0,) and lens.nets == (lens.front,) and lens.last_freeform.surface is lens.front
+    assert lens.tailored_numbers == (0,) and lens.nets == (lens.front,) and lens.last_tailored.surface is lens.front
     assert lens.back.is_net and not lens.back.heights.any()
-    assert disk.flat_lens(33).freeform == (1,) and disk.flat_lens(33).front == disk.lens.front.surface
+    assert disk.flat_lens(33).tailored_numbers == (1,) and disk.flat_lens(33).front == disk.lens.front.surface
 
 
 def test_a_back_whose_net_is_chosen_later_has_a_front_beside_it(disk):
@@ -178,7 +178,7 @@ def test_both_nets_of_a_design_come_back_to_the_last_bit(disk, points, only_fron
         (tmp_path / name).write_bytes(data)
     folders.write_design(design, (), tmp_path)
     again, nominal = folders.read_nominal(tmp_path)
-    assert again == scene and nominal.lens.freeform == lens.freeform
+    assert again == scene and nominal.lens.tailored_numbers == lens.tailored_numbers
     for one, other in ((lens.front, nominal.lens.front), (lens.back, nominal.lens.back)):
         assert np.array_equal(one.control_points(), other.control_points())
     read = folders.Made(again, nominal.lens, nominal.goals)

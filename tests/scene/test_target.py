@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageOps
 
+from bstcad.optics.receivers.irradiance import overlap
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.scene.errors import SceneError
 from bstcad.scene.picture import Picture
-from bstcad.scene.target import Target, drawing, inside, overlap, shown_size
+from bstcad.scene.target import Target, drawing, inside, shown_size
 
 F = np.zeros((16, 16), np.uint8)  # stem at the left, bars to the right of it, the upper one longer and at the top
 F[2:14, 4:6] = F[2:4, 4:13] = F[7:9, 4:10] = 255

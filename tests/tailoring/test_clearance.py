@@ -12,17 +12,17 @@ import torch
 from bstcad.analysis.shape import thickness_range
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.bspline import QUARTERS, BSplineSurface
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Sphere
-from bstcad.scene.blank import Bounds
 from bstcad.tailoring import machinability
 from bstcad.tailoring.clearance import PENALTY_MARGIN, CellGrid, clearance, unit
 from bstcad.tailoring.machinability import active_bounds, enforce_bounds, excess
 from bstcad.tailoring.merit import Merit
+from bstcad.tailoring.settings import Bounds
 from bstcad.tailoring.stage2 import Problem
 from tests.lenses import half_over, net
 
@@ -43,11 +43,11 @@ def random(shape, seed):
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def rough(outline=WHOLE, shaped=(0, 1)):
+def rough(outline=WHOLE, tailored=(0, 1)):
     """Two random nets of different sizes, 3 mm apart."""
     front = BSplineSurface(0.0, 0.7 * random((7, 12), 1), (-2.0, 2.0), (-3.0, 3.0))
     back = BSplineSurface(3.0, 0.7 * random((9, 8), 0), (-2.2, 2.1), (-3.0, 3.0))
-    return Lens(front, back, outline, 1.5, shaped=shaped)
+    return Lens(front, back, outline, 1.5, tailored=tailored)
 
 
 def thickness(lens, x, y):
@@ -56,11 +56,11 @@ def thickness(lens, x, y):
 
 @OUTLINES
 @pytest.mark.parametrize("name", BOUNDS)
-@pytest.mark.parametrize("shaped", [(0, 1), (0,)], ids=("both", "front"))
-def test_the_gradients_are_those_of_finite_differences(shaped, name, outline):
-    lens, bounds, step = rough(outline, shaped), BOUNDS[name], 1e-6
+@pytest.mark.parametrize("tailored", [(0, 1), (0,)], ids=("both", "front"))
+def test_the_gradients_are_those_of_finite_differences(tailored, name, outline):
+    lens, bounds, step = rough(outline, tailored), BOUNDS[name], 1e-6
     found = excess(lens, bounds)
-    assert found.worst > 0 and len(found.gradients) == len(shaped)
+    assert found.worst > 0 and len(found.gradients) == len(tailored)
     for k, gradient in enumerate(found.gradients):  # of each net by itself
         way = random(gradient.shape, 2)
         up, down = (
@@ -107,8 +107,8 @@ def test_a_tool_sees_the_valleys_of_a_sphere_from_its_own_side(curvature):
     """z = κ r² / 2 + …, κ = ±1 / 25 mm: on the back a valley if κ > 0, on the front, which bulges out then, a ridge."""
     ball = BSplineSurface.fitted(Sphere(0.0, curvature), (-8.0, 8.0), (-8.0, 8.0), 65)  # the fit waves at its ends
     flat = replace(ball, heights=torch.zeros_like(ball.heights))
-    front, back = Lens(ball, flat.moved(9.0), WHOLE, 1.5, shaped=(0, 1)), Lens(flat, ball.moved(9.0), WHOLE, 1.5)
-    for lens, valley in ((front, curvature < 0), (replace(back, shaped=(0, 1)), curvature > 0)):
+    front, back = Lens(ball, flat.moved(9.0), WHOLE, 1.5, tailored=(0, 1)), Lens(flat, ball.moved(9.0), WHOLE, 1.5)
+    for lens, valley in ((front, curvature < 0), (replace(back, tailored=(0, 1)), curvature > 0)):
         for bounds, met in ((Bounds(concave=0.039), not valley), (Bounds(convex=0.039), valley)):
             worst = excess(lens, bounds).worst
             # a step from span to span
@@ -118,33 +118,33 @@ def test_a_tool_sees_the_valleys_of_a_sphere_from_its_own_side(curvature):
 
 def test_only_a_tailored_front_needs_a_bound_where_none_is_asked():
     asked = Bounds(slope=0.5, thinnest=0.3)
-    both, front, back = (rough(shaped=shaped) for shaped in ((0, 1), (0,), None))
-    assert [lens.shapes("front") for lens in (both, front, back)] == [True, True, False]
+    both, front, back = (rough(tailored=tailored) for tailored in ((0, 1), (0,), None))
+    assert [lens.is_tailored("front") for lens in (both, front, back)] == [True, True, False]
     assert active_bounds(both, None, 0.5) == active_bounds(front, None, 0.5) == Bounds(thinnest=0.5)
     assert active_bounds(back, None, 0.5) is None
     assert active_bounds(back, asked, 0.5) == active_bounds(both, asked, 0.5) == asked
-    assert not replace(both, reflects=True, shaped=None).shapes("front")
+    assert not replace(both, reflects=True, tailored=None).is_tailored("front")
 
 
-def crossing(outline, z=3.0, sides=(33, 21), shaped=(0, 1)):
+def crossing(outline, z=3.0, sides=(33, 21), tailored=(0, 1)):
     """Both faces bulge into the glass and would cross on the axis, where they stand 3.6 mm towards each other."""
     nets = [
         net(lambda x, y, sag=sag: sag * torch.exp(-(x**2) - y**2), plane, m, half_over(outline, m))
         for m, plane, sag in ((sides[0], 0.0, 1.8), (sides[1], z, -1.8))
     ]
-    return Lens(*nets, outline, 1.5, shaped=shaped)
+    return Lens(*nets, outline, 1.5, tailored=tailored)
 
 
 @pytest.mark.parametrize("outline", [Rectangle(8.0, 8.0), Circle(4.0)], ids=("square", "round"))
-@pytest.mark.parametrize("shaped", [(0, 1), (0,)], ids=("both", "front"))
-def test_faces_that_would_cross_make_way_for_each_other(shaped, outline):
-    lens, bounds = crossing(outline, shaped=shaped), Bounds(thinnest=0.5)
+@pytest.mark.parametrize("tailored", [(0, 1), (0,)], ids=("both", "front"))
+def test_faces_that_would_cross_make_way_for_each_other(tailored, outline):
+    lens, bounds = crossing(outline, tailored=tailored), Bounds(thinnest=0.5)
     assert thickness_range(lens)[0] < 0
     found = enforce_bounds(lens, bounds)
     assert 0.5 <= thickness_range(found)[0] < 0.52  # bent no further than it takes
     assert found.back.z == lens.back.z  # no move
     for k, (after, before) in enumerate(zip((found.front, found.back), (lens.front, lens.back), strict=True)):
-        assert torch.equal(after.heights, before.heights) == (k not in shaped)
+        assert torch.equal(after.heights, before.heights) == (k not in tailored)
 
 
 def test_a_lens_with_room_stays_as_it_is():
@@ -170,7 +170,7 @@ def test_both_faces_are_bent_to_all_bounds():
 def test_the_merit_of_two_faces_has_the_penalty_in_both():
     lens = crossing(Rectangle(8.0, 8.0), z=3.7)
     screen = Screen(120.0, (-12.1, 12.0), (-12.2, 12.1), 16)
-    beam = Channel(Collimated(Rectangle(7.0, 7.0)), 1.5)
+    beam = Channel(CollimatedSource(Rectangle(7.0, 7.0)), 1.5)
     merit = Merit.of((beam,), lens, 40, [Goal("target", screen, np.ones(screen.shape))], 0.03)
     bounds = active_bounds(lens, None, 0.5)
     free, bound = Problem(lens, merit), Problem(lens, merit, bounds, 100.0)

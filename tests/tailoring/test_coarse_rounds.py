@@ -15,6 +15,7 @@ from bstcad.scene.scene import Scene
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.merit import CoarseVariable
 from bstcad.tailoring.run import BEST_LENS_STAGE, Hooks
+from tests import suite
 
 LATER = DesignOptions(compare_later=True)
 SIDE = {"shape": "rectangle", "width": 60.0, "height": 60.0}
@@ -42,7 +43,7 @@ def near():
 def rrmsd(made):
     """RRMSD by rays of its own."""
     [goal] = made.goals
-    return measure(made.lens, made.scene.channels(), goal.receiver, goal.picture, Effort(512, witness=False)).rrmsd
+    return measure(made.lens, made.scene.channels(), goal.screen, goal.picture, Effort(512, witness=False)).rrmsd
 
 
 def names(made):
@@ -60,6 +61,7 @@ def made(states):
     return design(near(), device="cpu", hooks=Hooks(save=states.append), options=LATER)
 
 
+@suite.in_turn(1, 2)
 def test_they_bring_light_far(made, monkeypatch):
     assert [name[:18] for name in names(made)] == ["stage 2, 32 pixels", "stage 2, 128² tube"]
     monkeypatch.setattr(stage2, "FAR_OFF_RRMSD", float("inf"))
@@ -68,11 +70,12 @@ def test_they_bring_light_far(made, monkeypatch):
     assert rrmsd(made) < 0.4 * rrmsd(without)
 
 
+@suite.in_turn(0, 2)
 def test_a_stage_hands_on_its_best_lens(monkeypatch):
     """A stage that ends with a round on 32 pixels, by which a letter on 64 pixels gets worse."""
 
     def steps(task, lens, state=None):
-        coarse, [(tubes, evaluations)] = stage2.coarse_rounds(task, lens), stage2.sheet_sizes(task.knobs)
+        coarse, [(tubes, evaluations)] = stage2.coarse_rounds(task, lens), stage2.sheet_sizes(task.settings)
         return stage2.run_rounds((*coarse, stage2.TubeRound(task, tubes, evaluations), *coarse[-1:]), lens, state)
 
     monkeypatch.setitem(pipeline.PROCEDURES, "least-squares", ("stage 1", stage1.steps, steps))
@@ -84,6 +87,7 @@ def test_a_stage_hands_on_its_best_lens(monkeypatch):
     assert rrmsd(made) == pytest.approx(judged[BEST_LENS_STAGE], rel=0.05)
 
 
+@suite.in_turn(1, 2)
 def test_a_design_goes_on_from_within_them(made, states):
     within = [s for s in states if getattr(s.second, "position", None) and s.second.position.round == 0]
     assert within

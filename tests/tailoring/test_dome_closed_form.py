@@ -19,7 +19,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.sphere_light import SphereLight
 from bstcad.optics.receivers.directions import Directions
 from bstcad.optics.receivers.goal import Goal
@@ -32,6 +32,7 @@ from bstcad.optics.trace import trace
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.slope_map import Solver
 from bstcad.tailoring.stage1 import COARSE_FACE_FIT, FINE_FACE_FIT
+from tests import suite
 
 N, R, INNER = 1.4936, 15.0, 8.0  # index, radii in mm
 CONE, DISC = math.radians(80.0), math.radians(50.0)  # half angles Θ and Φ
@@ -86,7 +87,7 @@ def interpolated(rho, m):
 
 def light(profile):
     """Return the lamp over the chart."""
-    return SphereLight(Point((0.0, 0.0, 0.0), profile=profile, half_angle=math.degrees(CONE)), 0.0, CHART, CONE)
+    return SphereLight(PointSource((0.0, 0.0, 0.0), profile=profile, half_angle=math.degrees(CONE)), 0.0, CHART, CONE)
 
 
 def lens_of(dome):
@@ -108,7 +109,7 @@ def disc(pixels, parts=16):
 def error_of_picture(lens, profile, rays, pixels=24):
     """Return the RRMSD of the light of rays x rays rays from an even disc."""
     goal = disc(pixels)
-    made, *_ = trace.simulate_plain([(1.0, light(profile), lens, 1)], [goal.receiver], rays)
+    made, *_ = trace.simulate_plain([(1.0, light(profile), lens, 1)], [goal.screen], rays)
     off = (made.box / made.box.sum()).numpy() - goal.picture
     return math.sqrt((off**2).sum() / (goal.picture**2).sum()), made.flux
 
@@ -135,7 +136,7 @@ def by_rounds(profile, m, plan):
     """Return the lens after rounds of stage 1 from a sphere; plan: cells of the transport map and fit of each."""
     goal, lens, source = disc(256), lens_of(flat_dome(m)), light(profile)
     per_degree = RIM / math.degrees(DISC)
-    slopes = SimpleNamespace(face_points=tuple(p * per_degree for p in slope_map.pixel_corners(goal.receiver)))
+    slopes = SimpleNamespace(face_points=tuple(p * per_degree for p in slope_map.pixel_corners(goal.screen)))
     for cells, fit in plan:
         window = slope_map.lit_window(source, lens)
         grid = slope_map.square_grid(source, lens, window, cells)
@@ -144,6 +145,7 @@ def by_rounds(profile, m, plan):
     return lens
 
 
+@suite.in_turn(0, 2)
 @pytest.mark.parametrize(("profile", "finest", "at_rim"), [
     ("uniform", 128, 1e-4), pytest.param("lambertian", 256, 2e-4, marks=pytest.mark.bench),
 ])  # fmt: skip

@@ -58,7 +58,7 @@ def even(receiver):
 def lit(scene):
     """The light of a scene's design, with its errors by cell."""
     made = pipeline.design(scene)
-    [light] = measure_goals(made.lens.plain(), scene.channels(), made.goals, EFFORT, ghost=None, draw=None)
+    [light] = measure_goals(made.lens.plain(), scene.channels(), made.goals, EFFORT, ghost=None, sampler=None)
     return made.goals[0], light, {each.cell: each.rrmsd for each in light.by_cell}
 
 
@@ -99,7 +99,7 @@ def test_the_cells_of_a_pixel_have_its_light(picture, rotate):
         sums = fine.picture.reshape(rows, cells, columns, cells).sum((1, 3))
         assert np.abs(sums - goal.picture).max() < 1e-6 * goal.picture.max()  # quadrature of the super-Gaussian
         assert fine.picture.min() >= 0
-        assert fine.receiver.shape == fine.picture.shape
+        assert fine.screen.shape == fine.picture.shape
 
 
 @pytest.mark.parametrize("shares", [(1.0,), (0.8, 0.2), (0.7, 0.2, 0.1)])
@@ -167,7 +167,7 @@ def test_only_convex_targets_without_detail_are_held_from_folding():
 def test_light_may_fold_at_the_border():
     """A square of light with one overturned column of tubes, in the middle of the target or at its border."""
     goal = goal_of("uniform")
-    (left, right), (below, above) = goal.receiver.x, goal.receiver.y
+    (left, right), (below, above) = goal.screen.x, goal.screen.y
     y = torch.linspace(below, above, 41, dtype=torch.float64)
     found = {}
     for place, column in (("middle", 20), ("border", 1)):

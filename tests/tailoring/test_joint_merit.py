@@ -7,17 +7,17 @@ import torch
 
 from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.numerics import ops
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen
-from bstcad.scene.blank import Bounds
 from bstcad.tailoring.machinability import excess
 from bstcad.tailoring.merit import Merit
+from bstcad.tailoring.settings import Bounds
 from bstcad.tailoring.stage2 import Problem
 from tests.tailoring.test_two_faces import BEAM, WAVES, N, bumpy, goals_of, merit_of, picture
 
-POINT = Point((0.5, 0.0, -300.0), half_angle=1.2, wavelength=600.0)
+POINT = PointSource((0.5, 0.0, -300.0), half_angle=1.2, wavelength=600.0)
 OBLONG = Screen(30.0, (-9.0, 9.0), (-6.0, 6.0), (24, 16))
 LEANING = Screen(60.0, (-9.0, 9.0), (-9.0, 9.0), 24, tilt=(10.0, -15.0))
 # mm.  Where corners cross pixel borders the merit gets another second derivative: for single control points the

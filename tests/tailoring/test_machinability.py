@@ -17,11 +17,11 @@ from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
 from bstcad.report import record
-from bstcad.scene.blank import Bounds
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.tailoring.machinability import RELIEF_RESERVE, enforce_bounds, excess, place_back
-from tests import lenses
+from bstcad.tailoring.settings import Bounds
+from tests import lenses, suite
 from tests.conftest import DISK, SMALL, quick_effort
 
 PLACE = r"at \([-\d.e]+, [-\d.e]+\) mm"
@@ -117,6 +117,7 @@ def test_each_bound_is_kept_to_where_the_free_lens_does_not(asked, kept_to, free
     assert not kept_to(free.lens) and kept_to(enforce_bounds(free.lens, load(DISK, TINY | asked).lens.bounds))
 
 
+@pytest.mark.thorough
 def test_a_design_keeps_to_a_range_of_thickness():
     coarse = {"lens.back.control_points": 17, "tailoring.rays": 64, "tailoring.rounds": 1}
     asked = {"tailoring.stage2_iterations": 3, "lens.min_thickness": 9.9, "lens.max_thickness": 10.0}
@@ -124,6 +125,7 @@ def test_a_design_keeps_to_a_range_of_thickness():
     assert 9.9 <= found["thickness_min"] <= found["thickness_max"] <= 10.0
 
 
+@suite.in_turn(0, 2)
 def test_a_bound_that_no_lens_meets_with_its_light_on_the_target_is_refused():
     aside = {"target.x": [60.0, 100.0], "target.y": [-20.0, 20.0], "target.outline": None, "lens.max_slope": 0.001}
     scene = load(DISK, TINY | {"tailoring.rounds": 2}).changed(aside)
@@ -138,6 +140,7 @@ def test_where_bending_does_not_help_the_back_gets_flatter():
     assert excess(lens, bounds).worst < 0 and float(lens.back.heights.std()) < 0.01
 
 
+@suite.in_turn(1, 2)
 def test_a_front_that_no_flat_back_clears_is_refused():
     lens = replace(rough(), front=Sphere(0.0, 0.2))
     with pytest.raises(SceneError, match=r"^lens\.max_thickness: "):

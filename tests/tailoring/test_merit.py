@@ -9,7 +9,7 @@ import torch
 
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.outlines import Rectangle
@@ -138,7 +138,7 @@ def test_steps_are_longer_where_the_picture_is_dark():
     lens = Lens(Plane(10.0), FLAT, Rectangle(16.0, 16.0), 1.5)
     picture = np.where(np.arange(64) < 32, 0.2, 1.8) * np.ones((48, 1))
     screen = Screen(100.0, (-8.0, 8.0), (-8.0, 8.0), (64, 48))
-    weight = local_weight(Collimated(Rectangle(16.0, 16.0)), lens, [Goal("target", screen, picture)])
+    weight = local_weight(CollimatedSource(Rectangle(16.0, 16.0)), lens, [Goal("target", screen, picture)])
     dark, bright = weight[4:12, 4:-4], weight[-12:-4, 4:-4]  # x along the first axis
     assert float(bright.mean()) == pytest.approx(1.8**-0.5, rel=5e-3)
     assert float(dark.mean()) == pytest.approx(0.2**-0.5, rel=5e-3)
@@ -149,7 +149,7 @@ def test_black_and_unlit_parts_have_a_bounded_weight():
     picture = np.zeros((64, 64))
     picture[10, 10] = 1.0
     goal = Goal("target", Screen(100.0, (-8.0, 0.0), (-8.0, 8.0), 64), picture)
-    weight = local_weight(Collimated(Rectangle(16.0, 16.0)), lens, [goal])
+    weight = local_weight(CollimatedSource(Rectangle(16.0, 16.0)), lens, [goal])
     assert float(weight.max()) == merit.MAX_LOCAL_WEIGHT and float(weight.min()) >= 1 / merit.MAX_LOCAL_WEIGHT
     assert float(weight[-8:].mean()) == pytest.approx(1.0, abs=1e-6)  # what lands beside the screen
 

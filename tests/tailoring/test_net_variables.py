@@ -8,8 +8,8 @@ import torch
 
 from bstcad.analysis.shape import slope_octaves
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.outlines import Rectangle
@@ -18,7 +18,7 @@ from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.net_variables import NetVariables, along_light
 from tests.lenses import net
 
-BEAM, POINT = Collimated(aperture=Rectangle(16.0, 16.0)), Point((1.0, 0.0, -80.0), half_angle=5.0)
+BEAM, POINT = CollimatedSource(aperture=Rectangle(16.0, 16.0)), PointSource((1.0, 0.0, -80.0), half_angle=5.0)
 SCREENS = [Screen(30.0, (-9.0, 9.0), (-9.0, 9.0), 8), Screen(70.0, (-9.0, 9.0), (-9.0, 9.0), 8)]
 GOALS = [Goal(f"target[{k}]", screen, np.full((8, 8), 1 / 64)) for k, screen in enumerate(SCREENS)]
 
@@ -30,14 +30,14 @@ def surface(z, sag, m):
 def lens_of(m=97, back=65):
     front = surface(0.0, lambda x, y: 0.004 * (x * x + y * y) + 0.05 * torch.cos(x / 4) * torch.cos(y / 3), m)
     last = surface(12.0, lambda x, y: -0.006 * (x * x + 2 * y * y) + 0.06 * torch.sin(x / 3) * torch.cos(y / 4), back)
-    return Lens(front, last, Rectangle(22.0, 22.0), 1.5, shaped=(0, 1))
+    return Lens(front, last, Rectangle(22.0, 22.0), 1.5, tailored=(0, 1))
 
 
 def traced(source, lens, q):
     rays = source.rays_through(q[0], q[1], lens.entrance.z, 1.0)
     for interface in lens.unbounded().interfaces:
         rays = behind(rays, interface)
-    return [screen.plane.land(rays).position for screen in SCREENS]
+    return [screen.receiver.land(rays).position for screen in SCREENS]
 
 
 def jacobian(places, step):
@@ -83,7 +83,7 @@ def test_where_rays_cross_in_the_glass_the_back_gets_no_ripple():
     """There q(b) is many-valued; the carried change is smooth all the same: it falls off towards the highest octave."""
     m = 97
     front = surface(0.0, lambda x, y: 0.004 * (x * x + y * y) + 0.25 * torch.cos(x / 0.8) * torch.cos(y / 0.8), m)
-    lens = Lens(front, lens_of().back, Rectangle(22.0, 22.0), 1.5, shaped=(0, 1))
+    lens = Lens(front, lens_of().back, Rectangle(22.0, 22.0), 1.5, tailored=(0, 1))
     places = torch.meshgrid(*[torch.linspace(-6, 6, 97).double()] * 2, indexing="ij")
     within = behind(BEAM.rays_through(*places, 0.0, 1.0), lens.unbounded().interfaces[0])
     there = within.position[:2] + (12.0 - within.above(0.0)) * within.direction[:2] / within.direction[2]

@@ -11,7 +11,7 @@ from bstcad import cli
 from bstcad.designs.pipeline import design, reachable_part
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.optics.surfaces.surfaces import Plane
@@ -20,6 +20,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.tailoring.grazing import Grazing
 from bstcad.tailoring.run import Edge
+from tests import suite
 from tests.conftest import draws_nothing, quick_effort, verify_with
 
 SCENE = """
@@ -126,6 +127,7 @@ def test_refuse_names_angle_and_remedy(wide, capsys):
     assert not (wide.parent / "out").exists()
 
 
+@suite.in_turn(1, 2)
 def test_each_of_several_targets_is_cut_to_what_light_can_reach(wide):
     """A small target near by, which light reaches whole, and the wide one behind it, of which it reaches a disc."""
     text = wide.read_text()
@@ -149,7 +151,7 @@ def test_the_pull_is_zero_up_to_its_angle_and_falls_with_its_gradient():
         slope = math.tan(math.asin(math.sin(math.radians(leaving)) / index))
         heights = (slope * x)[:, None].expand(9, 9).contiguous()
         lens = Lens(Plane(0.0), BSplineSurface(9.0, heights, (-2.0, 2.0), (-2.0, 2.0)), square, index)
-        pull = Grazing.of(Edge(Channel(Collimated(square), index), most), lens)
+        pull = Grazing.of(Edge(Channel(CollimatedSource(square), index), most), lens)
         value, gradient, worst = pull(heights)
         if u < 0:
             assert value == 0 and not gradient.any() and worst < 0
@@ -171,6 +173,7 @@ def designed(tmp_path_factory):
         yield folder / "out", cli.run(["generate", str(folder / "wide.toml"), "-o", str(folder / "out")])
 
 
+@suite.in_turn(0, 2)
 def test_a_design_lights_its_part_without_total_reflection(designed):
     folder, code = designed
     report = json.loads((folder / "report.json").read_text())
@@ -181,6 +184,7 @@ def test_a_design_lights_its_part_without_total_reflection(designed):
     assert any("cannot be lit" in sentence for sentence in report["given_up"])
 
 
+@suite.in_turn(0, 2)
 def test_a_verification_keeps_to_the_part(designed):
     """The verification compares the stored target with the scene's on that part."""
     folder, _ = designed

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -13,9 +13,10 @@ from bstcad.designs.pipeline import DesignState, design
 from bstcad.optics.trace.measure import Effort
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
+from bstcad.tailoring import effort as efforts
 from bstcad.tailoring.minimise import AdamState, Best, LbfgsState, adam, lbfgs, minimise
 from bstcad.tailoring.run import Hooks
-from tests import domes, two_faces
+from tests import domes, suite, two_faces
 from tests.conftest import DISK, SMALL
 
 TINY = SMALL | {"tailoring.rays": 64, "target.pixels": 32, "tailoring.transport_grid": 32, "tailoring.rounds": 3}
@@ -44,7 +45,7 @@ SCENES = {
 @pytest.fixture(autouse=True)
 def _few_rays(monkeypatch):
     """Scenes with bounds are rated by few rays; the law is one of bits, whatever the rays."""
-    monkeypatch.setattr("bstcad.tailoring.run.FINE_EFFORT", Effort(128, accuracy=0.0, witness=False))
+    monkeypatch.setattr(efforts, "FULL", replace(efforts.FULL, fine=Effort(128, accuracy=0.0, witness=False)))
 
 
 QUICK = (
@@ -103,7 +104,11 @@ def heights_of(made):
 
 
 @pytest.mark.parametrize(
-    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.bench) for name in SCENES]
+    "name",
+    [
+        *suite.in_turns(QUICK, len(QUICK)),
+        *(pytest.param(name, marks=pytest.mark.bench) for name in SCENES if name not in QUICK),
+    ],
 )
 def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
     scene = load(DISK, SCENES[name])
@@ -128,6 +133,7 @@ def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
         assert np.array_equal(again.transport.source, whole.transport.source)
 
 
+@suite.in_turn(0, 2)
 def test_an_interrupt_anywhere_gives_a_lens_and_loses_nothing():
     """Asked at every look: before the first round there is no lens; later the best so far, and the way on."""
     scene = load(DISK, SCENES["paper"])

@@ -7,8 +7,8 @@ import torch
 
 from bstcad.optics.lens.interfaces import Refract
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
@@ -29,7 +29,11 @@ def surface(m, phase, size=0.05):
 
 @pytest.mark.parametrize(
     ("source", "front"),
-    [(Collimated(Circle(8.0)), Plane(8.0)), (Point(), Sphere(15.0, 0.02)), (Point((1.0, -2.0, 0.0)), Plane(15.0))],
+    [
+        (CollimatedSource(Circle(8.0)), Plane(8.0)),
+        (PointSource(), Sphere(15.0, 0.02)),
+        (PointSource((1.0, -2.0, 0.0)), Plane(15.0)),
+    ],
     ids=("collimated", "point", "off axis"),
 )
 @pytest.mark.parametrize(
@@ -54,7 +58,7 @@ def test_an_aim_that_no_face_can_reach_turns_the_ray_as_far_as_one_can(index, re
     """Never reflected, never steeper than it may be, towards the aim, and as far as it goes where that is the limit."""
     x, y = torch.meshgrid(*[torch.linspace(-3.0, 3.0, 7, dtype=torch.float64)] * 2, indexing="ij")
     lens = Lens(Plane(8.0), net(m=5), SQUARE, index)
-    in_glass = to_first_net(Collimated(Circle(8.0)).rays_through(x, y, 8.0, 1.0), lens)
+    in_glass = to_first_net(CollimatedSource(Circle(8.0)).rays_through(x, y, 8.0, 1.0), lens)
     at_face, _, _ = intersect(lens.back, in_glass, SQUARE, Status.VIGNETTED)
     aim = torch.stack([torch.full_like(x, reach), torch.full_like(x, -0.2 * reach)])
     z_x, z_y = wanted_slopes(at_face, aim, LevelPlane(500.0), Refract(index, 1.0))
@@ -90,7 +94,7 @@ def test_a_polynomial_goes_on_where_no_ray_falls():
 
 def test_tailor_to_aim_lands_where_a_surface_can():
     """A stretched grid, near the axis: the map is a gradient but for the finite throw, so a surface follows it."""
-    source, lens = Collimated(Circle(8.0)), Lens(Plane(8.0), net(m=33), SQUARE, 1.488)
+    source, lens = CollimatedSource(Circle(8.0)), Lens(Plane(8.0), net(m=33), SQUARE, 1.488)
     x, y = sampling.grid(Rectangle(16.0, 16.0), 66)
     rays, screen = source.rays_through(x, y, 8.0, 1.0), LevelPlane(1000.0)
     aim = torch.stack([4 * x, 3 * y])

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen, efficiency
 from bstcad.optics.surfaces.outlines import Rectangle
@@ -21,9 +21,9 @@ from tests.lenses import SQUARE, N, net
 from tests.tracing import simulated
 
 CASES = {
-    "off axis": (Collimated(Rectangle(16.0, 16.0)), Plane(8.0), Screen(1000.0, (60.0, 300.0), (40.0, 280.0), 96)),
+    "off axis": (CollimatedSource(Rectangle(16.0, 16.0)), Plane(8.0), Screen(1000.0, (60.0, 300.0), (40.0, 280.0), 96)),
     "point and sphere": (
-        Point(profile="gaussian", half_angle_1e2=30.0), Sphere(15.0, 0.02),
+        PointSource(profile="gaussian", half_angle_1e2=30.0), Sphere(15.0, 0.02),
         Screen(1000.0, (-600.0, 600.0), (-600.0, 600.0), 96),
     ),
 }  # fmt: skip
@@ -92,7 +92,7 @@ def test_a_back_that_no_ray_is_found_to_is_one_sentence():
     """A point 0.05 mm from the front and far beside it: in 20 mm of glass its light gets no further than 18 mm."""
     lens = Lens(Plane(0.05), net(m=33, half=8.0), Rectangle(16.0, 16.0), 1.49)
     with pytest.raises(SceneError, match="^source: "):
-        lit_window(Point(position=(100.0, 0.0, 0.0)), lens)
+        lit_window(PointSource(position=(100.0, 0.0, 0.0)), lens)
 
 
 def test_thecorners_of_what_is_lit():

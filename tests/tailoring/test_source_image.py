@@ -11,8 +11,8 @@ import torch
 
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import channels_of, drawn_channels
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.numerics.reductions import total
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen
@@ -28,14 +28,14 @@ from tests.lenses import net
 
 INDEX, SIZE = 1.5, 2.4
 SCREEN = Screen(150.0, (-38.0, 36.0), (-36.0, 36.0), (50, 48))  # wider than the light, whose rim is sharp
-CHIP = Point((1.0, 0.0, -40.0), profile="lambertian", width=SIZE, height=1.0)
+CHIP = PointSource((1.0, 0.0, -40.0), profile="lambertian", width=SIZE, height=1.0)
 SOURCES = {
-    "disc": Point((1.0, 0.0, -40.0), profile="lambertian", diameter=SIZE),
+    "disc": PointSource((1.0, 0.0, -40.0), profile="lambertian", diameter=SIZE),
     "chip": CHIP,
     "line": replace(CHIP, height=None),
     "tilted": replace(CHIP, tilt=(0.0, 8.0)),
-    "sun": Collimated(Circle(8.0), divergence=2.5),
-    "two divergences": Collimated(Circle(8.0), divergence=(2.5, 1.0), rotate=30.0),
+    "sun": CollimatedSource(Circle(8.0), divergence=2.5),
+    "two divergences": CollimatedSource(Circle(8.0), divergence=(2.5, 1.0), rotate=30.0),
 }
 
 
@@ -66,7 +66,7 @@ def shown(merit):
 def by_rays(source, sets=6):
     """Independent pictures of sum 1, each from other points of the source."""
     seen = extended(source)
-    sets_of_rays = [simulated(lens(), seen.draw(128, seed), [SCREEN], n=50, seed=seed) for seed in range(sets)]
+    sets_of_rays = [simulated(lens(), seen.sampler(128, seed), [SCREEN], n=50, seed=seed) for seed in range(sets)]
     return [rays.box / total(rays.box) for [rays] in sets_of_rays]
 
 
@@ -125,7 +125,7 @@ def test_each_of_several_goals_is_blurred_by_images_of_its_own():
     for goal, found in zip(TWO, shown(merit(source, goals=TWO)), strict=True):
         [alone] = shown(merit(source, goals=(goal,)))
         torch.testing.assert_close(found, alone, rtol=1e-9, atol=1e-12)
-        by_point = RayTubes.launched(lens(), extended(source).centre, 60).picture(lens(), goal.receiver)
+        by_point = RayTubes.launched(lens(), extended(source).centre, 60).picture(lens(), goal.screen)
         assert float((found / total(found) - by_point / total(by_point)).norm()) > 0.1 * float(found.norm())
 
 
@@ -143,7 +143,7 @@ def test_what_the_images_leave_out_is_measured_by_rays():
     source = SOURCES["disc"]
     rays, half = by_rays(source), merit(replace(source, diameter=SIZE / 2))
     [found] = shown(half)
-    mended = found + blur_error(found, extended(source).draw, lens(), SCREEN, border=half.blurs[0][0].border, seed=3)
+    mended = found + blur_error(found, extended(source).sampler, lens(), SCREEN, border=half.blurs[0][0].border, seed=3)
     assert off(rays, mended) < 0.5 * off(rays, found)
 
 
@@ -177,7 +177,7 @@ def test_a_rectangle_of_light_casts_a_rectangle():
 def test_a_few_points_tell_how_wide_the_image_is(name):
     """The pull on light beyond the border falls with the width of the image, by all 64 points or by a few."""
     source = SOURCES[name]
-    light, knobs = channels_of(source, lambda nm: INDEX, 64), Tailoring(overshoot=0.03).resolved(65)
-    task = Task(light, GOALS, knobs, extended_sources=(extended(source),))
+    light, settings = channels_of(source, lambda nm: INDEX, 64), Tailoring(overshoot=0.03).resolved(65)
+    task = Task(light, GOALS, settings, extended_sources=(extended(source),))
     by_all = _overshoot_weight(replace(task, extended_sources=()), lens())
     assert _overshoot_weight(task, lens()) == pytest.approx(by_all, rel=0.02) and by_all < 0.02

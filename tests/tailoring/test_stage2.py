@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,11 +12,12 @@ import torch
 from bstcad.designs import pipeline
 from bstcad.designs.pipeline import design
 from bstcad.optics.trace.measure import rrmsd_by_tubes
-from bstcad.scene.quality import VERIFICATION_DRAW
+from bstcad.scene.quality import VERIFICATION_SET
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
+from bstcad.tailoring.effort import FULL
 from bstcad.tailoring.source_image import ExtendedSource
-from tests import two_faces
+from tests import suite, two_faces
 from tests.conftest import DISK, SMALL
 
 TINY = SMALL | {
@@ -42,8 +44,8 @@ WIDE = TINY | {"source.diameter": 1.2}  # 80 mm before the back, 475 mm behind i
 )
 def test_only_rounds_that_resolve_the_net_are_short_and_move_its_short_waves(changes, shares, level):
     scene = load(DISK, SMALL | {"tailoring.stage2_iterations": 60} | changes)
-    knobs = scene.tailoring.resolved(scene.lens.back.net)
-    task = pipeline.task_of(scene, scene.goals, knobs, edge=None)
+    settings = scene.tailoring.resolved(scene.lens.back.net)
+    task = pipeline.task_of(scene, scene.goals, settings, edge=None)
     assert stage2.round_shares(task) == shares
     first = stage2.TubeRound(task, 48, 30, resolved=stage2.resolves_net(task))
     assert first.level == pytest.approx(level, rel=1e-12)
@@ -55,9 +57,9 @@ def test_only_rounds_that_resolve_the_net_are_short_and_move_its_short_waves(cha
 )
 def test_the_last_round_of_a_large_net_has_more_tubes_unless_memory_forbids_it(points, tubes):
     scene = load("templates/portrait.toml", {"lens.back.control_points": points})
-    knobs = scene.tailoring.resolved(scene.lens.back.net)
-    shares = stage2.round_shares(pipeline.task_of(scene, scene.goals, knobs, edge=None))
-    found = list(stage2.sheet_sizes(knobs, shares))
+    settings = scene.tailoring.resolved(scene.lens.back.net)
+    shares = stage2.round_shares(pipeline.task_of(scene, scene.goals, settings, edge=None))
+    found = list(stage2.sheet_sizes(settings, shares))
     assert [each for each, _ in found] == tubes
     assert [count for _, count in found] == [round(part * 98) for part in ROUNDS_OF[points]]
 
@@ -70,15 +72,15 @@ def test_a_round_for_several_pictures_ends_once_it_fits_its_tubes_alone(monkeypa
     """No RRMSD by tubes is below 0 times that by rays, and each is below ∞ times it, at the first comparison."""
     monkeypatch.setattr(stage2, "DISTORTION_RATIO", ratio)
     scene = load(DISK, two_faces.SMALL)
-    knobs = scene.tailoring.resolved(scene.lens.back.net).model_copy(update={"stage2_iterations": 60})
-    task, lens = pipeline.task_of(scene, scene.goals, knobs, edge=None), scene.flat_lens(scene.lens.back.net)
+    settings = replace(scene.tailoring.resolved(scene.lens.back.net), stage2_iterations=60)
+    task, lens = pipeline.task_of(scene, scene.goals, settings, edge=None), scene.flat_lens(scene.lens.back.net)
     counts = Counter(step.part for step in stage2.steps(task, scene.as_mounted(lens)) if step.rrmsd is not None)
     assert list(counts.values()) == evaluations
 
 
 def judged(scene, lens):
     """RRMSD with the real source, by points that no tailoring knows."""
-    return rrmsd_by_tubes(lens, scene.channels(64, VERIFICATION_DRAW), scene.goals[0], 34)
+    return rrmsd_by_tubes(lens, scene.channels(64, VERIFICATION_SET), scene.goals[0], 34)
 
 
 @pytest.fixture(scope="module")
@@ -88,12 +90,14 @@ def compensated():
     return found, judged(found.scene, found.lens)
 
 
+@suite.in_turn(0, 2)
 def test_the_size_of_the_source_is_made_up_for(compensated):
     found, rrmsd = compensated
     point = pipeline.design(found.scene.with_source_scaled(0.0), device="cpu")
     assert rrmsd < 0.7 * judged(found.scene, point.lens)
 
 
+@suite.in_turn(0, 2)
 def test_it_tells_what_each_size_costs(compensated):
     """Stage 2 is replaced; the rays between the stages see the source's points, which no tailoring sees."""
     found, rrmsd = compensated
@@ -121,12 +125,12 @@ def test_the_source_grows_to_its_size():
 
 def task_of(scene):
     """The task of a scene as `pipeline.design` has it."""
-    knobs = scene.tailoring.resolved(33)
+    settings = scene.tailoring.resolved(33)
     light = scene.with_source_scaled(0.0).channels()
     scaled = [scene.with_source_scaled(share) for share, _ in stage2.SOURCE_SIZES]
     return pipeline.Task(
-        light, scene.goals, knobs, sampled_sources=tuple(each.channels() for each in scaled),
-        extended_sources=tuple(ExtendedSource(each.source, light, each.draw) for each in scaled),
+        light, scene.goals, settings, sampled_sources=tuple(each.channels() for each in scaled),
+        extended_sources=tuple(ExtendedSource(each.source, light, each.sampler) for each in scaled),
     )  # fmt: skip
 
 
@@ -143,8 +147,9 @@ def found():
     return design(load(DISK, TWINS), device="cpu").making.twins
 
 
+@suite.in_turn(1, 2)
 def test_the_twins_agree_to_what_single_precision_keeps(found):
-    assert found["control_points"] == 33 and found["evaluations"] == stage2.COMPARED_EVALUATIONS
+    assert found["control_points"] == 33 and found["evaluations"] == FULL.compared_evaluations
     assert 0 < found["merit"] < 1e-4  # sums of 2^16 tubes, each with some 1e-6 of the lens's size in its corners
     assert 0 < found["gradient"] < 1e-2
     assert found["rrmsd_float32"] == pytest.approx(found["rrmsd_float64"], rel=0.2)  # two line searches, equally good
@@ -162,6 +167,7 @@ def test_a_stationary_start_has_differences_that_are_finite(monkeypatch, merit, 
     assert (found.merit, found.gradient) == (difference, difference)
 
 
+@suite.in_turn(1, 2)
 def test_a_coarser_arithmetic_shows(monkeypatch, found):
     """Heights rounded to 1e-4 of themselves, as half precision would, in the single one of the twins."""
     call = stage2.Problem.__call__

@@ -26,10 +26,10 @@ SMALL = {
 def small(name, **more):
     """(task, blank lens) of a template at toy size: laws only, no figures."""
     wanted = scene.load(f"templates/{name}.toml", SMALL | more)
-    knobs = wanted.tailoring.resolved(17)
+    settings = wanted.tailoring.resolved(17)
     free = wanted.lens.front.free
-    task = Task(wanted.channels(), wanted.goals, knobs, free=free)
-    return task, wanted.flat_lens(knobs.levels[0])
+    task = Task(wanted.channels(), wanted.goals, settings, free=free)
+    return task, wanted.flat_lens(settings.levels[0])
 
 
 def driven(driver, task, steps, why=None):
@@ -71,7 +71,7 @@ def test_the_map_settles_where_the_slopes_change_much_with_the_place():
     outline = {"target.outline": "{ shape = 'circle', radius = 18.0 }"}
     task, lens = small("disk", **ends, **outline, **{"target.z": "60.0"})
     rounds = [step.state for step in stage1.follow_slopes(task, lens)]
-    assert rounds[-1].round == task.knobs.rounds > len(rounds)  # the coarse rounds ended once they had settled
+    assert rounds[-1].round == task.settings.rounds > len(rounds)  # the coarse rounds ended once they had settled
     assert rounds[-1].slopes.moved < 0.1 * stage1.SETTLED_CHANGE
 
 
@@ -175,7 +175,7 @@ def test_stage_1_finds_the_front_curvature_and_the_back_together():
     tailored, mapping = last.lens, last.mapping
     assert tailored.front.curvature != 0.0
     assert mapping.transport.mass_error[-1] < 0.02
-    found = simulated(task.heaviest.source, tailored, task.goals[0].receiver, 300, 0)
+    found = simulated(task.heaviest.source, tailored, task.goals[0].screen, 300, 0)
     assert efficiency(found.flux) > 0.98
     assert task.rrmsd(tailored) < 0.6 * task.rrmsd(replace(lens, back=lens.back.refined(17)))
 

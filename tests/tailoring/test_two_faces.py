@@ -10,7 +10,7 @@ import bstcad
 from bstcad.designs import pipeline
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.wavefront import PlaneWave, SphericalWave, ZernikeWave
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen
@@ -27,7 +27,7 @@ from tests.conftest import quick_effort
 from tests.lenses import SQUARE, rough
 
 N = 1.5
-BEAM = Collimated(aperture=Rectangle(16.0, 16.0), wavelength=600.0)
+BEAM = CollimatedSource(aperture=Rectangle(16.0, 16.0), wavelength=600.0)
 NEAR, FAR = Screen(30.0, (-9.0, 9.0), (-9.0, 9.0), 24), Screen(60.0, (-9.0, 9.0), (-9.0, 9.0), 24)
 WAVES = {
     "plane": PlaneWave(30.0), "sphere": SphericalWave((0.0, 0.0, 400.0), 30.0),
@@ -36,7 +36,7 @@ WAVES = {
 
 
 def bumpy(m=17):
-    return Lens(rough(0.02, 1, 0.0, m, 14.0), rough(0.02, 2, 8.0, half=14.0), SQUARE, N, shaped=(0, 1))
+    return Lens(rough(0.02, 1, 0.0, m, 14.0), rough(0.02, 2, 8.0, half=14.0), SQUARE, N, tailored=(0, 1))
 
 
 def picture(seed):
@@ -72,7 +72,7 @@ def test_the_waves_term_is_the_measured_error():
 
 def shown(light, screen):
     """The picture on a screen, by the quads of the light."""
-    there = torch.from_numpy(np.stack(light.positions_on(screen.plane)))
+    there = torch.from_numpy(np.stack(light.positions_on(screen.receiver)))
     flux = torch.from_numpy(np.ascontiguousarray(light.picture[::-1].T))
     return collect(screen.pixels_of(there), flux, screen.shape)[0].numpy()
 
@@ -205,7 +205,7 @@ def test_a_front_alone_makes_a_picture(tmp_path):
     scene = scene_of(tmp_path, lens=TWO["lens"] | {"back": TWO["lens"]["back"] | {"optimise": False}})
     scene = scene.changed({"target.image": waves_of(0.0), "target.z": 60.0})
     made = pipeline.design(scene.changed({"tailoring.stage2_iterations": 10}))
-    assert not made.lens.back.heights.any() and made.lens.freeform == (0,)
+    assert not made.lens.back.heights.any() and made.lens.tailored_numbers == (0,)
     assert rrmsds_by_rays(made.lens, scene.channels(), scene.goals, quick_effort())[0] < 0.1
 
 
@@ -227,6 +227,6 @@ def test_targets_that_cut_through_each_other_are_refused(tmp_path):
 
 def test_the_move_of_a_back_that_is_given_is_kept():
     """A front alone is tailored, and the back makes way for it."""
-    lens = replace(bumpy(), shaped=(0,))
+    lens = replace(bumpy(), tailored=(0,))
     moved = lens.with_back(lens.back.moved(9.5))
     assert Parameters.of(moved).apply_to(lens).back.z == 9.5

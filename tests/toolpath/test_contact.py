@@ -12,7 +12,7 @@ from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.toolpath import chords, cusps
 from bstcad.toolpath.cutting import Cutting
 from bstcad.toolpath.machined_face import MachinedFace, RoundTool
-from bstcad.toolpath.raster import Pass, raster
+from bstcad.toolpath.raster import ToolPass, raster
 from bstcad.toolpath.spiral import spiral
 from bstcad.toolpath.swept_volume import check_raster
 
@@ -118,7 +118,7 @@ def test_the_check_finds_a_path_that_cuts_into_the_face():
     path = milled(face_of(smooth), stock=0.0)
     assert check_raster(path).gouge < 5e-4
     [finish] = path.passes
-    low = Pass(finish.points - (0.0, 0.0, 0.003), rough=False)
+    low = ToolPass(finish.points - (0.0, 0.0, 0.003), rough=False)
     assert check_raster(replace(path, passes=(low,))).gouge > 0.0025
 
 

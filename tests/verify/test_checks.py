@@ -26,7 +26,7 @@ from bstcad.scene.accept import Accept
 from bstcad.verify import checks, step_checks
 from bstcad.verify.checks import Check
 from bstcad.verify.verdict import verdict
-from tests.conftest import draws_nothing, verify_with
+from tests.conftest import draws_nothing, quick_effort, verify_with
 
 POINT = r"CARTESIAN_POINT\('',\([^,]*,[^,]*,\s*"  # up to its z
 NUMBER = r"([-+.E\d]+)"
@@ -54,13 +54,13 @@ def nominal(small_design, few):
     [goal] = found.goals
     target = goal.picture.reshape(12, 4, 16, 4).sum((1, 3))
     target *= 1 + 0.08 * (-1.0) ** np.add.outer(np.arange(12), np.arange(16))
-    found = with_picture(found, target, receiver=replace(goal.receiver, pixels=(16, 12)))
+    found = with_picture(found, target, screen=replace(goal.screen, pixels=(16, 12)))
     return other_limits(found, rrmsd=0.2, efficiency=0.999)
 
 
 def with_picture(nominal, picture, **changes):
     """Return the nominal with another picture, which is stored as well, and interpolated on cells."""
-    goals = tuple(replace(goal, picture=picture, draw=None, **changes) for goal in nominal.goals)
+    goals = tuple(replace(goal, picture=picture, cell_picture=None, **changes) for goal in nominal.goals)
     return replace(nominal, goals=goals, stored=(picture,), lit=())
 
 
@@ -196,6 +196,7 @@ def test_a_lens_out_of_its_place_fails_in_the_folder_of_its_design(folder, nomin
 def test_where_no_limit_was_asked_the_verdict_is_one_of_its_own(small_design, tmp_path, capsys, monkeypatch):
     """Neither a pass nor a fail, in the terminal, in report.json and in Python; a check that fails, fails."""
     draws_nothing(monkeypatch)
+    verify_with(monkeypatch, quick_effort())
     folder = shutil.copytree(small_design.folder, tmp_path / "unasked")
     text = (folder / "scene.toml").read_text(encoding="utf-8")
     (folder / "scene.toml").write_text(re.sub(r"(?ms)^\[accept\].*?(?=^\[|\Z)", "", text), encoding="utf-8")
@@ -353,8 +354,8 @@ def other_limits(nominal, **changes):
 
 def narrower_screen(nominal, right=10.0):
     """Two thirds of the screen and its target: the rest of the light falls beside."""
-    screen = replace(nominal.goals[0].receiver, x=(-30.0, right))
-    return other_limits(with_picture(nominal, np.ones((12, 16)), receiver=screen), rrmsd=9)
+    screen = replace(nominal.goals[0].screen, x=(-30.0, right))
+    return other_limits(with_picture(nominal, np.ones((12, 16)), screen=screen), rrmsd=9)
 
 
 DESIGNS = {
@@ -383,7 +384,7 @@ def test_a_ripple_fails_a_lens_by_what_the_light_feels_of_it(nominal):
     slopes = []
     for height, fails in ((1e-6, False), (1e-2, True)):
         lens = replace(nominal.lens, back=replace(back, heights=back.heights + height * torch.from_numpy(noise)))
-        light = measure.measure(lens, nominal.channels, nominal.goals[0].receiver, nominal.goals[0].picture, effort=FEW)
+        light = measure.measure(lens, nominal.channels, nominal.goals[0].screen, nominal.goals[0].picture, effort=FEW)
         found = {c.id: c.passed for c in checks._light_checks(light, nominal.scene.accept)}
         assert found["rrmsd"] is not fails
         shape_of = shape.describe(lens) | checks._ripple_rrmsd(lens, nominal)

@@ -20,7 +20,7 @@ from bstcad.designs.pipeline import design as design_of
 from bstcad.optics.lens.interfaces import cross
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
@@ -28,6 +28,7 @@ from bstcad.optics.trace.measure import Effort, measure
 from bstcad.scene.mount import Mount
 from bstcad.scene.scene import load
 from bstcad.verify import step_checks
+from tests import suite
 from tests.conftest import DISK, draws_nothing, proofs, quick_effort
 from tests.lenses import net
 
@@ -58,7 +59,7 @@ def held(design, mount, curvature=None):
     return replace(lens, clear=mount.clear(lens)), mount
 
 
-@pytest.mark.parametrize("name", MOUNTS)
+@pytest.mark.parametrize("name", suite.in_turns(MOUNTS, 3))
 def test_the_light_is_that_of_rays_through_the_faces_of_the_part(design, name, tmp_path):
     """Polygons along the edges of part.step's faces decide which rays get through: all parallel, or from a point."""
     table = dict(MOUNTS[name])
@@ -71,7 +72,7 @@ def test_the_light_is_that_of_rays_through_the_faces_of_the_part(design, name, t
         assert np.abs(measured.depth(*designed.rim_points())).max() < 1e-4
     around, screen = polygons(tmp_path / "part.step"), replace(design.scene.target.screen, pixels=8)
     wide = found.apertures[0].half_extent[0] < 0.98 * found.apertures[1].half_extent[0]
-    for source in (design.scene.source, Collimated(Rectangle(9.0, 7.0))):
+    for source in (design.scene.source, CollimatedSource(Rectangle(9.0, 7.0))):
         light = measure(found, [Channel(source, lens.index)], screen, np.ones(screen.shape), Effort(512, accuracy=0))
         seen = independent(source, lens, around, screen)
         assert light.flux["on target"] == pytest.approx(seen.sum(), rel=1.5e-3)
@@ -121,7 +122,7 @@ def independent(source, lens, around, screen, count=1 << 17):
     for interface, polygon in zip(lens.unbounded().interfaces, around, strict=True):
         rays = cross(rays, interface).rays
         flux *= inside(polygon, rays.position[:2].numpy())
-    x, y, _ = screen.plane.to(rays).position.numpy()
+    x, y, _ = screen.receiver.to(rays).position.numpy()
     seen, _, _ = np.histogram2d(y, x, bins=screen.shape, range=(screen.y, screen.x), weights=flux)
     return seen[::-1]
 
@@ -151,7 +152,7 @@ def test_what_a_flange_stands_in_the_way_of():
     """Parallel light at 20 degrees through a plate: its beam is what three circles, each shifted on, have in common."""
     clear = Circle(5.0), Circle(5.0)
     lens = Lens(Plane(15.0), net(m=9, half=9.0), Rectangle(16.0, 16.0), 1.5, clear=clear)
-    light = [Channel(Collimated(Rectangle(30.0, 30.0), tilt=(0.0, 20.0)), 1.5)]
+    light = [Channel(CollimatedSource(Rectangle(30.0, 30.0), tilt=(0.0, 20.0)), 1.5)]
     outside, glass = math.tan(math.radians(20)), math.tan(math.asin(math.sin(math.radians(20)) / 1.5))
 
     def common(shift):
@@ -182,6 +183,7 @@ def cut(tmp_path_factory):
     return scene, folder, report, kept[0]
 
 
+@suite.in_turn(0, 2)
 def test_a_lens_is_tailored_for_what_the_mount_leaves_of_it(cut):
     _, folder, contents, proof = cut
     assert proof.passed and proof.light.rrmsd < 0.03  # of the uncut lens through these apertures over 0.4
@@ -190,6 +192,7 @@ def test_a_lens_is_tailored_for_what_the_mount_leaves_of_it(cut):
     assert bstcad.open(folder).lens.clear == (Circle(4.5), Circle(4.5))
 
 
+@suite.in_turn(0, 2)
 def test_the_figures_of_its_shape_are_those_of_what_is_left(cut):
     """The corners of the whole square are thicker than the edge of the circle that is cut out of it."""
     _, folder, contents, proof = cut
@@ -200,6 +203,7 @@ def test_the_figures_of_its_shape_are_those_of_what_is_left(cut):
     assert proof.shape["thickness_max"] < describe(lens, 129)["thickness_max"] - 1e-3
 
 
+@suite.in_turn(0, 2)
 def test_a_part_with_another_rim_is_judged_by_its_own_light_and_fails_by_name(cut, tmp_path):
     scene, folder, _, before = cut
     made = bstcad.open(folder)

@@ -18,6 +18,7 @@ from bstcad.optics.trace.measure import Effort
 from bstcad.report import report as reports
 from bstcad.report.record import of_json
 from bstcad.scene.scene import load
+from tests import suite
 from tests.conftest import draws_nothing, verify_with
 
 FEW = Effort(256, places=65, points=1024)
@@ -62,6 +63,7 @@ def printed(report):
     return console.file.getvalue()
 
 
+@suite.in_turn(2, 3)
 def test_the_part_of_its_light_that_arrives_is_said_first(made):
     """sin² of the angle to the rim enters, 53 %; a third of that leaves through the sides."""
     folder, report = made
@@ -78,6 +80,7 @@ def test_the_part_of_its_light_that_arrives_is_said_first(made):
         assert "(accept.rrmsd), so the verdict does not judge it." in text
 
 
+@suite.in_turn(2, 3)
 def test_what_the_scene_asked_for_and_did_not_get_comes_first(made):
     folder, report = made
     moved, missed, *others = report["given_up"]
@@ -86,6 +89,7 @@ def test_what_the_scene_asked_for_and_did_not_get_comes_first(made):
     assert report["verdict"] == "passed with remarks" and report["passed"] is True
 
 
+@suite.in_turn(2, 3)
 def test_the_folder_says_where_the_back_stands(made):
     folder, report = made
     written = report["prescription"]

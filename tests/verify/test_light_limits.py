@@ -26,10 +26,10 @@ def disk():
 def values(scene, noise=0.0, tilt=0.0):
     """Values of even light over the whole target, brighter to the right by `tilt` of the mean at its edge."""
     [goal], chance = scene.goals, np.random.default_rng(1)
-    even = goal.receiver.cell_sizes * (1 + tilt * np.linspace(-1, 1, goal.receiver.columns))
+    even = goal.screen.cell_sizes * (1 + tilt * np.linspace(-1, 1, goal.screen.columns))
     sets = tuple(torch.from_numpy(even * (1 + noise * chance.normal(size=even.shape))) for _ in range(8))
     light = Light(even, 0.1, 0.0, rays=1, flux={}, sets=sets, on_screen=ON_TARGET)
-    goal = Goal("target", goal.receiver, goal.receiver.cell_sizes / goal.receiver.cell_sizes.sum())
+    goal = Goal("target", goal.screen, goal.screen.cell_sizes / goal.screen.cell_sizes.sum())
     return light_values(scene, [goal], [light], lens=None, channels=())
 
 

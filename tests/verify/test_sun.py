@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bstcad import cli
+from tests import suite
 from tests.benchmarks.independent import judge
 from tests.conftest import draws_nothing, quick_effort, verify_with
 
@@ -34,6 +35,7 @@ def plate(tmp_path_factory):
     return plate_of(SMALL, tmp_path_factory.mktemp("sun"))
 
 
+@suite.in_turn(1, 3)
 def test_the_stated_rrmsd_is_that_of_rays_from_the_sun(plate):
     report = json.loads((plate / "report.json").read_text())
     judged = judge(plate, points=1 << 16)
@@ -42,6 +44,7 @@ def test_the_stated_rrmsd_is_that_of_rays_from_the_sun(plate):
     assert not any("size of the source" in sentence for sentence in report["given_up"])
 
 
+@suite.in_turn(1, 3)
 def test_the_finest_detail_is_the_image_of_the_sun(plate):
     """2 · 200 mm · tan(0.265°) through a plate that bends little, on pixels of 1.25 mm; at 100 mm half of it."""
     report = json.loads((plate / "report.json").read_text())
@@ -54,6 +57,7 @@ def test_the_finest_detail_is_the_image_of_the_sun(plate):
     assert "it would be 1.7 mm with the target 100 mm instead of 200 mm from the lens" in page
 
 
+@suite.in_turn(2, 3)
 def test_the_light_of_two_divergences_is_that_of_rays(tmp_path):
     """An ellipse of directions, turned by 30 degrees: RRMSD and picture; exchanged axes have another picture."""
     folder = plate_of(SMALL | {"source.divergence": "[1.6, 0.4]", "source.rotate": 30}, tmp_path)

@@ -17,6 +17,7 @@ from bstcad.designs import folder as folders
 from bstcad.report import prescription, report
 from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks, text_checks
+from bstcad.verify.nominal import Nominal
 from tests.conftest import flat_pictures, quick_effort
 from tests.two_faces import CHANGES, bent, made_of, scene_of
 
@@ -62,7 +63,7 @@ def test_each_light_is_that_of_its_own_screen(two):
     nominal = folders.read_nominal(two.folder)[1]
     effort = replace(nominal.effort(quick_effort()), seed=nominal.scene.tailoring.seed + checks.VERIFY_SEED)
     for goal, found in zip(nominal.goals, two.proof.lights, strict=True):
-        alone = bstcad.measure(two.proof.lens, nominal.channels, goal.receiver, goal.picture, effort=effort)
+        alone = bstcad.measure(two.proof.lens, nominal.channels, goal.screen, goal.picture, effort=effort)
         assert np.array_equal(alone.picture, found.picture) and alone.rrmsd == found.rrmsd
     assert light.picture.shape == (16, 16) and other.picture.shape == (18, 24) and light.rrmsd != other.rrmsd
 
@@ -81,7 +82,7 @@ def test_accept_holds_for_each_target(two):
 def test_a_target_without_light_is_named(two):
     nominal = folders.read_nominal(two.folder)[1]
     first, second = nominal.goals
-    dark = replace(second, receiver=replace(second.receiver, x=(500.0, 510.0)))
+    dark = replace(second, screen=replace(second.screen, x=(500.0, 510.0)))
     with pytest.raises(ValueError, match=r"none of its light falls on target\[1\]"):
         checks.verify(two.folder, replace(nominal, goals=(first, dark)), effort=quick_effort())
 
@@ -108,21 +109,21 @@ def test_a_face_that_is_off_by_a_nanometre_in_one_control_point_is_found(two, fa
 
 def test_a_file_whose_front_is_flat_is_no_lens_of_two_nets(two, tmp_path):
     """The net is missing for either reader, and the rest of the proof goes on."""
-    lens = replace(two.made.lens, front=bstcad.Plane(8.0), shaped=None)
+    lens = replace(two.made.lens, front=bstcad.Plane(8.0), tailored=None)
     folders.write_geometry(replace(two.made, lens=lens), tmp_path)()
     text = part21.read_lens(tmp_path / "lens.step")
     [failed] = [check for check in text_checks.lens_checks(text, two.made.lens) if not check.passed]
     assert failed.id == "control-points" and failed.name.endswith("of the front")
-    nominal = checks.Nominal(two.made.scene, two.made.lens, two.made.goals)
+    nominal = Nominal(two.made.scene, two.made.lens, two.made.goals)
     proof = checks.verify(tmp_path, nominal, effort=quick_effort())
     failed = {check.id: check.name for check in proof.checks if not check.passed}
-    assert "front" in failed["form"] and proof.lens.shaped is None
+    assert "front" in failed["form"] and proof.lens.tailored is None
 
 
 def test_figures_of_the_front_are_those_of_the_same_face_as_a_back(two):
     """Turned over: a ridge towards +z is a valley for whoever cuts the front from outside."""
     lens, shape = two.made.lens, two.facts["shape"]
-    as_back = describe(replace(lens, back=lens.front, front=lens.back.moved(-30.0), shaped=None), 129)
+    as_back = describe(replace(lens, back=lens.front, front=lens.back.moved(-30.0), tailored=None), 129)
     for key in ("sag_pv", "slope_max_deg", "departure_best_sphere", "slope_energy_top_octave"):
         assert shape[f"front_{key}"] == pytest.approx(as_back[key], rel=1e-9)
     assert shape["front_radius_min_concave"] == pytest.approx(as_back["radius_min_convex"], rel=1e-9)
@@ -144,7 +145,7 @@ def test_bounds_hold_for_both_faces(two):
     assert failed.keys() == {"tool-radius", "slope"} and all("of the front" in name for name in failed.values())
     assert at_bounds.keys() == {"tool_radius", "max_slope"} and all(0 < at.share < 1 for at in at_bounds.values())
     assert [at.tightest.endswith("of the front") for at in at_bounds.values()] == [True, True]
-    alone, _ = checks.bound_checks(replace(lens, shaped=None), asked, shape)
+    alone, _ = checks.bound_checks(replace(lens, tailored=None), asked, shape)
     assert all(check.passed for check in alone)
 
 
@@ -168,7 +169,7 @@ def test_the_margin_to_total_reflection_is_of_light_in_the_glass(two):
     """Nets that are free move no ray: the figure is that of the same faces with a fixed front."""
     nominal = folders.read_nominal(two.folder)[1]
     free, fixed = (
-        checks.margins(nominal.channels, replace(nominal.lens, shaped=shaped), nominal.goals[0].receiver, 0, n=64)
+        checks.margins(nominal.channels, replace(nominal.lens, tailored=shaped), nominal.goals[0].screen, 0, n=64)
         for shaped in ((0, 1), None)
     )
     assert free.tir_margin_deg == pytest.approx(fixed.tir_margin_deg, abs=1e-9)
@@ -269,7 +270,7 @@ def test_with_lens_keeps_a_front_that_is_tailored(two):
     design = bstcad.Design(two.made)
     net = design.scene.flat_lens((65, 65)).front
     other = design.with_lens(replace(two.made.lens, front=bent(net, 0.1)))
-    assert other.scene.lens.front.is_tailored and other.lens.shaped == (0, 1)
+    assert other.scene.lens.front.is_tailored and other.lens.tailored == (0, 1)
     finer = design.scene.changed({"lens.front.control_points": 65}).flat_lens((65, 65)).front
     again = design.with_lens(replace(two.made.lens, front=bent(finer, 0.1)))
     assert again.lens.front.shape == (65, 65) and again.scene.lens.nets() == (65, 65)

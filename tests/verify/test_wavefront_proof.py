@@ -16,6 +16,8 @@ from bstcad.optics.light.wavefront import ZernikeWave
 from bstcad.optics.trace.wavefront_error import wavefront_error
 from bstcad.report import record, report
 from bstcad.verify import checks
+from bstcad.verify.nominal import Nominal
+from tests import suite
 from tests.conftest import flat_pictures, proofs, quick_effort
 from tests.two_faces import CHANGES, made_of, scene_of
 
@@ -47,6 +49,7 @@ def judged(lens, nominal, **accept):
     return error, {check.id: check for check in found}
 
 
+@suite.in_turn(0, 3)
 def test_the_written_lens_has_the_wavefront_of_the_designed_one(one):
     scene, lens = one.made.scene, one.made.lens
     designed, found = wavefront_error(scene.source, lens, scene.wavefront), one.proof.wavefront
@@ -55,6 +58,7 @@ def test_the_written_lens_has_the_wavefront_of_the_designed_one(one):
     assert found.rays == designed.rays and found.wavelength == 633.0 and 0 < found.floor < 1e-8
 
 
+@suite.in_turn(0, 3)
 def test_without_a_limit_both_values_are_stated(one):
     found = {check.id: check for check in one.report.checks if check.id.startswith("wavefront")}
     assert found.keys() == {RMS, FLOOR} and all(check.passed and check.limit is None for check in found.values())
@@ -62,6 +66,7 @@ def test_without_a_limit_both_values_are_stated(one):
     assert one.report.passed and found[FLOOR].topic == "check-wavefront-floor"
 
 
+@suite.in_turn(0, 3)
 def test_a_wavefront_beyond_its_limit_fails(one):
     nominal, rms = folders.read_nominal(one.folder)[1], one.proof.wavefront.without_tilt.rms
     assert nominal.scene.wavefront == one.made.scene.wavefront
@@ -71,12 +76,14 @@ def test_a_wavefront_beyond_its_limit_fails(one):
     assert found[RMS].passed and found[RMS].limit == 1.01 * rms
 
 
+@suite.in_turn(0, 3)
 def test_a_limit_that_rounding_hides_fails_by_the_floor(one):
     nominal, floor = folders.read_nominal(one.folder)[1], one.proof.wavefront.floor
     _, found = judged(one.proof.lens, nominal, wavefront=5 * floor)
     assert not found[FLOOR].passed and found[FLOOR].limit == 0.5 * floor
 
 
+@suite.in_turn(0, 3)
 def test_a_wave_that_no_light_meets_fails_and_has_no_figures(one):
     nominal, beside = folders.read_nominal(one.folder)[1], ZernikeWave((0.0,), 1.0, z=60.0, centre=(500.0, 0.0))
     nominal = replace(nominal, scene=nominal.scene.model_copy(update={"wavefront": beside}))
@@ -88,7 +95,7 @@ def test_a_wave_that_no_light_meets_fails_and_has_no_figures(one):
 def test_a_flat_plate_leaves_parallel_light_parallel():
     """A plain lens: parallel light through level faces has no error but rounding."""
     made = made_of(scene_of(**ONE), front=0.0, back=0.0)
-    error, found = judged(made.lens, checks.Nominal(made.scene, made.lens, made.goals), wavefront=1e-6)
+    error, found = judged(made.lens, Nominal(made.scene, made.lens, made.goals), wavefront=1e-6)
     assert found[RMS].passed and found[FLOOR].passed
     assert error.without_piston.rms < 1e-8 and error.angle_max < 1e-6
 
@@ -97,7 +104,7 @@ def test_a_mounted_lens_is_measured_as_it_is_made(tmp_path):
     """The rim of the mount cuts away light that the bare lens lets through."""
     made = made_of(scene_of(**ONE, mount={"datum": "front", "rim": {"shape": "circle", "diameter": 6.4}}))
     folders.write_geometry(made, tmp_path)()
-    proof = checks.verify(tmp_path, checks.Nominal(made.scene, made.lens, made.goals), effort=quick_effort())
+    proof = checks.verify(tmp_path, Nominal(made.scene, made.lens, made.goals), effort=quick_effort())
     bare = wavefront_error(made.scene.source, replace(made.lens, clear=None), made.scene.wavefront)
     cut = wavefront_error(made.scene.source, made.lens, made.scene.wavefront)
     assert proof.wavefront.flux == pytest.approx(cut.flux, abs=1e-4) and proof.wavefront.flux < 0.95 * bare.flux
@@ -106,13 +113,14 @@ def test_a_mounted_lens_is_measured_as_it_is_made(tmp_path):
 def test_waves_are_those_of_the_main_line():
     source = CHANGES["source"] | {"wavelength": [[633.0, 1.0], [520.0, 3.0], [450.0, 1.0]]}
     made = made_of(scene_of(**ONE, source=source))
-    heaviest = checks.Nominal(made.scene, made.lens, made.goals).heaviest
+    heaviest = Nominal(made.scene, made.lens, made.goals).heaviest
     assert heaviest.source == made.scene.source.central and heaviest.source.wavelength == 520.0
 
 
 # ---- the report ------------------------------------------------------------------------------------------------------
 
 
+@suite.in_turn(0, 3)
 def test_report_json_tells_the_wavefront_and_reads_back(one):
     told, error = json.loads((one.folder / "report.json").read_text())["wavefront"], one.proof.wavefront
     assert list(told) == KEYS and told["removed"] == "piston and tilt" and told["z"] == 60.0
@@ -125,6 +133,7 @@ def test_report_json_tells_the_wavefront_and_reads_back(one):
     assert error.flux > 1 == told["flux"]  # on a grid the edge of the beam is a little too wide
 
 
+@suite.in_turn(0, 3)
 def test_the_page_the_terminal_and_the_figures_show_it(one):
     page = (one.folder / "report.html").read_text(encoding="utf-8")
     assert page.count("<h2>Wavefront</h2>") == 1 and page.count("optical path difference in waves") == 1

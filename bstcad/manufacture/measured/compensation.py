@@ -56,7 +56,7 @@ MAP_POINTS = 201  # points per side of the maps
 
 
 @dataclass(frozen=True)
-class Settings:
+class CompensationSettings:
     """Settings of a round."""
 
     gain: float | None = None  # part of the deviation that is corrected; None: 1 / number of the round
@@ -80,7 +80,7 @@ class Settings:
             raise ValueError(f"--cutoff {self.cutoff:g}: is not between {allowed}; give a value between them")
 
 
-USUAL = Settings()
+USUAL = CompensationSettings()
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Statistics:
 
 
 @dataclass(frozen=True, eq=False)
-class Round:
+class CompensationRound:
     """A round: what was measured, and what to cut next."""
 
     number: int  # 1 for the first correction of a design
@@ -153,10 +153,11 @@ def measured_form(cloud: Cloud, lens: Lens, decentre: float | None) -> FormError
 
 
 def next_round(
-    lens: Lens, cut: BSplineSurface, clouds: Sequence[Cloud], settings: Settings, before: Sequence[Statistics],
+    lens: Lens, cut: BSplineSurface, clouds: Sequence[Cloud], settings: CompensationSettings,
+    before: Sequence[Statistics],
     decentre: float | None = None, rate: Callable[[BSplineSurface], float] | None = None,
     staying: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
-) -> Round:  # fmt: skip
+) -> CompensationRound:  # fmt: skip
     """Return the next round; ValueError, in one sentence, if it would diverge or there is nothing to correct.
 
     lens: the design, as re-read from its STEP file.  cut: net that was cut last, the design's in the first round.
@@ -200,7 +201,7 @@ def next_round(
     )
     following = replace(cut, heights=cut.heights + correction.heights)
     noise = float(np.sqrt(np.mean([form.noise**2 for form in forms])))
-    return Round(
+    return CompensationRound(
         len(before) + 1, following, correction, found=deviation, left=residue, deviation=found,
         expected=_statistics(left, inside), corrected=_statistics(change, inside), standard_error=error, noise=noise,
         parts=len(forms), gain=gain, cutoff=cutoff, volume=volume(change, inside, net),

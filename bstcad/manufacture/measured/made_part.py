@@ -19,7 +19,8 @@ from bstcad.optics.lens.lens import Lens
 from bstcad.optics.receivers.goal import Goal, worst
 from bstcad.optics.trace.measure import Effort, Light
 from bstcad.optics.trace.wavefront_error import wavefront_error
-from bstcad.verify.checks import WAVEFRONT, Nominal
+from bstcad.verify.checks import WAVEFRONT
+from bstcad.verify.nominal import Nominal
 from bstcad.verify.verdict import Check
 
 MAX_RMS_DISTANCE = 3e-3  # RMS distance after alignment / BackFace.reach, above which a part is of another design

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bstcad.designs.folder import Made
+from bstcad.designs.made import Made
 from bstcad.designs.pipeline import DesignOptions, Earlier, design
 from bstcad.manufacture.measured.cloud import load as load_cloud
 from bstcad.manufacture.measured.compensation import measured_form
@@ -28,7 +28,8 @@ from bstcad.scene.blank import INDEX_OFFSETS
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import FIT_SIZES, FileNet, NetFront, fit_net, net_extent
 from bstcad.scene.scene import Scene
-from bstcad.tailoring.run import NO_HOOKS, Hooks, NetParameters, Parameters, stage_effort
+from bstcad.tailoring import effort as efforts
+from bstcad.tailoring.run import NO_HOOKS, Hooks, NetParameters, Parameters
 
 KEYS = "front", "thickness", "index"
 OPTION = "--as-built"
@@ -88,9 +89,8 @@ def retailor(made: Made, built: AsBuilt, hooks: Hooks = NO_HOOKS) -> Retailored:
     found = design(scene, device=made.device, hooks=hooks, options=options)
     before = earlier.parameters.apply_to(scene.flat_lens(scene.lens.back.net))
     states = (made, made.lens), (found, scene.as_mounted(replace(before.plain(), index=scene.index)))
-    rrmsds = (
-        max(light.rrmsd for light in of.lights(lens, of.goals, stage_effort(of.goals, RAYS))) for of, lens in states
-    )
+    rays = efforts.FULL.between_stages(made.goals, RAYS)
+    rrmsds = (max(light.rrmsd for light in of.lights(lens, of.goals, rays)) for of, lens in states)
     return Retailored(found, *rrmsds)
 
 
@@ -167,13 +167,13 @@ def _moved(lens: Lens, scene: Scene, shift: float) -> Parameters:
     """Return the parameters of a lens, its back moved by a shift (mm), for the blank of a scene."""
     old, flat, dome = Parameters.of(lens), scene.flat_lens(scene.lens.back.net), scene.lens.dome
     every: tuple[Face, ...] = ("front", "back")
-    faces = [face for face in every if lens.shapes(face)]
-    nets = {face: old.nets[lens.freeform.index(lens.number_of(face))] for face in faces}
+    faces = [face for face in every if lens.is_tailored(face)]
+    nets = {face: old.nets[lens.tailored_numbers.index(lens.number_of(face))] for face in faces}
     if "back" in nets and dome is None:
         nets["back"] = NetParameters(nets["back"].z + shift, nets["back"].heights)
     elif "back" in nets and dome is not None:  # the dome grows about its centre
         nets["back"] = NetParameters(nets["back"].z, dome.radius / (dome.radius - shift) * nets["back"].heights)
-    shaped = [face for face in faces if flat.shapes(face)]  # a front as built is tailored no more
+    shaped = [face for face in faces if flat.is_tailored(face)]  # a front as built is tailored no more
     shaped.sort(key=lambda face: flat.number_of(face))
     front = {} if flat.front.is_net else flat.front.parameters()
     return Parameters(tuple(nets[face] for face in shaped), front, old.back + (shift if dome is None else 0.0))

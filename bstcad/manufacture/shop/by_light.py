@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from bstcad.designs.folder import Made
+from bstcad.designs.made import Made
 from bstcad.optics.surfaces.bspline import BSplineSurface, interpolating_net
 from bstcad.optics.trace.measure import tubes_picture
 
@@ -50,8 +50,8 @@ def jacobian(made: Made, net: BSplineSurface, columns: np.ndarray) -> np.ndarray
         back = replace(net, heights=net.heights + torch.from_numpy(interpolating_net(heights)))
         lens, parts = made.lens.with_back(back), []
         for goal in made.goals:
-            n = max(MIN_TUBES, math.ceil(TUBES_PER_PIXEL * max(goal.receiver.shape)))
-            flux = tubes_picture(lens, made.channels, goal.receiver, n).cpu().numpy()
+            n = max(MIN_TUBES, math.ceil(TUBES_PER_PIXEL * max(goal.screen.shape)))
+            flux = tubes_picture(lens, made.channels, goal.screen, n).cpu().numpy()
             parts.append((flux / flux.sum()).ravel() / np.linalg.norm(goal.picture / goal.picture.sum()))
         return np.concatenate(parts)
 

@@ -29,8 +29,8 @@ class DeviationFigures:
     """Sizes of a deviation over the face, along z."""
 
     __pydantic_config__ = record.STRICT
-    pv_mm: Size
-    rms_mm: Size
+    pv_mm: Size  # peak to valley (mm)
+    rms_mm: Size  # RMS (mm)
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class CloudFigures:
     """Cloud of points that was measured for a round."""
 
     __pydantic_config__ = record.STRICT
-    file: str
-    sha256: str
-    points: int
+    file: str  # name of the file
+    sha256: str  # SHA-256 of the file, by which a cloud that was used before is recognised
+    points: int  # number of points
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class RoundLight:
     """RRMSD of the picture: of the design, with the deviation measured, and with the one expected to remain."""
 
     __pydantic_config__ = record.STRICT
-    design: Rrmsd
-    measured: Rrmsd
-    expected: Rrmsd
+    design: Rrmsd  # RRMSD of the design
+    measured: Rrmsd  # RRMSD with the deviation measured
+    expected: Rrmsd  # RRMSD with the deviation expected to remain
     expected_by_form: Rrmsd | None = None  # RRMSD expected after a correction by form
 
 
@@ -59,22 +59,22 @@ class RoundFigures:
     """Contents of compensation.json, of which each number is finite."""
 
     __pydantic_config__ = record.STRICT
-    round: int
-    parts: int
-    clouds: tuple[CloudFigures, ...]
-    gain: Size
-    filter: str
-    cutoff_mm: Size
-    deviation: DeviationFigures
-    correction: DeviationFigures
-    expected_deviation: DeviationFigures
-    by: Literal["form", "light"]
-    volume_mm3: Size
-    volume_by_form_mm3: Size
-    may_stay: DeviationFigures | None
-    standard_error_mm: Size
-    noise_mm: Size
-    rrmsd: RoundLight
+    round: int  # number of the round, from 1
+    parts: int  # number of parts that were measured for this round
+    clouds: tuple[CloudFigures, ...]  # clouds of the parts
+    gain: Size  # fraction of the deviation that is corrected
+    filter: str  # kind of the low pass
+    cutoff_mm: Size  # cutoff wavelength of the low pass (mm)
+    deviation: DeviationFigures  # mean deviation of the parts from the design
+    correction: DeviationFigures  # change of the back
+    expected_deviation: DeviationFigures  # deviation expected to remain
+    by: Literal["form", "light"]  # light: of long waves, only what changes the picture is corrected
+    volume_mm3: Size  # volume of the correction (mm³)
+    volume_by_form_mm3: Size  # volume of a correction of the whole form (mm³)
+    may_stay: DeviationFigures | None  # deviation that a correction by light leaves; None: by form
+    standard_error_mm: Size  # standard error of the measured deviation (mm RMS)
+    noise_mm: Size  # noise of the measured points (mm RMS)
+    rrmsd: RoundLight  # RRMSDs of the picture
 
 
 def read_round(place: Path) -> RoundFigures:

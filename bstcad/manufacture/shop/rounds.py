@@ -16,12 +16,12 @@ import numpy as np
 import torch
 
 from bstcad.designs import folder as folders
-from bstcad.designs.folder import Made
+from bstcad.designs.made import Made
 from bstcad.figures.shop_figures import correction_figure
 from bstcad.manufacture.measured import compensation
 from bstcad.manufacture.measured.cloud import Cloud
 from bstcad.manufacture.measured.cloud import load as load_cloud
-from bstcad.manufacture.measured.compensation import Round, Settings, Statistics
+from bstcad.manufacture.measured.compensation import CompensationRound, CompensationSettings, Statistics
 from bstcad.manufacture.shop import by_light
 from bstcad.manufacture.shop.production import FIGURES, ROUND_REMEDY, ROUNDS, read_round, write_production_page
 from bstcad.optics.lens.lens import Lens
@@ -71,7 +71,12 @@ class Compensated:
 
 
 def compensate(
-    made: Made, folder: Path, clouds: Sequence[Path], settings: Settings, progress: Progress, effort: Effort = FULL
+    made: Made,
+    folder: Path,
+    clouds: Sequence[Path],
+    settings: CompensationSettings,
+    progress: Progress,
+    effort: Effort = FULL,
 ) -> Compensated:
     """Write the next round of a design; ValueError, in one sentence, if it would diverge or a cloud cannot serve.
 
@@ -133,7 +138,7 @@ def _last(folder: Path, lens: Lens) -> tuple[BSplineSurface, list[Statistics], s
     return cut, before, used
 
 
-def _figures(made: Made, found: Round, clouds: Sequence[Cloud], effort: Effort) -> dict[str, Any]:
+def _figures(made: Made, found: CompensationRound, clouds: Sequence[Cloud], effort: Effort) -> dict[str, Any]:
     """Return the contents of compensation.json."""
     lens, goal = made.lens, made.goals[0]
     back, cheap = lens.back_net, replace(made.effort(effort), witness=False)

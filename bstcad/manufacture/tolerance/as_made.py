@@ -113,7 +113,7 @@ def as_made(
     if layer_height is not None:
         table = (*table, Tolerance(layer_height=layer_height))
     name, finish = base_grade(table), finish_of(table)
-    light = Light.of(scene, lens, goals)
+    light = SceneLight.of(scene, lens, goals)
     formed = _with_form_error(lens, light, table)
     plain = replace(finish, layer_height=None, ripple=0.0, smoothing_length=0.0, roughness=0.0)
     marks = replace(finish, roughness=0.0)
@@ -131,7 +131,7 @@ def as_made(
         before, after = designed[k], made[k]
         changes = {effect: difference(pictures[k], before) for effect, pictures in alone.items()}
         ordered = dict(sorted(changes.items(), key=lambda item: -item[1]))
-        blur = scatter.angle * abs(per_radian(lens, goal.receiver))
+        blur = scatter.angle * abs(per_radian(lens, goal.screen))
         of_target = goal.picture.sum()
         found.append(
             GoalAsMade(
@@ -143,7 +143,7 @@ def as_made(
                 light=float(after.sum()),
                 changes=ordered,
                 blur=blur,
-                unit=goal.receiver.plane.unit,
+                unit=goal.screen.receiver.unit,
             )  # fmt: skip
         )
     words = GRADES[name].words if name in GRADES else "as stated in the scene"
@@ -151,7 +151,7 @@ def as_made(
 
 
 @dataclass(frozen=True)
-class Light:
+class SceneLight:
     """Light of a scene on its targets; that of an extended source is the light of its centre, blurred."""
 
     channels: tuple[Channel, ...]  # light of a point source or of the centre of an extended source
@@ -159,17 +159,17 @@ class Light:
     blurs: tuple[tuple[BlurOperator, ...], ...]  # blurs by the extended source, by goal and channel; (): a point source
 
     @classmethod
-    def of(cls, scene: Scene, lens: Lens, goals: Sequence[Goal]) -> Light:
+    def of(cls, scene: Scene, lens: Lens, goals: Sequence[Goal]) -> SceneLight:
         """Return the light of a scene; lens: designed lens, whose images of the source blur the pictures."""
-        draw = scene.draw  # None: a point source or a parallel beam
-        if scene.source.extent is None or draw is None:
+        sampler = scene.sampler  # None: a point source or a parallel beam
+        if scene.source.extent is None or sampler is None:
             return cls(scene.channels(), tuple(goals), ())
-        source = ExtendedSource(scene.light, scene.with_source_scaled(0.0).channels(), draw)
-        return cls(source.centre, tuple(goals), tuple(blurs(source, lens.plain(), goal.receiver) for goal in goals))
+        source = ExtendedSource(scene.light, scene.with_source_scaled(0.0).channels(), sampler)
+        return cls(source.centre, tuple(goals), tuple(blurs(source, lens.plain(), goal.screen) for goal in goals))
 
     def pictures(self, lens: Lens, finish: Finish) -> list[np.ndarray]:
         """Return flux per pixel (rows, columns) / flux of the source, on each target, for a lens with a finish."""
-        screens = [goal.receiver for goal in self.goals]
+        screens = [goal.screen for goal in self.goals]
         pixels = max(max(screen.shape) for screen in screens)
         if self.blurs:
             screens = [with_border(screen, blur[0].border) for screen, blur in zip(screens, self.blurs, strict=True)]
@@ -179,7 +179,7 @@ class Light:
 
     def _picture(self, k: int, found: Sequence[Tensor], lens: Lens, finish: Finish) -> np.ndarray:
         """Return the picture of goal k from the light of each channel, blurred by the source and by roughness."""
-        receiver = self.goals[k].receiver
+        receiver = self.goals[k].screen
         shift, (columns, rows) = per_radian(lens, receiver), receiver.per_unit
         parts = []
         for j, channel in enumerate(self.channels):
@@ -191,7 +191,7 @@ class Light:
         return np.asarray(weighted_sum(self.channels, parts))
 
 
-def _with_form_error(lens: Lens, light: Light, table: Sequence[Tolerance]) -> Lens:
+def _with_form_error(lens: Lens, light: SceneLight, table: Sequence[Tolerance]) -> Lens:
     """Return the lens with one random form error on its back, whose RMS is the limit of back.form."""
     values = settings_of(table, FORM[0])
     if values.get("grade") == NONE or "back" not in lens.optical_faces:
@@ -204,7 +204,7 @@ def _with_form_error(lens: Lens, light: Light, table: Sequence[Tolerance]) -> Le
         kind = form_error(lens, length, FORM_SEED)
     except ValueError:  # the net is too coarse for the correlation length
         return lens
-    return kind.apply(Setup(lens, light.channels, light.goals[0].receiver), size).lens
+    return kind.apply(Setup(lens, light.channels, light.goals[0].screen), size).lens
 
 
 def scaled(picture: np.ndarray, size: float) -> np.ndarray:

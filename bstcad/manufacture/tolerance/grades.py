@@ -91,17 +91,29 @@ GRADES = {
 
 def grade_limit(kind: Kind, grade: ToleranceGrade, setup: Setup) -> float:
     """Return the limit (±) that a grade sets for a kind of error, in the unit of the kind."""
-    part, _, error = kind.name.partition(".")
-    if part == "screen" and kind.unit == "mm":
+    field = limit_of(kind.name)
+    if field == "screen" and kind.unit == "mm":
         screen, z = setup.screen, setup.pivot("lens")[2]
-        distance = abs(screen.plane.throw(z))
-        width = (screen.x[1] - screen.x[0]) * (distance / abs(screen.plane.per_radian(z)))  # mm
-        return grade.screen * (distance if error == "axial" else width)
-    if error.startswith(("tilt", "clocking", "wedge")):
-        return grade.tilt
-    if error.startswith(("decentre", "axial")):
-        return grade.decentre
-    return grade.source if part == "source" else getattr(grade, error or part)
+        distance = abs(screen.receiver.throw(z))
+        width = (screen.x[1] - screen.x[0]) * (distance / abs(screen.receiver.per_radian(z)))  # mm
+        return grade.screen * (distance if kind.name == "screen.axial" else width)
+    return grade.decentre if field == "screen" else getattr(grade, field)
+
+
+# field of ToleranceGrade by the name of an error without its part; other errors have a field of their own name
+FIELDS = {
+    **dict.fromkeys(("tilt", "tilt_x", "tilt_y", "clocking", "wedge", "wedge_x", "wedge_y"), "tilt"),
+    **dict.fromkeys(("decentre", "decentre_x", "decentre_y", "axial"), "decentre"),
+}
+
+
+def limit_of(name: str) -> str:
+    """Return the field of ToleranceGrade that limits the error of this name, such as lens.decentre_x."""
+    part, _, error = name.partition(".")
+    field = FIELDS.get(error)
+    if field is not None:
+        return "screen" if (part, field) == ("screen", "decentre") else field
+    return "source" if part == "source" else error or part
 
 
 def graded_table(table: Sequence[Tolerance], grade: str | None = None) -> tuple[Tolerance, ...]:
@@ -142,7 +154,7 @@ def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None
     errors = []
     for kind in kinds(setup, material).values():
         values = settings_of(table, kind.name)
-        left_out = kind.name.startswith(TWO_FACE_ERRORS) and not _names_error(table, kind.name)
+        left_out = kind.name in TWO_FACE_ERRORS and not _names_error(table, kind.name)
         if values.get("grade") != NONE and not left_out:
             stated = "limit" in values
             size = values["limit"] if stated else grade_limit(kind, GRADES[values["grade"]], setup)
@@ -150,7 +162,7 @@ def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None
     errors += _face_errors(setup.lens, table)
     for k, entry in enumerate(table[1:]):
         off = entry.name and settings_of(table, entry.name).get("grade") == NONE
-        if entry.name and not off and entry.name.startswith(TWO_FACE_ERRORS) and "front" not in setup.lens.passes.faces:
+        if entry.name and not off and entry.name in TWO_FACE_ERRORS and "front" not in setup.lens.passes.faces:
             reason = "is an error of a lens with two faces, but a mirror has one face"
             raise SceneError(f"tolerance[{k}].name: {entry.name!r} {reason}; remove that table")
         if entry.name and not off and not any(entry.covers(error.kind.name) for error in errors):

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bstcad.manufacture.tolerance.as_made import Light, scaled
+from bstcad.manufacture.tolerance.as_made import SceneLight, scaled
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import rrmsd_of_pictures
@@ -77,7 +77,7 @@ def lit_by(scene: Scene, lens: Lens, goals: Sequence[Goal], name: str, distance:
     SceneError for an unknown light, or one that does not go with the scene.
     """
     other, distance = scene_lit_by(scene, name, distance)
-    before, after = (Light.of(each, lens, goals).pictures(lens, Finish()) for each in (scene, other))
+    before, after = (SceneLight.of(each, lens, goals).pictures(lens, Finish()) for each in (scene, other))
     found = tuple(
         GoalLit(goal.key, goal.picture, scaled(one, goal.picture.sum()), scaled(two, goal.picture.sum()))
         for goal, one, two in zip(goals, before, after, strict=True)

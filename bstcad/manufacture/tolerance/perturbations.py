@@ -119,6 +119,7 @@ class Kind:
     words: str  # name in reports
     unit: str  # unit of its amounts; "" for a ratio
     apply: Callable[[Setup, float], Setup]  # function (setup, amount) -> setup with this error added
+    moves: bool = False  # True if a part moves; errors of shape act before motions
 
 
 @dataclass(frozen=True)
@@ -165,8 +166,7 @@ def draws(perturbations: Sequence[Perturbation], uniform: np.ndarray) -> np.ndar
 def perturb(setup: Setup, perturbations: Sequence[Perturbation], amounts: Sequence[float]) -> Setup:
     """Apply amounts (n,), in the order of the perturbations, to a setup; errors of shape come before motions."""
     pairs = [(p.kind, float(a)) for p, a in zip(perturbations, amounts, strict=True) if a]
-    motions = ("lens.decentre", "lens.tilt", "lens.axial", "lens.clocking", "source.", "screen.", "front.decentre")
-    for kind, amount in sorted(pairs, key=lambda pair: pair[0].name.startswith(motions)):
+    for kind, amount in sorted(pairs, key=lambda pair: pair[0].moves):
         setup = kind.apply(setup, amount)
     return setup
 
@@ -196,7 +196,7 @@ def kinds(setup: Setup, material: str | None = None) -> dict[str, Kind]:
 
 def _motions(setup: Setup) -> Iterator[Kind]:
     sources, without_effect = [channel.source for channel in setup.channels], {"source.clocking"}
-    if setup.screen.plane.chart:  # directions, which a shift does not change
+    if setup.screen.receiver.goniometer:  # directions, which a shift does not change
         without_effect |= {"screen.decentre_x", "screen.decentre_y", "screen.axial"}
     if all(source.is_shift_invariant for source in sources):
         without_effect.add("source.axial")  # a shift of collimated light along the axis has no effect
@@ -206,8 +206,8 @@ def _motions(setup: Setup) -> Iterator[Kind]:
         name = setup.lens.passes.optic if part == "lens" else part
         for error, words, axis, turns in MOTIONS:
             if f"{part}.{error}" not in without_effect:
-                moves = partial(_move_part, part, axis, turns)
-                yield Kind(f"{part}.{error}", words.format(name), "deg" if turns else "mm", moves)
+                move = partial(_move_part, part, axis, turns)
+                yield Kind(f"{part}.{error}", words.format(name), "deg" if turns else "mm", move, moves=True)
 
 
 def _move_part(part: str, axis: int, turns: bool, setup: Setup, by: float) -> Setup:
@@ -219,7 +219,7 @@ def _shapes(setup: Setup, material: str | None) -> Iterator[Kind]:
     optic, refracts = setup.lens.passes.optic, setup.lens.passes.enters
     if refracts:
         yield Kind("lens.thickness", f"thickness of the {optic}", "mm", _change_thickness)
-        yield Kind("lens.index", "refractive index", "", lambda setup, by: setup.with_indices(lambda n: n + by))
+        yield Kind("lens.index", "refractive index", "", lambda s, by: s.with_indices(lambda n: n + by))
         if setup.lens.shares_outline:  # the front of another lens is nearly vertical at its rim
             yield Kind("lens.front_power", "sag of the front at its rim", "mm", _change_front_power)
     yield Kind("lens.scale", f"scale of the {optic} (shrinkage)", "", lambda s, by: s.with_lens_scaled(1 + by))
@@ -271,10 +271,10 @@ def _change_wavelength(material: str, setup: Setup, by: float) -> Setup:
 def _lights(setup: Setup) -> Iterator[Kind]:
     sources = [channel.source for channel in setup.channels]
     if any(source.with_wider_cone(0.0) for source in sources):
-        yield Kind("source.angle", "width of the source's cone, relative", "", _change_cone)
+        yield Kind("source.angle", "width of the source's cone, relative", "", _change_cone, moves=True)
     extended = len({source.place for source in sources}) > 1
     if extended and all(source.moved_away(0.0, source.place) for source in sources):
-        yield Kind("source.size", "size of the source, relative", "", _change_size)
+        yield Kind("source.size", "size of the source, relative", "", _change_size, moves=True)
 
 
 def _change_cone(setup: Setup, by: float) -> Setup:
@@ -295,7 +295,7 @@ def _alignments(lens: Lens) -> Iterator[Kind]:
         yield Kind(f"lens.wedge_{name}", words, "deg", partial(_tilt_back, axis))
         if not lens.front.level:
             words = f"decentre of the front in {name} relative to the back"
-            yield Kind(f"front.decentre_{name}", words, "mm", partial(_decentre_front, axis))
+            yield Kind(f"front.decentre_{name}", words, "mm", partial(_decentre_front, axis), moves=True)
 
 
 def _decentre_front(axis: int, setup: Setup, by: float) -> Setup:

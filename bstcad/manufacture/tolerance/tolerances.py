@@ -43,6 +43,10 @@ Spread = TypedDict("Spread", {"5 %": Size, "50 %": Size, "95 %": Size})  # perce
 Disagreement = TypedDict("Disagreement", {"median": Size, "95 %": Size})  # relative errors of superposed RRMSD or RMS
 
 
+# grades whose layers, tool marks or roughness a maker finishes
+FINISHED_GRADES = ("milled-polished", "milled-sanded", "resin-printed", "resin-printed-coated")
+
+
 @dataclass(frozen=True)
 class Grade:
     """Grade of manufacture that gives the default widths of the errors."""
@@ -53,7 +57,7 @@ class Grade:
     @property
     def has_finish(self) -> bool:
         """True for a grade of a maker, whose layers or roughness change the picture."""
-        return self.name.startswith(("milled", "resin"))
+        return self.name in FINISHED_GRADES
 
 
 @dataclass(frozen=True)

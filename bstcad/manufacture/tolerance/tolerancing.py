@@ -35,7 +35,7 @@ from bstcad.runs import files
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import Target
-from bstcad.verify.checks import DEFAULT_RRMSD_LIMIT, Nominal
+from bstcad.verify.nominal import DEFAULT_RRMSD_LIMIT, Nominal
 
 TRACED_SOURCE_POINTS = 64  # number of points that sample an extended source
 
@@ -93,14 +93,14 @@ def _pictures(scene: Scene, nominal: Nominal, settings: StudySettings) -> tuple[
     channels = scene.channels(TRACED_SOURCE_POINTS) if scene.source.extent else scene.channels()
     setup = Setup(nominal.lens, channels, scene.target.screen)
     errors = perturbations(setup, graded_table(scene.tolerance, settings.grade), scene.lens.material)
-    setups = [(replace(setup, screen=goal.receiver), goal.picture) for goal in nominal.goals]
+    setups = [(replace(setup, screen=goal.screen), goal.picture) for goal in nominal.goals]
     return tuple(TargetPictures(each, errors, picture, settings.tubes) for each, picture in setups)
 
 
 def _rrmsd(nominal: Nominal, pictures: TargetPictures) -> float:
     screen, effort = pictures.setup.screen, nominal.effort(Effort(witness=False, cells=1))
-    lens, channels, draw = nominal.lens, nominal.channels, nominal.scene.draw
-    return measure(lens, channels, screen, pictures.target, effort=effort, draw=draw).rrmsd
+    lens, channels, sampler = nominal.lens, nominal.channels, nominal.scene.sampler
+    return measure(lens, channels, screen, pictures.target, effort=effort, sampler=sampler).rrmsd
 
 
 def _grade(scene: Scene, grade: str | None) -> Grade:
@@ -142,7 +142,7 @@ def _record(scene: Scene, settings: StudySettings, study: Study, goals: Sequence
 
 
 def _of_target(key: str, target: Target, study: Study) -> TargetStudy:
-    where, figures = target.screen.plane.position_text(), _shared_figures(study, [study])
+    where, figures = target.screen.receiver.position_text(), _shared_figures(study, [study])
     return TargetStudy(key=key, where=where, **figures, sensitivities=study.sensitivities)
 
 

@@ -337,7 +337,7 @@ def _clear_columns(own, touched, corner, scale):
         reductions.clear(own, touched, int(low), int(high))
 
 
-@compiled(parallel=True)
+@compiled(threads_by="flux")
 def _clip(corner, scale, flux, thinnest, sums, touched, far):
     """Add the flux of the two triangles of each tube to `sums`, (parts, columns, rows + 1), and set `far`, (parts,).
 
@@ -360,7 +360,7 @@ def _clip(corner, scale, flux, thinnest, sums, touched, far):
             _add_end(sums[c], corner, scale, last, upper)
 
 
-@compiled(parallel=True)
+@compiled(threads_by="image")
 def _running_sums(sums, touched, image):
     """Set image (columns, rows) to the running sums down the columns of the sum of all parts, added in their order."""
     columns, rows = image.shape
@@ -374,7 +374,7 @@ def _running_sums(sums, touched, image):
             image[i, j] += image[i, j - 1]
 
 
-@compiled(parallel=True)
+@compiled(threads_by="g")
 def _sums_below(g, below):
     """Set below[i, j] to the sum of g[i, j:], for j up to the number of rows."""
     columns, rows = g.shape
@@ -539,7 +539,7 @@ def _add_rest_of_row(g, corner, scale, flux, k, flags, g_far, d_corner, d_flux):
             d_flux[k, r] += 0.5 * mean
 
 
-@compiled(parallel=True)
+@compiled(threads_by="flux")
 def clip_adjoint(corner, scale, flux, thinnest, g, below_g, g_far, d_corner, d_flux):
     """Add the gradient in the corners to d_corner; store the gradient in the flux in d_flux, (n, m) or empty.
 

@@ -245,7 +245,7 @@ def _add_directions(tilted, g, status, first, count, work):
     C: with r = hypot(x, y), s = θ / r and θ = atan2(r, z), ds = (dθ - s dr) / r and dθ = z dr - r dz.
     """
     n_z = tilted.n_z
-    if tilted.chart == 1:
+    if tilted.goniometer == 1:
         forward.angles_by_radius(E_X, E_Y, E_Z, n_z, count, work)
         for r in range(count):
             at, ex, ey, ez, s = first + r, work[E_X + r], work[E_Y + r], n_z * work[E_Z + r], work[S + r]
@@ -261,11 +261,11 @@ def _add_directions(tilted, g, status, first, count, work):
         at, ex, ey, ez = first + r, work[E_X + r], work[E_Y + r], n_z * work[E_Z + r]
         gx, gy = (g[0, at], g[1, at]) if status[at] == 0 else (0.0, 0.0)
         gx, gy = forward.DEGREES * gx, forward.DEGREES * gy
-        one, other, g_one, g_other = (ex, ey, gx, gy) if tilted.chart == 2 else (ey, ex, gy, gx)
+        one, other, g_one, g_other = (ex, ey, gx, gy) if tilted.goniometer == 2 else (ey, ex, gy, gx)
         flat = one * one + ez * ez
         by_one, by_z = g_one * ez / flat, -g_one * one / flat
         by_other = g_other / math.sqrt(max(1.0 - other * other, 1e-12))
-        by_x, by_y = (by_one, by_other) if tilted.chart == 2 else (by_other, by_one)
+        by_x, by_y = (by_one, by_other) if tilted.goniometer == 2 else (by_other, by_one)
         work[G_DX + r] += by_x
         work[G_DY + r] += by_y
         work[G_DZ + r] += n_z * by_z
@@ -275,7 +275,7 @@ def _add_directions(tilted, g, status, first, count, work):
 def _add_landing(faces, throw, tilted, g, status, first, count, work):
     """Add ∂L/∂(hit, direction behind the face) of rays that land on a screen; g (2, n): ∂L/∂landing."""
     if tilted is not None:
-        if tilted.chart > 0:
+        if tilted.goniometer > 0:
             _add_directions(tilted, g, status, first, count, work)
         else:
             _add_tilted(faces, throw, tilted, g, status, first, count, work)

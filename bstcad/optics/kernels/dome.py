@@ -490,11 +490,11 @@ def _rays(net, light, both, tilted, losses, x, y, landing, flux, fate):
             flux[first + r], fate[first + r] = work[FLUX + r], np.uint8(work[FATE + r])
 
 
-def _scene(source: Emitter, lens: Lens, plane: Receiver) -> forward.Scene:
+def _scene(source: Emitter, lens: Lens, receiver: Receiver) -> forward.Scene:
     """Return net, light, faces and tilted screen for the kernels."""
     *front, last = lens.interfaces
     net, face = _as_numbers(last)
-    faces, tilted = kernel_arguments.faces(last, plane, 1, last.surface.z)
+    faces, tilted = kernel_arguments.faces(last, receiver, 1, last.surface.z)
     first = dome_light.front_of(front, last.surface.z)
     both = DomeFaces(face._replace(faces=faces._replace(front_eta=first.face.eta)), first)
     return net_of(net), kernel_arguments.beam(source, lens), both, tilted

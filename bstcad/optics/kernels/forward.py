@@ -259,12 +259,12 @@ def _about_axis(one, other, at_one, at_other, n_z, count, work):
 @njit(error_model="numpy")
 def to_directions(tilted, count, work):
     """Replace the places of rays by the coordinates (degrees) of their directions (`Directions.coordinates`)."""
-    if tilted.chart == 1:
+    if tilted.goniometer == 1:
         angles_by_radius(DX, DY, DZ, tilted.n_z, count, work)
         for r in range(count):
             scale = DEGREES * work[S + r]
             work[X + r], work[Y + r] = scale * work[DX + r], scale * work[DY + r]
-    elif tilted.chart == 2:
+    elif tilted.goniometer == 2:
         _about_axis(DX, DY, X, Y, tilted.n_z, count, work)
     else:
         _about_axis(DY, DX, Y, X, tilted.n_z, count, work)
@@ -291,7 +291,7 @@ def to_tilted(faces, throw, tilted, count, work):
 def to_screen(faces, throw, tilted, count, work):
     """Move rays from the back face to the screen; store x and y on it.  throw: as `Faces.throw`."""
     if tilted is not None:
-        if tilted.chart > 0:
+        if tilted.goniometer > 0:
             to_directions(tilted, count, work)
         else:
             to_tilted(faces, throw, tilted, count, work)
@@ -645,7 +645,7 @@ def simulate(
         for arguments in scenes[c::count] if many else scenes:
             form.rows(*arguments, pixels, *((0, 1) if many else (c, count)), box[c], tent[c], lines[c])
 
-    scenes = list(_scenes(lights, screen.plane, n, form.scene))
+    scenes = list(_scenes(lights, screen.receiver, n, form.scene))
     reductions.on_threads(part, [(c,) for c in range(count)])
     rays = int(lines[:, COUNT].sum())
     box, tent, lines = (total.sum(0) for total in (box, tent, lines))
@@ -662,13 +662,13 @@ def _taken(lens: Lens) -> dict[str, int]:
 
 
 def _scenes(
-    lights: Sequence[SeededLight], plane: Receiver, n: int, scene: Callable[..., Scene]
+    lights: Sequence[SeededLight], receiver: Receiver, n: int, scene: Callable[..., Scene]
 ) -> Iterator[tuple[Any, ...]]:
     """Yield the first six arguments of `_rows` for each light; successive equal lenses are converted once."""
     last: tuple[Lens, tuple[Any, ...]] | None = None
     for weight, source, lens, seed, window in lights:
         if last is None or not _is_same(lens, last[0]):
-            last = lens, (scene(source, lens, plane), kernel_arguments.losses(lens))
+            last = lens, (scene(source, lens, receiver), kernel_arguments.losses(lens))
         (net, _, faces, tilted), losses = last[1]
         cells, beam = kernel_arguments.cells(window, n, seed), kernel_arguments.beam(source, lens)
         assert beam is not None  # else the plain form traces the light
@@ -684,13 +684,13 @@ def _is_same(one: Lens, other: Lens) -> bool:
     )
 
 
-def land(source: Emitter, lens: Lens, plane: Receiver, x: Tensor, y: Tensor, form: Form | None = None) -> Landed:
-    """Trace rays through (x, y) of the first vertex's plane, each (n,) float64, to `plane`; flux: density at (x, y).
+def land(source: Emitter, lens: Lens, receiver: Receiver, x: Tensor, y: Tensor, form: Form | None = None) -> Landed:
+    """Trace rays through (x, y) of the first vertex's plane, each (n,) float64, to `receiver`; flux: density at (x, y).
 
     Equal to `trace.trace` of these `source.rays_through` without losses, except for the status of rays without flux.
     """
     form = form or HEIGHTS
-    scene = *form.scene(source, lens, plane), NO_LOSS_TABLES
+    scene = *form.scene(source, lens, receiver), NO_LOSS_TABLES
     landing, flux, fate = np.empty((2, x.numel())), np.empty(x.numel()), np.empty(x.numel(), np.uint8)
     reductions.on_threads(
         lambda first, last: form.rays(
@@ -701,11 +701,11 @@ def land(source: Emitter, lens: Lens, plane: Receiver, x: Tensor, y: Tensor, for
     return Landed(torch.from_numpy(landing), torch.from_numpy(flux), torch.from_numpy(fate))
 
 
-def _scene(source: Emitter, lens: Lens, plane: Receiver) -> Scene:
+def _scene(source: Emitter, lens: Lens, receiver: Receiver) -> Scene:
     """Return net, beam, faces and tilted screen for the kernels; light along -z is reflected by z -> -z."""
     (*front, last), z = lens.interfaces, lens.entrance.z
     heights = last.net.heights
-    faces = kernel_arguments.faces(last, plane, lens.passes.sense, z, *front)
+    faces = kernel_arguments.faces(last, receiver, lens.passes.sense, z, *front)
     return net_of(-heights if lens.passes.sense < 0 else heights), kernel_arguments.beam(source, lens), *faces
 
 

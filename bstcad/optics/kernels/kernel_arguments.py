@@ -162,13 +162,15 @@ def _table_of_light(source: Emitter, window: Rectangle, z: float) -> Beam | None
     return None
 
 
-def _tilted(plane: Receiver, before: int, behind: int) -> records.TiltedScreen:
-    """Return a plane as numbers; before, behind: sense of light on the net's two sides."""
-    if plane.chart:  # the coordinates of the direction, whose z component is `before` times that in the kernels' frame
-        return records.TiltedScreen._make([*floats([0.0, 0.0, 0.0, 0.0, before, *6 * [0.0]]), plane.chart])
-    assert plane.axes is not None  # no kernel traces to other receivers
-    along_x, along_y, normal = ((*axis[:2], before * axis[2]) for axis in plane.axes)
-    numbers = floats([*plane.middle[:2], *(behind * n for n in normal), *along_x, *along_y])
+def _tilted(receiver: Receiver, before: int, behind: int) -> records.TiltedScreen:
+    """Return a receiver as numbers; before, behind: sense of light on the net's two sides."""
+    if (
+        receiver.goniometer
+    ):  # the coordinates of the direction, whose z component is `before` times that in the kernels' frame
+        return records.TiltedScreen._make([*floats([0.0, 0.0, 0.0, 0.0, before, *6 * [0.0]]), receiver.goniometer])
+    assert receiver.axes is not None  # no kernel traces to other receivers
+    along_x, along_y, normal = ((*axis[:2], before * axis[2]) for axis in receiver.axes)
+    numbers = floats([*receiver.middle[:2], *(behind * n for n in normal), *along_x, *along_y])
     return records.TiltedScreen._make([*numbers, 0])
 
 

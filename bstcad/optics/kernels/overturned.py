@@ -58,7 +58,7 @@ def _strip(corner, flux, factor, least, most, slope, first, last):
     return part
 
 
-@compiled(parallel=True, error_model="numpy")
+@compiled(threads_by="flux", error_model="numpy")
 def _penalty(corner, flux, factor, least, most, slope, sums):
     """Store the penalty of each strip of rows in `sums`, and add its gradient in the corners to `slope`.
 

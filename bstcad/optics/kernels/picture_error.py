@@ -20,7 +20,7 @@ SUMS = 4  # sums of each row of pixels: the error, and E^s, (E^s)² and E^s E of
 ERROR, LIGHT, SQUARE, PRODUCT = range(SUMS)
 
 
-@compiled(parallel=True, error_model="numpy")
+@compiled(threads_by="image", error_model="numpy")
 def _errors(image, target, flux, weights, gradient, sums):
     """Store the gradient of Σ_l weights[l] Σ d_l², and the sums of each row of pixels.
 

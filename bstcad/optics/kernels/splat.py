@@ -16,7 +16,7 @@ from bstcad.optics.numerics.compiling import compiled
 RAYS_PER_TASK = 4096  # number of rays per task, whose coordinates and results stay in the second-level cache
 
 
-@compiled(parallel=True)
+@compiled(threads_by="flux")
 def _splat(position, flux, frame, image, touched, outside):
     """Splat rays bilinearly onto pixel centres; image (parts, rows, columns), outside (parts,): as in `Splat`."""
     n = flux.size
@@ -53,7 +53,7 @@ def _splat(position, flux, frame, image, touched, outside):
         outside[c] = far
 
 
-@compiled(parallel=True)
+@compiled(threads_by="flux")
 def _splat_adjoint(position, flux, frame, g, g_outside, d_position):
     """Compute d_position from the gradients g (rows, columns) in the picture and g_outside in the sum of `outside`."""
     rows, columns = g.shape

@@ -183,7 +183,7 @@ def beyond2(x, y, limit_x, limit_y):
 # --- at many points ---------------------------------------------------------------------------------------------------
 
 
-@compiled(parallel=True)
+@compiled(threads_by="u")
 def _evaluate(net, m, n, u, v, h, h_u, h_v):
     count = u.size
     for c in prange((count + POINTS_PER_TASK - 1) // POINTS_PER_TASK):
@@ -191,7 +191,7 @@ def _evaluate(net, m, n, u, v, h, h_u, h_v):
             h[r], h_u[r], h_v[r] = sag(net, m, n, float(u[r]), float(v[r]))
 
 
-@compiled(parallel=True)
+@compiled(threads_by="u")
 def _adjoint_in_net(u, v, g, g_u, g_v, d_net, touched):
     """Add the gradient in the net to d_net (parts, m, n), float64, a separate sum for each part (see reductions.py)."""
     n = u.size
@@ -202,7 +202,7 @@ def _adjoint_in_net(u, v, g, g_u, g_v, d_net, touched):
         scatter(d_net[c], touched[c], u[part], v[part], g[part], g_u[part], g_v[part])
 
 
-@compiled(parallel=True)
+@compiled(threads_by="u")
 def _adjoint_in_places(net, m, n, u, v, g, g_u, g_v, d_u, d_v):
     count = u.size
     for c in prange((count + POINTS_PER_TASK - 1) // POINTS_PER_TASK):

@@ -34,7 +34,7 @@ class Lens:
     at its back: light comes from above, along -z, and leaves along +z; its front, the rear of the plate, gets no light.
     A second-surface mirror reflects at its front, and light crosses its back twice.
     `passes` states which face acts on the light in which order; a face that light meets twice is two interfaces.
-    Rays are traced through `interfaces`; the surfaces that tailoring shapes are those of `freeform`.
+    Rays are traced through `interfaces`; the surfaces that tailoring shapes are those of `tailored_numbers`.
     """
 
     front: Surface  # lower surface, at smaller z
@@ -46,7 +46,7 @@ class Lens:
     clear: tuple[Outline, Outline] | None = None  # clear apertures (front, back); None: see `apertures`
     before: tuple[Interface, ...] = ()  # interfaces before the solid, such as a window
     behind: tuple[Interface, ...] = ()  # interfaces behind the solid, such as a fold mirror
-    shaped: tuple[int, ...] | None = None  # numbers of the interfaces that tailoring shapes; None: the back alone
+    tailored: tuple[int, ...] | None = None  # numbers of the interfaces that tailoring shapes; None: the back alone
     own_passes: Passes | None = None  # passes of the light through the solid; None: determined by `reflects`
 
     def __post_init__(self) -> None:
@@ -107,38 +107,38 @@ class Lens:
         return slice(len(self.before), len(self.before) + len(self.passes.steps))
 
     @property
-    def freeform(self) -> tuple[int, ...]:
+    def tailored_numbers(self) -> tuple[int, ...]:
         """Numbers of the interfaces whose nets tailoring shapes, in the order of the light."""
-        return (self.number_of("back"),) if self.shaped is None else self.shaped
+        return (self.number_of("back"),) if self.tailored is None else self.tailored
 
-    def shapes(self, face: Face) -> bool:
+    def is_tailored(self, face: Face) -> bool:
         """Return True if tailoring shapes this face of the solid."""
         first = len(self.before)
-        return any(first + k in self.freeform for k in self.passes.numbers_of(face))
+        return any(first + k in self.tailored_numbers for k in self.passes.numbers_of(face))
 
     @property
-    def shapes_two_faces(self) -> bool:
+    def has_two_tailored_faces(self) -> bool:
         """True if tailoring shapes front and back of a lens, which light crosses one after the other."""
-        return self.shapes("front") and self.shapes("back") and not self.passes.reflects
+        return self.is_tailored("front") and self.is_tailored("back") and not self.passes.reflects
 
-    def shaping(self, *faces: Face) -> Lens:
+    def with_tailored(self, *faces: Face) -> Lens:
         """Return the lens in which tailoring shapes these faces of the solid, given in the order of the light."""
-        return replace(self, shaped=tuple(self.number_of(face) for face in faces))
+        return replace(self, tailored=tuple(self.number_of(face) for face in faces))
 
     @property
     def nets(self) -> tuple[BSplineSurface, ...]:
-        """Surfaces of the interfaces in `freeform`; TypeError if one is not a net."""
-        return tuple(self.interfaces[k].net for k in self.freeform)
+        """Surfaces of the interfaces in `tailored_numbers`; TypeError if one is not a net."""
+        return tuple(self.interfaces[k].net for k in self.tailored_numbers)
 
     @property
     def front_vertex(self) -> float:
         """z (mm) where the front crosses the axis; a tailored net has another reference plane for its heights."""
-        return float(sag(self.front, 0.0, 0.0)) if self.shapes("front") else float(self.front.z)
+        return float(sag(self.front, 0.0, 0.0)) if self.is_tailored("front") else float(self.front.z)
 
     @property
-    def last_freeform(self) -> Interface:
+    def last_tailored(self) -> Interface:
         """Last freeform interface, which realises the transport map in stage 1."""
-        return self.interfaces[self.freeform[-1]]
+        return self.interfaces[self.tailored_numbers[-1]]
 
     def with_front(self, front: Surface) -> Lens:
         """Return the lens with another front."""
@@ -150,12 +150,12 @@ class Lens:
 
     def with_last_net(self, net: BSplineSurface) -> Lens:
         """Return the lens with another surface in place of the last of `nets`."""
-        return self._with_surface(self.freeform[-1], net)
+        return self._with_surface(self.tailored_numbers[-1], net)
 
     def with_nets(self, nets: Iterable[BSplineSurface]) -> Lens:
         """Return the lens with other surfaces in place of `nets`."""
         lens = self
-        for k, net in zip(self.freeform, nets, strict=True):
+        for k, net in zip(self.tailored_numbers, nets, strict=True):
             lens = lens._with_surface(k, net)
         return lens
 
@@ -188,7 +188,7 @@ class Lens:
     @property
     def like(self) -> Tensor:
         """Tensor of the precision and device of the lens: the heights of a net, else an empty one (float64, CPU)."""
-        last = self.last_freeform.surface
+        last = self.last_tailored.surface
         return last.heights if is_net(last) else torch.zeros(0, dtype=torch.float64)
 
     @property

@@ -41,7 +41,7 @@ class Channel:
 
 
 @dataclass(frozen=True)
-class Draw:
+class SourceSampler:
     """Samples of a source: its channels for a set of rays, by (number of points of an extended source, seed)."""
 
     sample: Callable[[int, int], Sequence[Channel]]
@@ -52,11 +52,11 @@ class Draw:
         return self.sample(points, seed)
 
 
-def channels_of(source: Emitter, index: Callable[[float], float], points: int, draw: int = 0) -> tuple[Channel, ...]:
+def channels_of(source: Emitter, index: Callable[[float], float], points: int, number: int = 0) -> tuple[Channel, ...]:
     """Return the channels of a source; index(nm) is the refractive index of the lens.
 
-    points: number of sample points of an extended source, all lines together, but at least two per line.  draw:
-    number that selects the points.  A point or parallel beam of one wavelength gives one channel, with `source` itself.
+    points: number of sample points of an extended source, all lines together, but at least two per line.  number:
+    number of the set of points.  A point or parallel beam of one wavelength gives one channel, with `source` itself.
     """
     extent = source.extent
     if extent is None:
@@ -65,7 +65,7 @@ def channels_of(source: Emitter, index: Callable[[float], float], points: int, d
         return tuple(Channel(light, index(nm), fraction) for light, (nm, fraction) in zip(lights, lines, strict=True))
 
     def points_of(fraction: float, k: int) -> list[tuple[float, float]]:
-        return sampling.point_pairs(extent, max(1, round(fraction * points / 2)), draw + k)
+        return sampling.point_pairs(extent, max(1, round(fraction * points / 2)), number + k)
 
     return _sample_extent(source, index, points_of)
 

@@ -26,7 +26,7 @@ MAX_INCLINATION = 89.0  # limit of the angle between light and the axis of the l
 
 
 @dataclass(frozen=True)
-class Collimated(Emitter):
+class CollimatedSource(Emitter):
     """Parallel rays through an aperture, on whose plane z the irradiance is that of a profile.
 
     uniform: constant.  gaussian: ∝ exp(-2 r² / radius_1e2²), or with two radii (w_x, w_y) ∝ exp(-2 q), q = x² / w_x² +
@@ -120,7 +120,7 @@ class Collimated(Emitter):
         """True if aperture, profile and cone of directions are round."""
         return self.aperture.is_round and not self.can_rotate
 
-    def moved(self, motion: Motion, entrance: float) -> Collimated:
+    def moved(self, motion: Motion, entrance: float) -> CollimatedSource:
         """Return the simple beam after a motion; entrance: z of the plane through the first vertex (mm).
 
         The aperture keeps its size in a plane z = const when the light is rotated, so the beam gets too narrow across
@@ -152,18 +152,18 @@ class Collimated(Emitter):
         return Circle(math.sin(math.radians(max(self.half_angles)))) if any(self.half_angles) else None
 
     @property
-    def central(self) -> Collimated:
+    def central(self) -> CollimatedSource:
         """Beam of the mean direction, at the main wavelength."""
         return replace(self, wavelength=self.main_wavelength, divergence=None)
 
-    def scaled(self, share: float) -> Collimated:
+    def scaled(self, share: float) -> CollimatedSource:
         """Return the beam with its divergence multiplied by `share`."""
         if not (share and self.divergence):
             return replace(self, divergence=None)
         along_x, along_y = (share * angle for angle in pair_of(self.divergence))
         return replace(self, divergence=(along_x, along_y) if isinstance(self.divergence, tuple) else along_x)
 
-    def element(self, u: float, v: float) -> Collimated:
+    def element(self, u: float, v: float) -> CollimatedSource:
         """Return the beam at (u, v) of the extent: d_x and d_y from cos α n + u e_x + v e_y, and d_z from |d| = 1.
 
         For two half angles, u and v are multiplied by sin α_x and sin α_y over the larger of them, e_x and e_y are

@@ -30,7 +30,7 @@ MAX_CONE_HALF_ANGLE = math.radians(89.0)  # rad, half angle below which light ha
 
 
 @dataclass(frozen=True)
-class Point(Emitter):
+class PointSource(Emitter):
     """Rays from one point into the half space on the side of the lens.
 
     gaussian: irradiance on z = const ∝ exp(-2 r² / w²), r from the axis, w = distance · tan(half_angle_1e2); with two
@@ -143,7 +143,7 @@ class Point(Emitter):
             others = {"profile": self.profile != "lambertian", "half_angle": self.half_angle is not None}
             if self.rays is not None:
                 others |= {key: getattr(self, key) is not None for key in ("intensity", *SIZE_KEYS, "real_diameter")}
-                if self.rays.facts.lines and self.wavelength != Point.wavelength:
+                if self.rays.facts.lines and self.wavelength != PointSource.wavelength:
                     yield "wavelength: the file of the rays states wavelengths of its own; remove this key"
             yield from (f"{key}: the source also has {kind}; remove one of them" for key in others if others[key])
         given = [name for name in ("width", "height") if getattr(self, name) is not None]
@@ -185,12 +185,12 @@ class Point(Emitter):
         """True for a point or a disc with a round profile."""
         return (self.extent is None or self.extent.is_round) and (self.law is None or self.law.is_round)
 
-    def moved(self, motion: Motion, entrance: float) -> Point:
+    def moved(self, motion: Motion, entrance: float) -> PointSource:
         """Return the point source after a motion; entrance: not used."""
         tilt = self.tilt if not motion.rotates else tilt_of(motion.direction(self.axes[2]))
         return replace(self, position=motion.point(self.position), tilt=tilt)
 
-    def with_wider_cone(self, by: float) -> Point | None:
+    def with_wider_cone(self, by: float) -> PointSource | None:
         """Return the source with the tangent of its half angle larger by the fraction `by`; None: no half angle."""
 
         def wider(angle: float) -> float:
@@ -205,7 +205,7 @@ class Point(Emitter):
             return replace(self, half_angle_1e2=wider(self.half_angle_1e2))
         return replace(self, half_angle=wider(self.half_angle)) if self.half_angle else None
 
-    def moved_away(self, by: float, about: Vector) -> Point:
+    def moved_away(self, by: float, about: Vector) -> PointSource:
         """Return the source with its distance from the point `about` (mm) larger by the fraction `by`."""
         middle = np.array(about)
         return replace(self, position=tuple((middle + (1 + by) * (np.array(self.position) - middle)).tolist()))
@@ -220,18 +220,18 @@ class Point(Emitter):
         return Rectangle(self.width or 0.0, self.height or 0.0) if self.width or self.height else None
 
     @property
-    def central(self) -> Point:
+    def central(self) -> PointSource:
         """Point source at the centre, at the main wavelength."""
         return replace(self.scaled(0.0), wavelength=self.main_wavelength)
 
-    def scaled(self, share: float) -> Point:
+    def scaled(self, share: float) -> PointSource:
         """Return the source with diameter, width and height multiplied by `share`."""
         sizes = self.diameter, self.width, self.height
         diameter, width, height = (share * size if share and size else None for size in sizes)
         rays = None if self.rays is None else self.rays.scaled(share)
         return replace(self, diameter=diameter, width=width, height=height, rays=rays)
 
-    def element(self, x: float, y: float) -> Point:
+    def element(self, x: float, y: float) -> PointSource:
         """Return the point source at (x, y) (mm) of the extent."""
         e_x, e_y, _ = self.axes if self.rays is None else self.file_axes(1)
         position = point_along(point_along(self.position, x, e_x), y, e_y)
@@ -258,7 +258,7 @@ class Point(Emitter):
     def irradiance(self, x: Tensor, y: Tensor, z: float) -> Tensor:
         """Return E(x, y) (1/mm²) on the plane z (mm); the flux into the half space is 1.
 
-        gaussian: 2 / (π w²) exp(-2 r² / w²), r and w as in `Point`.  lambertian: I = cos θ / (π sin² θ_max) and
+        gaussian: 2 / (π w²) exp(-2 r² / w²), r and w as in `PointSource`.  lambertian: I = cos θ / (π sin² θ_max) and
         E = I cos θ / d², so E = D² / (π sin² θ_max d⁴), D and d the distances of plane and (x, y, z) from the source.
         uniform: I = 1 / (2π (1 - cos θ_max)), E = I D / d³.  The last two are zero beyond θ_max, the half angle `edge`.
         """

@@ -156,7 +156,7 @@ class TiltedScreen(NamedTuple):
     y_x: float  # y axis of the plane
     y_y: float
     y_z: float
-    chart: int = 0  # directions.CHARTS, for the coordinates of the direction (x, y, n_z z); 0: a plane
+    goniometer: int = 0  # directions.GONIOMETERS, for the angles of the direction (x, y, n_z z); 0: a plane
 
 
 class Screens(NamedTuple):

@@ -22,10 +22,9 @@ from numba import njit, prange
 from torch import Tensor
 
 from bstcad.optics.numerics import ops
-from bstcad.optics.numerics.compiling import compiled
+from bstcad.optics.numerics.compiling import MIN_PART, compiled
 
 MAX_PARTS = 16  # maximum number of parts; a power of two, so that two, four or eight threads have equal work
-MIN_PART = 1 << 14  # minimum number of rays or tubes in a part
 ROW_LENGTH = 4096  # count of numbers summed by one thread
 ELEMENTARY = 1024  # count of numbers whose exp, sin or cos one thread of torch computes; torch divides 2048 or more
 
@@ -86,7 +85,7 @@ def dot_of_arrays(a: Tensor, b: Tensor) -> float:
     return float(sums.sum())
 
 
-@compiled(parallel=True, fastmath={"reassoc", "contract"})
+@compiled(threads_by="a", fastmath={"reassoc", "contract"})
 def _dot(a, b, sums):
     for c in prange(sums.size):
         part = 0.0
@@ -105,7 +104,7 @@ def shift(q: Tensor, y: Tensor, factor: float, along: Tensor, scale: float = 1.0
     return dot(q, along)
 
 
-@compiled(parallel=True, fastmath={"reassoc", "contract"})
+@compiled(threads_by="q", fastmath={"reassoc", "contract"})
 def _shift(q, y, factor, along, scale, sums):
     for c in prange(sums.size):
         part = 0.0
@@ -134,7 +133,7 @@ def _widen(own, touched, first, last):
     touched[0], touched[1] = min(touched[0], first), max(touched[1], last)
 
 
-@compiled(parallel=True)
+@compiled(threads_by="out")
 def _merge(own, touched, out):
     for row in prange(out.shape[0]):
         for c in range(own.shape[0]):

@@ -27,7 +27,7 @@ from bstcad.optics.surfaces.outlines import Outline
 from bstcad.optics.surfaces.rays import Rays, Vector
 
 FAR = 1e9  # distance (mm) of points that stand for directions; a lens of 100 mm is seen from there at 1e-7 rad
-CHARTS = {"C": 1, "A": 2, "B": 3}  # number of the coordinates for the kernels
+GONIOMETERS = {"C": 1, "A": 2, "B": 3}  # number of the system of angles for the kernels
 NAMES = {
     "C": "directions by the angle from the axis", "A": "directions by horizontal angle and elevation",
     "B": "directions by vertical angle and inclination to the side",
@@ -52,7 +52,7 @@ class Directions(Receiver):
     unit, light, photometric_unit = "degrees", "radiant intensity", "cd"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "chart", CHARTS[self.angles])
+        object.__setattr__(self, "goniometer", GONIOMETERS[self.angles])
         object.__setattr__(self, "names", ("x", "y") if self.angles == "C" else ("horizontal", "vertical"))
 
     def position_text(self, origin: float = 0.0) -> str:

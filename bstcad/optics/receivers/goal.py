@@ -21,14 +21,14 @@ class Goal:
     """A picture on a receiver."""
 
     key: str  # key in the scene, sentences and report.json: target, or target[0], target[1], … of several goals
-    receiver: Screen  # screen that receives the light
+    screen: Screen  # screen that receives the light
     picture: np.ndarray  # (rows, columns), row 0 = y max: fraction of the flux wanted in each pixel; the sum is 1
     weight: float = 1.0  # weight of the goal's RRMSD² in the merit function
     reachable: np.ndarray | None = None  # (rows, columns), True in the pixels that light can reach; None: all pixels
     whole: np.ndarray | None = None  # (rows, columns), picture before `restricted`; None: not restricted
     # function of a number k that returns the picture of cells, k along each side of a pixel, of sum 1 and before
     # `restricted`; None: `interpolated`
-    draw: Callable[[int], np.ndarray] | None = None
+    cell_picture: Callable[[int], np.ndarray] | None = None
     is_shape: bool = False  # True for a profile, a uniform target or an intensity, which have no fine detail
 
     @property
@@ -52,11 +52,11 @@ class Goal:
         if cells == 1:
             return self
         picture = self.picture if self.whole is None else self.whole
-        fine = interpolated(picture, cells) if self.draw is None else self.draw(cells)
-        if abs(picture.sum() - 1) > SUM_ROUNDING and self.draw is not None:
+        fine = interpolated(picture, cells) if self.cell_picture is None else self.cell_picture(cells)
+        if abs(picture.sum() - 1) > SUM_ROUNDING and self.cell_picture is not None:
             fine = fine * picture.sum()
         part = self.reachable
-        goal = Goal(self.key, self.receiver.divided(cells), fine, self.weight, is_shape=self.is_shape)
+        goal = Goal(self.key, self.screen.divided(cells), fine, self.weight, is_shape=self.is_shape)
         return goal.restricted(None if part is None else np.kron(part, np.ones((cells, cells), dtype=bool)))
 
 

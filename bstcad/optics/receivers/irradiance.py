@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from bstcad.optics.numerics import ops
@@ -48,7 +49,7 @@ class Screen:
         return sum(self.x) / 2, sum(self.y) / 2, self.z
 
     @property
-    def plane(self) -> Receiver:
+    def receiver(self) -> Receiver:
         """Receiver on which light lands: a plane, or a receiver of another form."""
         if self.surface is not None:
             return self.surface
@@ -101,12 +102,12 @@ class Screen:
     @property
     def areas(self) -> np.ndarray | None:
         """Relative areas or solid angles of the pixels (rows, columns), of mean 1; None: all are equal."""
-        return self.plane.areas(self.x, self.y, self.shape)
+        return self.receiver.areas(self.x, self.y, self.shape)
 
     @property
     def cell_sizes(self) -> np.ndarray:
         """Areas (mm²) or solid angles (sr) of the pixels, (rows, columns)."""
-        return self.plane.cell_sizes(self.x, self.y, self.shape)
+        return self.receiver.cell_sizes(self.x, self.y, self.shape)
 
     def pixel(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return (column, row) of (x, y) as real numbers: pixel i extends from i to i + 1."""
@@ -306,3 +307,22 @@ def efficiency(flux: dict[str, float]) -> float:
 def rrmsd_of_pictures(target: np.ndarray, irradiance: np.ndarray) -> float:
     """Return the RRMSD of Wang et al. 2023, sqrt(Σ (E_s - E)² / Σ E²), where E_s is simulated and E the target."""
     return float(np.sqrt(np.sum((irradiance - target) ** 2) / np.sum(target**2)))
+
+
+def averaged(picture: np.ndarray, columns: int, rows: int) -> np.ndarray:
+    """Return the exact means (rows, columns) of a picture over fewer pixels."""
+    down, across = overlap(picture.shape[0], rows), overlap(picture.shape[1], columns)
+    return down @ (across @ picture.T).T
+
+
+def overlap(size: int, pixels: int, start: float = 0.0, stop: float | None = None) -> csr_array:
+    """Return the matrix (pixels, size) that averages `size` inputs of width 1 over equal pixels from start to stop."""
+    stop = size if stop is None else stop
+    edges = start + np.arange(pixels + 1) * (stop - start) / pixels
+    edges[-1] = stop
+    cuts = np.union1d(np.arange(size + 1), np.clip(edges, 0, size))
+    cuts = cuts[(cuts >= start) & (cuts <= stop)]
+    middle = (cuts[1:] + cuts[:-1]) / 2
+    to = np.clip(((middle - start) * pixels / (stop - start)).astype(int), 0, pixels - 1)
+    of = np.clip(middle.astype(int), 0, size - 1)
+    return csr_array((np.diff(cuts) * pixels / (stop - start), (to, of)), shape=(pixels, size))

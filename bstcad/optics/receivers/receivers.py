@@ -37,12 +37,12 @@ class Receiver(ABC):
     tilt: tuple[float, float] | None = None  # tilt of a plane about x, then y, degrees; None: not a tilted plane
     names: tuple[str, str] = ("x", "y")  # names of the coordinates
     is_level: bool = False  # True for a plane z = const
-    chart: int = 0  # number of the coordinates of directions (directions.CHARTS); 0: not a receiver of directions
+    goniometer: int = 0  # number of the system of angles (directions.GONIOMETERS); 0: not a receiver of directions
 
     @property
     def has_kernel(self) -> bool:
         """True if the kernels trace rays to the receiver."""
-        return self.axes is not None or self.chart > 0
+        return self.axes is not None or self.goniometer > 0
 
     @property
     def axes(self) -> Frame | None:

@@ -24,8 +24,8 @@ from bstcad.optics.surfaces.sides import Sides, as_pair
 POINTS_PER_STRIP = 1 << 18  # approximate number of points in a strip of rows
 SPLITMIX_INCREMENT = 0x9E3779B97F4A7C15  # increment of SplitMix64: 2^64 divided by the golden ratio
 MIX_1, MIX_2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB  # multipliers of the finaliser of SplitMix64
-# Step φ of a golden lattice, 1/g with g² = g + 1; shift from one lattice (`draw`) to the next, 1/g with g³ = g + 1.
-GOLDEN_RATIO, DRAW_SHIFT = 0.6180339887498949, 0.7548776662466927
+# Step φ of a golden lattice, 1/g with g² = g + 1; shift from one lattice (`number`) to the next, 1/g with g³ = g + 1.
+GOLDEN_RATIO, LATTICE_SHIFT = 0.6180339887498949, 0.7548776662466927
 
 
 def grid(window: Rectangle, sides: Sides, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
@@ -74,17 +74,17 @@ def random(window: Rectangle, count: int, seed: int, dtype: torch.dtype = torch.
     return points[0] * window.width, points[1] * window.height
 
 
-def point_pairs(outline: Outline, pairs: int, draw: int = 0) -> list[tuple[float, float]]:
+def point_pairs(outline: Outline, pairs: int, number: int = 0) -> list[tuple[float, float]]:
     """Return points (x, y) spread over an outline, each followed by its reflection in the centre: their mean is 0.
 
     A golden lattice, a = (k + 1/2) / pairs and b = (k φ + shift) mod 1 for k = 0, 1, … (φ: GOLDEN_RATIO), covers one
-    half: (a, 2 b - 1) of a rectangle, r² = a and ψ = π b (a sunflower spiral) of a disc, in half extents.  `draw`
+    half: (a, 2 b - 1) of a rectangle, r² = a and ψ = π b (a sunflower spiral) of a disc, in half extents.  `number`
     determines the shift.  For two or more pairs the second moments are set to those of the outline, so that a point may
     lie outside a rectangle by hundredths of its size.  32 points of a disc have 2/3 of the noise of 128 random ones at
     a hard edge of a picture, 1/5 at a soft one.
     """
     half_x, half_y = outline.half_extent
-    lattice = [((k + 0.5) / pairs, (0.5 + draw * DRAW_SHIFT + k * GOLDEN_RATIO) % 1.0) for k in range(pairs)]
+    lattice = [((k + 0.5) / pairs, (0.5 + number * LATTICE_SHIFT + k * GOLDEN_RATIO) % 1.0) for k in range(pairs)]
     if outline.is_round:
         points = [(math.sqrt(a) * math.cos(math.pi * b), math.sqrt(a) * math.sin(math.pi * b)) for a, b in lattice]
         points = _with_second_moment(points, 1 / 4)

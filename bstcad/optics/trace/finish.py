@@ -132,9 +132,9 @@ def finished_pictures(
     light here.  Faces z = const have no finish.  Of many channels each has a part of the phases.
     """
     lens = finish.smoothed_lens(lens)
-    lens = lens.shaping(*lens.passes.faces)  # tubes start before the first face
+    lens = lens.with_tailored(*lens.passes.faces)  # tubes start before the first face
     count = min(PHASES, max(MIN_PHASES, PHASES // len(channels))) if finish.is_marked else 1
-    planes = [screen.plane for screen in screens]
+    planes = [screen.receiver for screen in screens]
     found = []
     for k, channel in enumerate(channels):
         through = channel.through(lens)
@@ -152,7 +152,7 @@ def _landings(
     rays: Rays, lens: Lens, planes: Sequence[Receiver], finish: Finish, numbers: Sequence[int]
 ) -> Iterator[tuple[Landed, ...]]:
     """Yield where rays before the first face land on each plane, for each number of a phase."""
-    first, faces = lens.freeform[0], lens.unbounded().interfaces
+    first, faces = lens.tailored_numbers[0], lens.unbounded().interfaces
     finished = [k for k in range(first, len(faces)) if finish.is_marked and _is_finished(lens, k)]
     start = finished[0] if finished else len(faces)
     for face in faces[first:start]:

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.channels import Channel, Draw, points_per_line, source_numbers, weighted_sum
+from bstcad.optics.light.channels import Channel, SourceSampler, points_per_line, source_numbers, weighted_sum
 from bstcad.optics.numerics.reductions import dot, total
 from bstcad.optics.receivers.goal import Goal, interpolated
 from bstcad.optics.receivers.irradiance import (
@@ -168,46 +168,51 @@ def measure(
     target: np.ndarray,
     effort: Effort = FULL,
     ghost: GhostTracer | None = None,
-    draw: Draw | None = None,
+    sampler: SourceSampler | None = None,
 ) -> Light:
     """Measure the light that `lens` produces on `screen` against `target`.
 
     lens: heights in float64 on the CPU for full accuracy.  channels: weights sum to 1.  target: (rows, columns) of any
     sum, row 0 = y max.  ghost: function that traces light reflected twice inside the lens (trace.ghost_light), which is
-    added to picture and ledger; None: no ghost is traced.  draw: function that samples new source points for
+    added to picture and ledger; None: no ghost is traced.  sampler: function that samples new source points for
     each set of rays; None: all sets use the points of `channels`.
     """
     goal = Goal("target", screen, np.asarray(target, dtype=np.float64))
-    return measure_goal(lens, channels, goal, effort, ghost=ghost, draw=draw)
+    return measure_goal(lens, channels, goal, effort, ghost=ghost, sampler=sampler)
 
 
 def measure_goal(
-    lens: Lens, channels: Sequence[Channel], goal: Goal, effort: Effort, ghost: GhostTracer | None, draw: Draw | None
+    lens: Lens,
+    channels: Sequence[Channel],
+    goal: Goal,
+    effort: Effort,
+    ghost: GhostTracer | None,
+    sampler: SourceSampler | None,
 ) -> Light:
     """Measure the light on the receiver of a goal against its picture and against `goal.whole` (see `measure`)."""
-    [light] = measure_goals(lens, channels, [goal], effort, ghost=ghost, draw=draw)
+    [light] = measure_goals(lens, channels, [goal], effort, ghost=ghost, sampler=sampler)
     return light
 
 
 def measure_goals(
     lens: Lens, channels: Sequence[Channel], goals: Sequence[Goal], effort: Effort, *, ghost: GhostTracer | None,
-    draw: Draw | None, images: Sequence[float] = (),
+    sampler: SourceSampler | None, images: Sequence[float] = (),
 ) -> list[Light]:  # fmt: skip
     """Measure the light on the receivers of several goals, with the same rays for all (see `measure_goal`).
 
     images: diameter (pixels) of the image of the real source on each receiver, if the channels have no size.
     """
-    setups = _setups(lens, channels, goals, draw, cells=effort.cells)
+    setups = _setups(lens, channels, goals, sampler, cells=effort.cells)
     if images:
         setups = [replace(setup, image=image) for setup, image in zip(setups, images, strict=True)]
     if ghost:
         n = round(side_factor(channels) * effort.rays / GHOST_DIVISOR)
         ghosts = [ghost(lens, channels, setup.screen, n, effort.seed) for setup in setups]
         setups = [replace(setup, ghost=image) for setup, image in zip(setups, ghosts, strict=True)]
-    sample = _sample if draw is None else _sample_source
+    sample = _sample if sampler is None else _sample_source
     rays = sample(setups, effort, PICTURE_NOISE * effort.accuracy / FULL.accuracy)
     given = zip(setups, goals, rays, strict=True)
-    witness = effort.witness and draw is None
+    witness = effort.witness and sampler is None
     return [_light(setup, goal, channels, found, witness=witness) for setup, goal, found in given]
 
 
@@ -219,9 +224,9 @@ def _light(setup: _Setup, goal: Goal, channels: Sequence[Channel], rays: _Rays, 
     (value, error), (tent, _) = _value(rays.boxes, target), _value(rays.tents, target)
     smoothed, error_of_smoothed = _smoothed(rays.boxes, target)
     # two nets, windows and mirrors have no kernel for the whole path, and yet have a witness
-    plain = lens.shapes("front") or bool(lens.before or lens.behind)
+    plain = lens.is_tailored("front") or bool(lens.before or lens.behind)
     lossless = all(c.losses is None for c in channels)
-    paths = ((c.source, c.through(lens), screen.plane) for c in channels)
+    paths = ((c.source, c.through(lens), screen.receiver) for c in channels)
     simple = lossless and (plain or all(whole_kernel("trace.simulate", *path) for path in paths))
     return Light(
         smoothed.numpy(), value, error, rays=rays.count, flux=rays.flux, tent=tent,
@@ -236,17 +241,21 @@ def _light(setup: _Setup, goal: Goal, channels: Sequence[Channel], rays: _Rays, 
 
 
 def rrmsds_by_rays(
-    lens: Lens, channels: Sequence[Channel], goals: Sequence[Goal], effort: Effort = FULL, draw: Draw | None = None
+    lens: Lens,
+    channels: Sequence[Channel],
+    goals: Sequence[Goal],
+    effort: Effort = FULL,
+    sampler: SourceSampler | None = None,
 ) -> list[float]:
     """Return `Light.rrmsd` alone for each goal; NaN if no light falls on its screen."""
-    setups = _setups(lens, channels, goals, draw)
+    setups = _setups(lens, channels, goals, sampler)
     pairs = zip(setups, _sample(setups, effort), strict=True)
     return [_value(rays.boxes, setup.target)[0] if rays.boxes else math.nan for setup, rays in pairs]
 
 
 def rrmsd_by_tubes(lens: Lens, channels: Sequence[Channel], goal: Goal, n: int) -> float:
     """Return the RRMSD by n x n tubes per channel, without noise but with their bias; NaN if no light lands."""
-    flux = tubes_picture(lens, channels, goal.receiver, n).cpu()
+    flux = tubes_picture(lens, channels, goal.screen, n).cpu()
     return float(rrmsd(flux, torch.from_numpy(goal.picture))) if total(flux) > 0 else math.nan
 
 
@@ -282,7 +291,7 @@ class _Setup:
     """Lens, light and target of a measurement."""
 
     lens: Lens  # lens that is measured
-    draw: Draw  # function that returns the channels of a set of rays
+    sampler: SourceSampler  # function that returns the channels of a set of rays
     screen: Screen
     target: Tensor  # (rows, columns), row 0 = y max, of any sum
     ghost: GhostImage | None = None
@@ -319,17 +328,17 @@ class _Setup:
 
 
 def _setups(
-    lens: Lens, channels: Sequence[Channel], goals: Sequence[Goal], draw: Draw | None, cells: int = 1
+    lens: Lens, channels: Sequence[Channel], goals: Sequence[Goal], sampler: SourceSampler | None, cells: int = 1
 ) -> list[_Setup]:
-    """Return the measurements of one lens and light on the receivers of all goals; draw: as in `measure`.
+    """Return the measurements of one lens and light on the receivers of all goals; sampler: as in `measure`.
 
     cells: wanted number of cells along each side of a pixel, reduced by halves to at most MAX_CELLS per picture.
     """
-    if not isinstance(draw, Draw):  # a function of a script, or none
-        draw = Draw(draw or (lambda count, seed: channels))
+    if not isinstance(sampler, SourceSampler):  # a function of a script, or none
+        sampler = SourceSampler(sampler or (lambda count, seed: channels))
     while cells > 1 and max(goal.picture.size for goal in goals) * cells**2 > MAX_CELLS:
         cells //= 2
-    return [_Setup(lens, draw, goal.receiver, torch.from_numpy(goal.picture), cells=cells) for goal in goals]
+    return [_Setup(lens, sampler, goal.screen, torch.from_numpy(goal.picture), cells=cells) for goal in goals]
 
 
 def _trace(setups: Sequence[_Setup], side: int, seed: int, counts_cells: bool = True) -> list[_Rays]:
@@ -340,7 +349,7 @@ def _trace(setups: Sequence[_Setup], side: int, seed: int, counts_cells: bool = 
     sets, screens, cells = [], [setup.screen for setup in setups], setups[0].cells if counts_cells else 1
     count = min(max(side**2 // RAYS_PER_POINT, MIN_SOURCE_POINTS), MAX_SOURCE_POINTS)
     for i in range(SETS):
-        channels = setups[0].draw(count, seed + i)
+        channels = setups[0].sampler(count, seed + i)
         n = max(1, round(side_factor(channels) * side))
         sets.append(simulated(setups[0].lens, channels, screens, n, seed=seed + i, cells=cells))
     return [setup.rays(parts, side) for setup, parts in zip(setups, zip(*sets, strict=True), strict=True)]
@@ -391,7 +400,7 @@ def _by_cell(rays: _Rays, goal: Goal, image: float) -> Iterator[CellError]:
     """
     if not rays.cells:
         return
-    pixels, finest = torch.from_numpy(goal.picture), rays.cells[0].shape[0] // goal.receiver.rows
+    pixels, finest = torch.from_numpy(goal.picture), rays.cells[0].shape[0] // goal.screen.rows
     for size in COARSER_CELLS:
         pictures = [joined_cells(box, size) for box in rays.boxes]
         yield _cell_error(float(size), pictures, joined_cells(pixels, size), image)
@@ -504,7 +513,7 @@ def _sample(setups: Sequence[_Setup], effort: Effort, max_noise: float = math.in
     RRMSD.  The standard error falls as n^-3 where products of noise dominate (the variance of a pixel of n² stratified
     rays falls as n^-3; measured: n^-2.9), and as n^-3/2 where products of the lens's error and noise dominate.
     """
-    most = min(effort.rays, setups[0].draw.largest_side or effort.rays)
+    most = min(effort.rays, setups[0].sampler.largest_side or effort.rays)
     pilot = max(most // PILOT_DIVISOR, min(most, 32))
     began, side, rays = time.perf_counter(), pilot if effort.accuracy else most, None
     first = side
@@ -546,7 +555,7 @@ def _sample_source(setups: Sequence[_Setup], effort: Effort, max_noise: float) -
     rays.  The error of the RRMSD falls as n^-2, or faster where more rays come from more points (measured: n^-2.6).
     Source and picture are smooth, so `max_noise` limits the error of the smoothed picture, not the noise of pixels.
     """
-    most = min(effort.rays, setups[0].draw.largest_side or effort.rays)
+    most = min(effort.rays, setups[0].sampler.largest_side or effort.rays)
     pilot = max(most // PILOT_DIVISOR, min(most, 32))
     began, side, rays = time.perf_counter(), pilot if effort.accuracy else most, None
     number = 0
@@ -658,7 +667,7 @@ class RayTubes:
 
     def picture(self, lens: Lens, screen: Screen) -> Tensor:
         """Return the flux in each pixel (rows, columns), row 0 = y max, as a fraction of the source's flux."""
-        pairs = zip(self.sheets, self.landings(lens, [screen.plane])[0], strict=True)
+        pairs = zip(self.sheets, self.landings(lens, [screen.receiver])[0], strict=True)
         return weighted_sum(self.channels, (sheet.collect(corners, screen)[0] for sheet, corners in pairs))
 
 
@@ -690,7 +699,7 @@ def spectral_lines(lens: Lens, channels: Sequence[Channel], goal: Goal, n: int) 
         return ()
     parts = []
     for wavelength, members in sorted(lines.items()):
-        picture = tubes_picture(lens, members, goal.receiver, n).cpu()
+        picture = tubes_picture(lens, members, goal.screen, n).cpu()
         if total(picture) > 0:
             picture = picture * (total(torch.from_numpy(goal.picture)) / total(picture))
         parts.append(SpectralLine(wavelength, math.fsum(channel.weight for channel in members), picture.numpy()))

@@ -56,20 +56,20 @@ def spread_at(source: Emitter, lens: Lens) -> float:
     a, b = source.extent.half_extent
     x, y = torch.meshgrid(*[torch.tensor([-1e-3, 1e-3], dtype=torch.float64)] * 2, indexing="ij")
     points = [source.element(a * u, b * v).central for u, v in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))]
-    middle, *ends = rays_to(points, lens, x, y, number=lens.freeform[-1])[2].direction[:, :, 0, 0].T
+    middle, *ends = rays_to(points, lens, x, y, number=lens.tailored_numbers[-1])[2].direction[:, :, 0, 0].T
     return max(math.acos(min(float(total(middle * end)), 1.0)) for end in ends)
 
 
-def directions(at_face: Rays, aim: Tensor, plane: Receiver) -> tuple[Tensor, Tensor, Tensor]:
+def directions(at_face: Rays, aim: Tensor, receiver: Receiver) -> tuple[Tensor, Tensor, Tensor]:
     """Return (d, d', d · d'): unit vectors (3, …) of rays at a face, and from there to aims (2, …) on the receiver."""
-    out = plane.vector_to(at_face, aim)
+    out = receiver.vector_to(at_face, aim)
     d, out = at_face.direction, out / torch.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
     return d, out, dot(d, out)
 
 
-def wanted_slopes(at_face: Rays, aim: Tensor, plane: Receiver, law: Law) -> tuple[Tensor, Tensor]:
+def wanted_slopes(at_face: Rays, aim: Tensor, receiver: Receiver, law: Law) -> tuple[Tensor, Tensor]:
     """Return the slopes (∂z/∂x, ∂z/∂y) that send each ray to an aim (2, …) on the receiver (see `slopes_towards`)."""
-    _, out, _ = directions(at_face, aim, plane)
+    _, out, _ = directions(at_face, aim, receiver)
     return slopes_towards(at_face, out, law)
 
 
@@ -128,16 +128,16 @@ def _at_angle(d: Tensor, towards: Tensor, along: Tensor, angle: float) -> Tensor
     return math.cos(angle) * d + math.sin(angle) * across
 
 
-def reach_margin(at_face: Rays, aim: Tensor, plane: Receiver, law: Law, grazing: float = MAX_EXIT_ANGLE) -> Tensor:
+def reach_margin(at_face: Rays, aim: Tensor, receiver: Receiver, law: Law, grazing: float = MAX_EXIT_ANGLE) -> Tensor:
     """Return the margin of each ray to the limits of the face, without unit; negative: the aim is out of reach.
 
     Minimum of three: d · d' minus the cosine of the largest deflection (not for a mirror); n_z - |(n_x, n_y)| /
     MAX_SLOPE, n by `normal_towards`; and d' · m, m the receiver's unit normal, which points away from the lens.
     """
-    _, out, along = directions(at_face, aim, plane)
+    _, out, along = directions(at_face, aim, receiver)
     normal = at_face.chart.local(at_face.position, normal_towards(at_face, out, law))
     upright = normal[2] - torch.sqrt(normal[0] ** 2 + normal[1] ** 2) / MAX_SLOPE
-    onwards = (-at_face.sense if law.reverses else at_face.sense) * dot(plane.normal(aim), out)
+    onwards = (-at_face.sense if law.reverses else at_face.sense) * dot(receiver.normal(aim), out)
     margin = torch.minimum(upright, onwards)
     if law.reverses:
         return margin

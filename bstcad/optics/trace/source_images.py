@@ -127,7 +127,7 @@ def _through(channels: Sequence[Channel], lens: Lens, screen: Screen, x: Tensor,
     p, q, rays = tubes.rays_to([channel.source for channel in channels], lens, x, y)
     last = replace(lens.unbounded(), losses=None).interfaces[lens.number_of("back") :]
     rays = replace(rays, position=rays.position - lens.back.standoff * rays.direction)
-    [landed] = through(rays, last, [screen.plane])
+    [landed] = through(rays, last, [screen.receiver])
     centre = tubes.middle(p), tubes.middle(q)
     cells = zip(channels, *centre, strict=True)
     density = [each.weight * each.source.irradiance(x, y, lens.entrance.z) for each, x, y in cells]

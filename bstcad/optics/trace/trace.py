@@ -84,35 +84,35 @@ def _net_kernel(name: str, rays: Rays, interface: Interface) -> Callable[..., An
 
 
 def whole_kernel(
-    name: str, source: Emitter, lens: Lens, plane: Receiver, tables: bool = True
+    name: str, source: Emitter, lens: Lens, receiver: Receiver, tables: bool = True
 ) -> Callable[..., Any] | None:
     """Return the kernel of this name if it can trace from the source through the lens to the receiver; None: it cannot.
 
     tables: allow a table of the source's light, which costs as much as some ten thousand rays.
     """
-    fast = ops.whole_kernel(name, lens.interfaces) if plane.has_kernel and not source.is_given else None
+    fast = ops.whole_kernel(name, lens.interfaces) if receiver.has_kernel and not source.is_given else None
     return fast if fast and beam(source, lens, tables) is not None else None
 
 
 def to_first_net(rays: Rays, lens: Lens) -> Rays:
     """Trace rays from the source through all interfaces in front of the first freeform interface."""
-    return across(rays, lens.interfaces[: lens.freeform[0]])
+    return across(rays, lens.interfaces[: lens.tailored_numbers[0]])
 
 
-def from_first_net(coming: Rays, lens: Lens, plane: Receiver) -> Landed:
+def from_first_net(coming: Rays, lens: Lens, receiver: Receiver) -> Landed:
     """Trace rays through the first freeform interface, and all interfaces behind it, to the receiver."""
-    [landed] = from_first_net_to_each(coming, lens, [plane])
+    [landed] = from_first_net_to_each(coming, lens, [receiver])
     return landed
 
 
 def from_first_net_to_each(coming: Rays, lens: Lens, planes: Sequence[Receiver]) -> tuple[Landed, ...]:
     """Trace rays as `from_first_net` does, once, to each of several receivers."""
-    return through(coming, lens.interfaces[lens.freeform[0] :], planes)
+    return through(coming, lens.interfaces[lens.tailored_numbers[0] :], planes)
 
 
-def trace(rays: Rays, lens: Lens, plane: Receiver) -> Landed:
+def trace(rays: Rays, lens: Lens, receiver: Receiver) -> Landed:
     """Trace rays from the source through all interfaces of the lens to the receiver."""
-    return from_first_net(to_first_net(rays, lens), lens, plane)
+    return from_first_net(to_first_net(rays, lens), lens, receiver)
 
 
 def is_transmitted(rays: Rays, lens: Lens) -> Tensor:
@@ -220,7 +220,7 @@ def simulate(
     """
     tables = n >= MIN_RAYS_FOR_TABLE and len(lights) <= MAX_LIGHT_TABLES
     kernels = [
-        whole_kernel("trace.simulate", source, lens, screen.plane, tables=tables)
+        whole_kernel("trace.simulate", source, lens, screen.receiver, tables=tables)
         for _, source, lens, _ in lights
         for screen in screens
     ]
@@ -246,7 +246,7 @@ def simulate_plain(
     ledgers: list[dict[str, float]] = [{} for _ in screens]
     for weight, source, lens, seed in lights:
         for rays in launch_strips(source, lens, n, seed):
-            landings = from_first_net_to_each(to_first_net(rays, lens), lens, [screen.plane for screen in screens])
+            landings = from_first_net_to_each(to_first_net(rays, lens), lens, [screen.receiver for screen in screens])
             for screen, landed, (box, tent), flux in zip(screens, landings, pictures, ledgers, strict=True):
                 box += weight * irradiance.box(landed, screen.divided(cells))
                 tent += weight * irradiance.tent(landed, screen)
@@ -367,7 +367,7 @@ def _ghost_of_channel(channel: Channel, lens: Lens, screen: Screen, n: int, seed
     launched, lines = 0.0, dict.fromkeys((GHOST_ON, GHOST_OFF, REFLECTED, TOTAL_REFLECTION), 0.0)
     for rays in launch_strips(channel.source, lens, n, seed):
         out, at_first = trace_ghost(rays, lens)  # at_first: True where the first reflection was total
-        landed = screen.plane.land(out)
+        landed = screen.receiver.land(out)
         on_screen = landed.alive & screen.contains(*landed.position)
         picture += irradiance.box(landed, screen)
         gains, losses = {GHOST_ON: on_screen, GHOST_OFF: ~on_screen}, {REFLECTED: ~at_first, TOTAL_REFLECTION: at_first}

@@ -49,9 +49,9 @@ class Tubes:
     rays: Rays  # rays at the corners (3, rows + 1, columns + 1); flux: transmitted fraction
     flux: Tensor  # flux launched in each tube (rows, columns), as a fraction of the source's
 
-    def landing(self, lens: Lens, plane: Receiver) -> Landed:
+    def landing(self, lens: Lens, receiver: Receiver) -> Landed:
         """Trace the corners to the receiver without the solid's apertures; `flux` excludes light that these stop."""
-        [landed] = self.landings(lens, [plane])
+        [landed] = self.landings(lens, [receiver])
         return landed
 
     def landings(self, lens: Lens, planes: Sequence[Receiver]) -> tuple[Landed, ...]:
@@ -72,7 +72,7 @@ class Tubes:
 
     def picture(self, lens: Lens, screen: Screen) -> Tensor:
         """Return the flux in each pixel (rows, columns), row 0 = y max."""
-        return self.collect(self.landing(lens, screen.plane), screen)[0]
+        return self.collect(self.landing(lens, screen.receiver), screen)[0]
 
 
 @torch.no_grad()
@@ -144,7 +144,7 @@ def _tubes(source: Emitter, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tube
     light = replace(light, flux=torch.ones_like(light.flux))
     rays = [light]  # in front of each interface
     interfaces = lens.unbounded().interfaces
-    first, back = lens.freeform[0], lens.number_of("back")
+    first, back = lens.tailored_numbers[0], lens.number_of("back")
     end = lens.solid.stop if lens.solid.stop > back + 1 else back  # faces behind the back: in a second-surface mirror
     for k in range(max(first, end)):
         rays.append(cross(rays[k], interfaces[k]).rays)
@@ -224,7 +224,7 @@ def _over_the_back(source: Emitter, lens: Lens, n: int, few: int) -> _Sheet:
 
 def _tubes_per_side(lens: Lens, light: Outline, n: int) -> Sides:
     """Return n tubes per side; for a net of unequal sides about n² in all, in proportion to its spans in `light`."""
-    net = lens.last_freeform.net
+    net = lens.last_tailored.net
     if net.shape[0] == net.shape[1]:
         return n
     return spread(n, *(half / pitch for half, pitch in zip(light.half_extent, net.pitch, strict=True)))

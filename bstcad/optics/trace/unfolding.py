@@ -35,10 +35,10 @@ class Image(PlaneReceiver):
     vectors: Frame  # (e_x, e_y, normal directed away from the incident light)
 
     @classmethod
-    def of(cls, plane: Receiver) -> Image:
+    def of(cls, receiver: Receiver) -> Image:
         """Return a plane as the image of itself."""
-        assert plane.frame is not None  # a scene with elements behind the lens has planes only
-        return cls(plane.middle, plane.origin, plane.frame)
+        assert receiver.frame is not None  # a scene with elements behind the lens has planes only
+        return cls(receiver.middle, receiver.origin, receiver.frame)
 
     @property
     def frame(self) -> Frame:
@@ -120,17 +120,17 @@ class BehindGlass(Receiver):
         return direction
 
 
-def image(behind: Sequence[Interface], plane: Receiver) -> Receiver:
+def image(behind: Sequence[Interface], receiver: Receiver) -> Receiver:
     """Return the image of a receiver by interfaces with flat surfaces; the receiver itself if there are none.
 
     Light leaves the lens along +z, and a receiver behind elements is a plane.
     """
     if not behind:
-        return plane
+        return receiver
     if sum(not interface.law.reverses for interface in behind) % 2:  # the first interface is the exit from the glass
         first, *rest = behind
-        return BehindGlass(image(rest, plane), float(sag(first.surface, 0.0, 0.0)), first.law.eta)
-    view = Image.of(plane)
+        return BehindGlass(image(rest, receiver), float(sag(first.surface, 0.0, 0.0)), first.law.eta)
+    view = Image.of(receiver)
     leaves: TiltedSurface | None = None  # exit face of a plate, while the light is followed backwards
     for interface in reversed(behind):
         face, law = TiltedSurface.of(interface.surface), interface.law
@@ -145,21 +145,21 @@ def image(behind: Sequence[Interface], plane: Receiver) -> Receiver:
     return view.plain()
 
 
-def image_from_last_net(lens: Lens, plane: Receiver) -> Receiver:
+def image_from_last_net(lens: Lens, receiver: Receiver) -> Receiver:
     """Return the image of a receiver by the interfaces behind the last net; the receiver itself if there are none."""
-    return image(lens.interfaces[lens.freeform[-1] + 1 :], plane)
+    return image(lens.interfaces[lens.tailored_numbers[-1] + 1 :], receiver)
 
 
 def image_screen(lens: Lens, screen: Screen) -> Screen:
     """Return the screen on the image of its receiver by the interfaces behind the last net of a lens."""
-    plane = screen.plane
-    view = image_from_last_net(lens, plane)
-    return screen if view is plane else replace(screen, surface=view)
+    receiver = screen.receiver
+    view = image_from_last_net(lens, receiver)
+    return screen if view is receiver else replace(screen, surface=view)
 
 
 def image_from_lens(lens: Lens, screen: Screen) -> Receiver:
     """Return the image of a screen's receiver by the elements behind the lens; the receiver if there are none."""
-    return image(lens.behind, screen.plane)
+    return image(lens.behind, screen.receiver)
 
 
 def per_radian(lens: Lens, screen: Screen) -> float:

@@ -34,7 +34,7 @@ from bstcad.optics.surfaces.sides import Sides, as_pair
 from bstcad.optics.trace.reach import wanted_slopes
 from bstcad.optics.trace.trace import clear_window, to_first_net
 from bstcad.optics.trace.unfolding import image_from_last_net
-from bstcad.scene.errors import SceneError
+from bstcad.runs.files import SceneError
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.baselines.paper import transport
 from bstcad.tailoring.machinability import place_back
@@ -77,17 +77,17 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
     The initial point lies on the ray through the centre of the first surface, in the plane of the back.  If the back
     would come too near to the front, the integration is repeated from a point further along +z.  first: as in `march`.
     """
-    knobs, screen = task.knobs, task.goals[0].receiver
+    settings, screen = task.settings, task.goals[0].screen
     source, exact, z = task.heaviest.source, lens.plain(), lens.back.z
-    area, n = clear_window(source, exact), knobs.rays // 2 * 2 + 1  # odd: one ray through the centre
+    area, n = clear_window(source, exact), settings.rays // 2 * 2 + 1  # odd: one ray through the centre
     x, y = sampling.grid(area, n)
     coming = to_first_net(source.rays_through(x, y, exact.entrance.z, area.area / n**2), exact)
-    aim, plane = slope_map.aim_points(mapping, exact, screen, x=x, y=y), image_from_last_net(exact, screen.plane)
+    aim, receiver = slope_map.aim_points(mapping, exact, screen, x=x, y=y), image_from_last_net(exact, screen.receiver)
     for _ in range(MAX_STARTS):
         start = exact.back.z
-        points = march(coming, aim, plane, law=exact.last_freeform.law, z=start, first=first)
+        points = march(coming, aim, receiver, law=exact.last_tailored.law, z=start, first=first)
         lit = points.reached & (coming.flux > 0) & exact.apertures[1].contains(*points.position[:2])
-        back = fit_net(exact.back_net, points, lit, knobs.levels)
+        back = fit_net(exact.back_net, points, lit, settings.levels)
         exact = place_back(exact.with_back(back), z, task.min_thickness)
         if exact.back.z == start:
             break
@@ -95,8 +95,8 @@ def follow_points(task: Task, lens: Lens, mapping: Mapping, first: First = "x") 
 
 
 @torch.no_grad()
-def march(coming: Rays, aim: Tensor, plane: Receiver, law: Law, z: float, first: First = "x") -> SurfacePoints:
-    """Return points of a face that sends rays (n, n), n odd, to aims (2, n, n) on the receiver `plane`.
+def march(coming: Rays, aim: Tensor, receiver: Receiver, law: Law, z: float, first: First = "x") -> SurfacePoints:
+    """Return points of a face that sends rays (n, n), n odd, to aims (2, n, n) on the `receiver`.
 
     coming: rays on the way to the face.  z: z (mm) of the point on the middle ray.  first: axis of the first line;
     all others cross it.  A lost ray, or one parallel to the face, ends its line.  SceneError if the middle ray is lost.
@@ -114,9 +114,9 @@ def march(coming: Rays, aim: Tensor, plane: Receiver, law: Law, z: float, first:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # a step has so few numbers that a second thread only delays the first
     try:
-        along = _outwards(line, begin.origin, begin.alive, plane=plane, law=law)
+        along = _outwards(line, begin.origin, begin.alive, receiver=receiver, law=law)
         starts = _transposed(along.position), _transposed(along.reached)
-        across = _outwards(grid.transposed(), *starts, plane=plane, law=law)
+        across = _outwards(grid.transposed(), *starts, receiver=receiver, law=law)
     finally:
         torch.set_num_threads(threads)
     return across if first == "y" else SurfacePoints(_transposed(across.position), _transposed(across.reached))
@@ -157,10 +157,10 @@ class _Grid:
         origin, direction, aim, alive = map(change, (self.origin, self.direction, self.aim, self.alive))
         return _Grid(origin, direction, aim, alive, rays=self.rays)
 
-    def normals(self, position: Tensor, plane: Receiver, law: Law) -> Tensor:
+    def normals(self, position: Tensor, receiver: Receiver, law: Law) -> Tensor:
         """Return normals (3, rays, lines), n = (-p, -q, 1), of a face that sends rays from positions (mm) to aims."""
         at = replace(self.rays, position=position, direction=self.direction)
-        p, q = wanted_slopes(at, self.aim, plane, law)
+        p, q = wanted_slopes(at, self.aim, receiver, law)
         return torch.stack([-p, -q, torch.ones_like(p)])
 
     def meet(self, point: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
@@ -171,19 +171,19 @@ class _Grid:
         return torch.where(ok, self.origin + path * self.direction, point), ok
 
 
-def _outwards(grid: _Grid, position: Tensor, reached: Tensor, plane: Receiver, law: Law) -> SurfacePoints:
+def _outwards(grid: _Grid, position: Tensor, reached: Tensor, receiver: Receiver, law: Law) -> SurfacePoints:
     """Integrate lines outwards from their points on the middle ray, `position` (3, 1, lines) mm and `reached`."""
     middle = grid.alive.shape[0] // 2
     points, all_reached = torch.zeros_like(grid.origin), torch.zeros_like(grid.alive)
     points[:, [middle]], all_reached[[middle]] = position, reached
-    normal = grid[[middle], :].normals(position, plane, law)
+    normal = grid[[middle], :].normals(position, receiver, law)
     for k in range(1, middle + 1):
         pair = [middle - k, middle + k]
         rays = grid[pair, :]
         tangent, meets = rays.meet(position, normal)  # the explicit rule
-        mean = (normal + rays.normals(tangent, plane, law)) / 2
+        mean = (normal + rays.normals(tangent, receiver, law)) / 2
         position, meets_again = rays.meet(position, mean)  # the trapezoidal rule
-        normal = rays.normals(position, plane, law)
+        normal = rays.normals(position, receiver, law)
         reached = reached & rays.alive & meets & meets_again
         points[:, pair], all_reached[pair] = position, reached
     return SurfacePoints(points, all_reached)

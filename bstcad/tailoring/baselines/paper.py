@@ -53,43 +53,43 @@ class Level:
 
 def stage1(task: Task, lens: Lens, state: Level | None = None) -> Iterator[StageStep]:
     """Run stage 1, or resume it, on one net after another, with the same map (`transport`) for all nets."""
-    knobs, lens, each = task.knobs, task.heaviest.through(lens), task.knobs.stage1_iterations
+    settings, lens, each = task.settings, task.heaviest.through(lens), task.settings.stage1_iterations
     area = clear_window(task.heaviest.source, lens)  # window of the light that passes the blank
     if state is None:
         mapping = transport(task, lens)
         yield StageStep(None, part="transport", ends=True)
     else:
         lens, mapping = state.lens.apply_to(lens), state.mapping
-    for level in range(state.level if state else 0, len(knobs.levels)):
-        lens = lens.refined(knobs.levels[level])
+    for level in range(state.level if state else 0, len(settings.levels)):
+        lens = lens.refined(settings.levels[level])
         begun, best = Parameters.of(lens), Best()
         for reached in _on_level(task, lens, mapping, area=area, state=state):
             best, search = reached.best, reached.state
             resumable = None if search is None else Level(level, mapping, begun, best=best, search=search)
-            finish = partial(_improved, lens, best, task.free, knobs.levels[-1])
+            finish = partial(_improved, lens, best, task.free, settings.levels[-1])
             text, count = f"landing error {best.merit**0.5:.3f} mm RMS", level * each + best.evaluations
-            progress = None if reached.skipped else ("stage 1", count, each * len(knobs.levels), text)
+            progress = None if reached.skipped else ("stage 1", count, each * len(settings.levels), text)
             yield StageStep(finish, resumable, mapping, progress=progress, skipped=reached.skipped)
-        lens, state = _improved(lens, best, task.free, knobs.levels[level]), None
-    yield StageStep(partial(lens.refined, knobs.levels[-1]), mapping=mapping)
+        lens, state = _improved(lens, best, task.free, settings.levels[level]), None
+    yield StageStep(partial(lens.refined, settings.levels[-1]), mapping=mapping)
 
 
 def _on_level(task: Task, lens: Lens, mapping: Mapping, area: Rectangle, state: Level | None) -> Iterator[Iterate]:
     """Run or resume stage 1 on the net of `lens`: minimise the miss of rays through `area` by heights and front."""
-    n = min(task.knobs.rays, MAX_RAYS_PER_CONTROL_POINT * max(lens.back_net.shape))
+    n = min(task.settings.rays, MAX_RAYS_PER_CONTROL_POINT * max(lens.back_net.shape))
     x, y = (t.to(lens.like) for t in sampling.grid(area, n))
     rays = task.heaviest.source.rays_through(x, y, lens.entrance.z, area.area / n**2)
-    screen, shape = task.goals[0].receiver, lens.front.parameters()
+    screen, shape = task.goals[0].screen, lens.front.parameters()
     aim = slope_map.aim_points(mapping, lens, screen, x=x, y=y)
     start = [lens.back_net.heights, *(torch.as_tensor(shape[name]).to(lens.like) for name in task.free)]
     nearest = min(STAGE1_RATES, key=lambda m: abs(m - max(lens.back_net.shape)))
 
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaves = [p.detach().clone().requires_grad_() for p in parameters]
-        merit = mean_square_miss(trace(rays, with_parameters(lens, leaves, task.free), screen.plane), aim)
+        merit = mean_square_miss(trace(rays, with_parameters(lens, leaves, task.free), screen.receiver), aim)
         return float(merit.detach()), list(torch.autograd.grad(merit, leaves)), float("nan")
 
-    steps, rates = task.knobs.stage1_iterations, [STAGE1_RATES[nearest], *(FRONT_RATES[name] for name in task.free)]
+    steps, rates = task.settings.stage1_iterations, [STAGE1_RATES[nearest], *(FRONT_RATES[name] for name in task.free)]
     method = adam(start, rates, steps, state.search if state else None)
     return minimise(problem, method, steps, state.best if state else Best())
 
@@ -105,7 +105,7 @@ def _improved(lens: Lens, best: Best, free: tuple[str, ...], net: Sides) -> Lens
 def transport(task: Task, lens: Lens) -> Mapping:
     """Return the map from the vertex plane of the first surface to the target, for a blank lens."""
     source, goal = task.heaviest.source, task.goals[0]
-    n, count = task.knobs.transport_grid, task.knobs.transport_iterations
+    n, count = task.settings.transport_grid, task.settings.transport_iterations
 
     def progress(s: TransportStep) -> None:
         task.progress("transport", s.iteration, count, f"mass error {s.mass_error:.4f}")
@@ -158,20 +158,20 @@ class RaySearch:
 
 def stage2(task: Task, lens: Lens, state: RaySearch | None = None) -> Iterator[StageStep]:
     """Run stage 2, or resume it from `state`, with new random rays in each step."""
-    knobs, goal, start = task.knobs, task.goals[0], lens if state is None else state.lens.apply_to(lens)
+    settings, goal, start = task.settings, task.goals[0], lens if state is None else state.lens.apply_to(lens)
     target = torch.from_numpy(goal.picture).to(lens.like.device)
-    merit = TentMerit.of(task.channels, goal.receiver, target, knobs.overshoot)
-    seeds = itertools.count(knobs.seed + 2 + (state.best.evaluations if state else 0))
-    bundles = (random_bundles(task.channels, start, knobs.rays**2, seed) for seed in seeds)
+    merit = TentMerit.of(task.channels, goal.screen, target, settings.overshoot)
+    seeds = itertools.count(settings.seed + 2 + (state.best.evaluations if state else 0))
+    bundles = (random_bundles(task.channels, start, settings.rays**2, seed) for seed in seeds)
     if state is None:
         yield StageStep(lambda: lens)
-    for reached in tailor_to_irradiance(start, bundles, merit, steps=knobs.stage2_iterations, state=state):
+    for reached in tailor_to_irradiance(start, bundles, merit, steps=settings.stage2_iterations, state=state):
         assert reached.parameters is not None  # Adam never ends
         best, lens = reached.best, with_parameters(start, [reached.parameters[0]])
         resumable = None if reached.state is None else RaySearch(Parameters.of(start), best, reached.state)
         step = StageStep(maker(lens), resumable, skipped=reached.skipped, part="stage 2")
         if not reached.skipped:
-            progress = "stage 2", best.evaluations, knobs.stage2_iterations, f"RRMSD {best.latest:.4f}"
+            progress = "stage 2", best.evaluations, settings.stage2_iterations, f"RRMSD {best.latest:.4f}"
             step = replace(step, progress=progress, rrmsd=best.latest)
         yield step
     judged = task.rrmsd(lens)
@@ -204,7 +204,9 @@ def tailor_to_irradiance(
     def problem(parameters: list[Tensor]) -> tuple[float, list[Tensor], float]:
         leaf = parameters[0].detach().clone().requires_grad_()
         trial, pairs = with_parameters(lens, [leaf]), zip(merit.channels, next(bundles), strict=True)
-        square, rrmsd = merit(tuple(trace(rays, channel.through(trial), merit.screen.plane) for channel, rays in pairs))
+        square, rrmsd = merit(
+            tuple(trace(rays, channel.through(trial), merit.screen.receiver) for channel, rays in pairs)
+        )
         (gradient,) = torch.autograd.grad(square.sqrt(), leaf)
         return float(square.detach().sqrt()), [gradient], float(rrmsd)
 

@@ -25,10 +25,9 @@ import numpy as np
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.receivers.goal import Goal
-from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.receivers.irradiance import Screen, overlap
 from bstcad.optics.trace.measure import Effort, measure
 from bstcad.scene.errors import MachineError, SceneError, nearest
-from bstcad.scene.target import overlap
 from bstcad.verify.verdict import Check
 
 JUDGES = {"batoid": "bstcad.verify.judges.batoid", "mitsuba": "bstcad.verify.judges.mitsuba"}
@@ -142,11 +141,11 @@ def compare(
     began = time.perf_counter()
     (functions, name, version), key = _judge_functions(judge), goal.key if goal.suffix else ""
     declined = functions.cannot(lens, channels)
-    if isinstance(judge, str) and goal.receiver.plane.frame is None:
+    if isinstance(judge, str) and goal.screen.receiver.frame is None:
         declined = "it collects light only on planes"
     if declined:
         return Comparison(Judge(name, version, declined, target=key))
-    raster = coarse_screen(goal.receiver)
+    raster = coarse_screen(goal.screen)
     target, light = resample(goal.picture, raster.shape), functions.light(lens, channels)
     traced = functions.trace(lens, light, raster, rays=rays, seed=seed)
     seconds = time.perf_counter() - began

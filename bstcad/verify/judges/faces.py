@@ -28,7 +28,7 @@ PLATE_RINGS = (1.0, 1.2, 1.5, 2.0, 4.0, 10.0, 30.0, 100.0)  # radii of rings / r
 
 
 @dataclass(frozen=True)
-class Shape:
+class FaceShape:
     """Heights and slopes of a face at some points, arrays of one shape."""
 
     x: np.ndarray  # x of the points (mm)
@@ -74,15 +74,15 @@ class Freeform:
         )
         return x, y
 
-    def at(self, x: np.ndarray, y: np.ndarray) -> Shape:
+    def at(self, x: np.ndarray, y: np.ndarray) -> FaceShape:
         """Evaluate the face at points (mm) by scipy's NdBSpline."""
         (inside_x, u, u_x), (inside_y, v, v_y) = self._parameter(x, 0), self._parameter(y, 1)
         spline = NdBSpline(self.knots, np.ascontiguousarray(self.net[..., 2]), 2)
         z, z_u, z_v = (spline(np.stack([u, v], axis=-1), nu=nu) for nu in ((0, 0), (1, 0), (0, 1)))
         z_x, z_y = z_u * u_x, z_v * v_y
-        return Shape(x, y, z + z_x * (x - inside_x) + z_y * (y - inside_y), z_x=z_x, z_y=z_y)
+        return FaceShape(x, y, z + z_x * (x - inside_x) + z_y * (y - inside_y), z_x=z_x, z_y=z_y)
 
-    def on_grid(self, x: np.ndarray, y: np.ndarray) -> Shape:
+    def on_grid(self, x: np.ndarray, y: np.ndarray) -> FaceShape:
         """Evaluate the face, with z_xy, where lines x and y (mm) cross, y along the first axis, by scipy's BSpline."""
         (inside_x, u, u_x), (inside_y, v, v_y) = self._parameter(x, 0), self._parameter(y, 1)
         along = [BSpline(self.knots[0], self.net[..., 2], 2)(u, nu=nu).T for nu in (0, 1)]
@@ -91,7 +91,7 @@ class Freeform:
         off_x, off_y = x - inside_x, (y - inside_y)[:, None]
         grid_x, grid_y = np.meshgrid(x, y)
         z = z + z_x * off_x + z_y * off_y + z_xy * off_x * off_y
-        return Shape(grid_x, grid_y, z, z_x=z_x + z_xy * off_y, z_y=z_y + z_xy * off_x, z_xy=z_xy)
+        return FaceShape(grid_x, grid_y, z, z_x=z_x + z_xy * off_y, z_y=z_y + z_xy * off_x, z_xy=z_xy)
 
     def _parameter(self, x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return x (axis 1: y) clipped to the net, and t and dt/dx for x(t) = Σ B_i(t) x_i, by Newton's method."""
@@ -120,16 +120,16 @@ class Revolved:
         x, y = (np.linspace(-half, half, cells + 1) for half in self.half)
         return x, y
 
-    def on_grid(self, x: np.ndarray, y: np.ndarray) -> Shape:
+    def on_grid(self, x: np.ndarray, y: np.ndarray) -> FaceShape:
         """Evaluate the face where lines x and y (mm) cross, y along the first axis."""
         return self.at(*np.meshgrid(x, y))
 
-    def at(self, x: np.ndarray, y: np.ndarray) -> Shape:
+    def at(self, x: np.ndarray, y: np.ndarray) -> FaceShape:
         """Evaluate the face at points (mm)."""
         c, r2 = self.curvature, x**2 + y**2
         cos2 = 1 - (1 + self.conic_constant) * c * c * r2
         root = np.sqrt(np.maximum(cos2, 1e-6))  # any value is allowed outside the rim
-        return Shape(x, y, self.z0 + c * r2 / (1 + root), z_x=c * x / root, z_y=c * y / root)
+        return FaceShape(x, y, self.z0 + c * r2 / (1 + root), z_x=c * x / root, z_y=c * y / root)
 
 
 Face = Freeform | Revolved
@@ -161,7 +161,7 @@ class FaceError:
         return cls(max(heights), max(slopes))
 
     @classmethod
-    def between(cls, heights: np.ndarray, normals: np.ndarray, exact: Shape) -> FaceError:
+    def between(cls, heights: np.ndarray, normals: np.ndarray, exact: FaceShape) -> FaceError:
         """Return the error of heights (mm) and unit normals (…, 3) against the exact face at the same points."""
         angles = np.linalg.norm(normals - exact.normals, axis=-1)  # small-angle approximation
         return cls(*(float(np.sqrt(np.mean(p**2))) for p in (heights - exact.z, angles)))
@@ -249,13 +249,13 @@ def face_mesh(face: Face, outline: Outline, parts: int, up: bool) -> tuple[Trime
     return _mesh(corners[used], -normals[used], triangles[:, ::-1]), error
 
 
-def _mesh_error(face: Face, shape: Shape, x: np.ndarray, y: np.ndarray, *, whole: np.ndarray) -> FaceError:
+def _mesh_error(face: Face, shape: FaceShape, x: np.ndarray, y: np.ndarray, *, whole: np.ndarray) -> FaceError:
     """Return the error of the mesh at the midpoints of the cells' diagonals; whole: True for cells inside the rim."""
     middle = face.on_grid((x[:-1] + x[1:]) / 2, (y[:-1] + y[1:]) / 2)
     between = shape.normals[:-1, :-1] + shape.normals[1:, 1:]
     between /= np.linalg.norm(between, axis=-1, keepdims=True)
     heights = (shape.z[:-1, :-1] + shape.z[1:, 1:]) / 2
-    exact = Shape(*(getattr(middle, name)[whole] for name in ("x", "y", "z", "z_x", "z_y")))
+    exact = FaceShape(*(getattr(middle, name)[whole] for name in ("x", "y", "z", "z_x", "z_y")))
     return FaceError.between(heights[whole], between[whole], exact)
 
 

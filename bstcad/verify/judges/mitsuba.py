@@ -25,9 +25,9 @@ from trimesh import Trimesh
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.losses import FresnelLoss, Losses
 from bstcad.optics.light.channels import Channel, points_per_line
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.emitters import Emitter
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.optics.surfaces.rays import axes
@@ -48,7 +48,7 @@ SPOT_EDGE = 1e-5  # width of a spot's soft edge, relative to its half angle
 PROJECTOR_FLUX = math.pi  # ratio of the flux of Mitsuba's projector to the irradiance of its slide
 
 Entry = dict[str, Any]  # entry of a scene in Mitsuba's notation
-S = TypeVar("S", Collimated, Point)
+S = TypeVar("S", CollimatedSource, PointSource)
 
 
 def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
@@ -208,13 +208,13 @@ def lamps(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, En
 
 
 def _beam_lamps(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, Entry]:
-    beams = enumerate(_sources(channels, Collimated))
+    beams = enumerate(_sources(channels, CollimatedSource))
     return {f"lamp{k}": _plate(beam, weight, lens, folder / f"lamp{k}.ply") for k, (beam, weight) in beams}
 
 
 def _point_lamps(channels: Sequence[Channel], lens: Lens, folder: Path) -> dict[str, Entry]:
     """Return a spot for each point source of uniform radiant intensity in a cone, otherwise a projector."""
-    points = _sources(channels, Point)
+    points = _sources(channels, PointSource)
     first, _ = points[0]
     if first.profile == "uniform" and first.is_cone:
         return {f"lamp{k}": _spot(point, weight, lens) for k, (point, weight) in enumerate(points)}
@@ -231,7 +231,7 @@ def _sources(channels: Sequence[Channel], kind: type[S]) -> list[tuple[S, float]
 LAMPS = {"collimated": _beam_lamps, "point": _point_lamps}  # function that returns the lamps, for each kind of source
 
 
-def _plate(source: Collimated, weight: float, lens: Lens, path: Path) -> Entry:
+def _plate(source: CollimatedSource, weight: float, lens: Lens, path: Path) -> Entry:
     """Return a plate of the aperture's shape that emits a parallel beam, in the plane where rays start."""
     z = lens.entrance.z
     start = source.start(z)
@@ -246,7 +246,7 @@ def _plate(source: Collimated, weight: float, lens: Lens, path: Path) -> Entry:
     return _ply(disc, path) | {"bsdf": _matt(0.0), "emitter": emitter}
 
 
-def _spot(source: Point, weight: float, lens: Lens) -> Entry:
+def _spot(source: PointSource, weight: float, lens: Lens) -> Entry:
     """Return a spot with the radiant intensity weight / (2π (1 - cos θ_max)) up to the half angle θ_max."""
     edge = source.half_angle
     assert edge is not None  # a cone has a half angle
@@ -256,19 +256,19 @@ def _spot(source: Point, weight: float, lens: Lens) -> Entry:
     return spot | {"intensity": {"type": "rgb", "value": intensity}}
 
 
-def _projector(source: Point, weight: float, lens: Lens, half: float) -> Entry:
+def _projector(source: PointSource, weight: float, lens: Lens, half: float) -> Entry:
     """Return a projector along the axis of the lens; its square field has slopes up to `half` along x and y."""
     to_world, fov = _look_along(source.position, (0.0, 0.0, _sense(source, lens))), math.degrees(2 * math.atan(half))
     projector = {"type": "projector", "to_world": to_world, "fov": fov, "scale": weight / PROJECTOR_FLUX}
     return projector | {"irradiance": {"type": "ref", "id": "slide"}}
 
 
-def _largest_slope(source: Point, lens: Lens) -> float:
+def _largest_slope(source: PointSource, lens: Lens) -> float:
     field, (x, y, z) = window(source, lens), source.position
     return max(field.width / 2 + abs(x), field.height / 2 + abs(y)) / abs(lens.entrance.z - z)
 
 
-def _slide(source: Point, lens: Lens, half: float) -> Entry:
+def _slide(source: PointSource, lens: Lens, half: float) -> Entry:
     """Return a projector's slide: the irradiance on a plane 1 mm from the source, seen along the light."""
     (x, y, z), sense, across = source.position, _sense(source, lens), half * TEXEL_CENTRES
     return _texture(_irradiance(source, x - sense * across, y - across, z + sense))
@@ -285,7 +285,7 @@ def _texture(values: np.ndarray) -> Entry:
     return {"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": "clamp"}
 
 
-def _sense(source: Point, lens: Lens) -> float:
+def _sense(source: PointSource, lens: Lens) -> float:
     """Return the direction of the light along z: 1 if the source is below the entrance of the lens, else -1."""
     return 1.0 if source.position[2] <= lens.entrance.z else -1.0
 

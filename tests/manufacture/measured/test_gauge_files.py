@@ -19,6 +19,7 @@ from bstcad.manufacture.measured import grid_process, hdf5_structure, made_part,
 from bstcad.manufacture.measured.alignment import BackFace
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.surfaces import sag
+from tests import suite
 from tests.manufacture.measured import gauge_files
 from tests.manufacture.measured.gauge_files import BY_SURFACE_TOPOGRAPHY, WRITERS, grid_points
 from tests.manufacture.measured.synthetic import with_form_error
@@ -77,7 +78,7 @@ def loaded(folder, form, data, outline=ROUND):
     return clouds.load(path, outline)
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("fault", suite.in_turns(FAULTS, 3))
 @pytest.mark.parametrize("form", WRITERS)
 def test_a_file_is_read_back_with_its_truth(tmp_path, lens, heights, form, fault):
     """A cloud that reads as the truth has the truth's checks, which the next test names."""

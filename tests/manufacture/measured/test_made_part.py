@@ -24,6 +24,7 @@ from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.optics.trace.measure import measure
 from bstcad.verify import checks
+from tests import suite
 from tests.conftest import pictures, quick_effort
 from tests.lenses import net
 from tests.manufacture.measured.synthetic import SHIFT, TURN, cloud, dirty, points, with_form_error
@@ -39,7 +40,7 @@ def nominal(small_design):
 
 @pytest.fixture(scope="module")
 def light(nominal):
-    return measure(nominal.lens, nominal.channels, nominal.goals[0].receiver, nominal.goals[0].picture, EFFORT)
+    return measure(nominal.lens, nominal.channels, nominal.goals[0].screen, nominal.goals[0].picture, EFFORT)
 
 
 @pytest.fixture
@@ -68,7 +69,7 @@ def test_the_form_error_is_recovered_and_its_light_predicted(nominal, light):
     found = part.deviation.form.ravel()
     assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.05 * np.sqrt(np.mean(wanted**2))
     assert part.facts["noise"] == pytest.approx(2e-5, rel=0.05)
-    rrmsd = measure(made, nominal.channels, nominal.goals[0].receiver, nominal.goals[0].picture, EFFORT).rrmsd
+    rrmsd = measure(made, nominal.channels, nominal.goals[0].screen, nominal.goals[0].picture, EFFORT).rrmsd
     assert rrmsd > 1.5 * light.rrmsd
     assert part.facts["rrmsd_predicted"] == pytest.approx(rrmsd, rel=0.05)
     assert part.facts["rrmsd_high"] >= part.facts["rrmsd_predicted"]
@@ -247,7 +248,7 @@ def test_many_parts_of_one_design_are_judged_beside_it(small_design, nominal, tm
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
-@pytest.mark.parametrize("degrees", [90.0, 137.0, 180.0])
+@pytest.mark.parametrize("degrees", suite.in_turns([90.0, 137.0, 180.0], 3))
 def test_a_turned_part_is_aligned_by_its_relief(degrees):
     """Relief of 1 µm on a bowl: a part upside down was said to be of another lens, or to have reversed axes."""
     bowl = Lens(Plane(0.0), net(lambda x, y: 0.02 * x**2 + 0.01 * y**2, 5.0, 65, 6.0), Circle(5.0), 1.5)

@@ -13,6 +13,7 @@ from bstcad.manufacture.measured.form_error import deviation, fit_form_error
 from bstcad.optics.trace.measure import Effort
 from bstcad.report.record import with_part
 from bstcad.report.units import environment
+from tests import suite
 from tests.manufacture.measured.synthetic import cloud, dirty, with_form_error
 from tests.report.test_report import CONTENTS
 
@@ -67,7 +68,7 @@ DEFECTS = {
 }
 
 
-@pytest.mark.parametrize("defect", DEFECTS)
+@pytest.mark.parametrize("defect", suite.in_turns(DEFECTS, 2))
 def test_a_defect_that_covers_an_area_is_form(nominal, clean, defect):
     """Some fifty points in all, under dust: the dust goes, at least 97 of 100 points of the defect stay."""
     lens = nominal.lens

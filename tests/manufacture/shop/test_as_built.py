@@ -13,6 +13,7 @@ from bstcad.manufacture.shop.as_built import AsBuilt
 from bstcad.optics.surfaces.surfaces import sag
 from bstcad.optics.trace.measure import Effort
 from bstcad.scene.errors import SceneError
+from tests import suite
 from tests.conftest import quick_effort
 
 
@@ -29,7 +30,7 @@ def thickness(lens):
     return lens.back.vertex_z - lens.front.z
 
 
-@pytest.mark.parametrize("key", ["thickness", "index", "both", "curvature"])
+@pytest.mark.parametrize("key", suite.in_turns(["thickness", "index", "both", "curvature"], 4))
 def test_the_back_is_tailored_to_the_blank(made, key):
     """A blank that spoils the picture by half or more has its picture back, on its new thickness, index or front."""
     thick, index = thickness(made.lens) + 1.0, made.scene.index + 0.01

@@ -19,7 +19,7 @@ from bstcad.designs import folder as folders
 from bstcad.manufacture.measured import alignment, compensation
 from bstcad.manufacture.measured.alignment import BackFace
 from bstcad.manufacture.measured.cloud import Cloud
-from bstcad.manufacture.measured.compensation import Settings, Statistics
+from bstcad.manufacture.measured.compensation import CompensationSettings, Statistics
 from bstcad.manufacture.shop import by_light
 from bstcad.manufacture.shop import rounds as rounds_of_shop
 from bstcad.optics.surfaces.bspline import BSplineSurface, interpolating_net
@@ -71,7 +71,7 @@ def lens(small_design):
     return folders.read_nominal(small_design.folder)[1].lens.plain()
 
 
-def rounds(shop, count, settings=Settings(), parts=1):  # noqa: B008
+def rounds(shop, count, settings=CompensationSettings(), parts=1):  # noqa: B008
     """Yield (round, part that is cut from it); all parts differ."""
     net, before = shop.lens.back_net, []
     for number in range(count):
@@ -94,7 +94,7 @@ def test_two_rounds_lower_the_deviation_tenfold(lens):
 def test_a_gain_of_half_leaves_half(lens):
     shop = Shop(lens)
     _, before = shop.deviation(shop.cut(lens.back_net, 0))
-    [(found, part)] = rounds(shop, 1, Settings(gain=0.5))
+    [(found, part)] = rounds(shop, 1, CompensationSettings(gain=0.5))
     assert shop.deviation(part)[1] == pytest.approx(before / 2, rel=0.1)
     assert found.expected.rms == pytest.approx(found.deviation.rms / 2, rel=0.02)
 
@@ -160,12 +160,12 @@ def test_by_light_less_is_cut_and_the_picture_is_the_same(small_design, lens):
     cloud = shop.measure(shop.cut(lens.back_net, 0), 1)
     nominal = rrmsd(0.0 * lens.back_net.heights)
     staying = partial(by_light.staying, made, rrmsd=nominal)
-    found = compensation.next_round(lens, lens.back_net, [cloud], Settings(by="light"), [], staying=staying)
+    found = compensation.next_round(lens, lens.back_net, [cloud], CompensationSettings(by="light"), [], staying=staying)
     assert 0 < found.volume < found.volume_by_form and found.may_stay.pv > 0
     assert rrmsd(found.found.heights) > 1.5 * nominal
     assert rrmsd(found.left.heights) < 1.1 * nominal
     with pytest.raises(ValueError, match="--by colour: is not one of form, light"):
-        compensation.next_round(lens, lens.back_net, [cloud], Settings(by="colour"), [])
+        compensation.next_round(lens, lens.back_net, [cloud], CompensationSettings(by="colour"), [])
 
 
 def test_what_does_not_repeat_is_told_from_what_repeats(lens):
@@ -174,7 +174,7 @@ def test_what_does_not_repeat_is_told_from_what_repeats(lens):
     assert 3e-5 < found.standard_error < 3e-4 and found.parts == 3
     perfect = [Shop(lens).measure(lambda x, y: sag(lens.back_net, x, y), seed, noise=2e-4) for seed in (1, 2)]
     with pytest.raises(ValueError, match="nothing is cut: the repeatable deviation is .* µm RMS, and it is known to"):
-        compensation.next_round(lens, lens.back_net, perfect, Settings(), [])
+        compensation.next_round(lens, lens.back_net, perfect, CompensationSettings(), [])
 
 
 def test_rounds_that_diverge_are_refused(lens):
@@ -182,14 +182,14 @@ def test_rounds_that_diverge_are_refused(lens):
     cloud = shop.measure(shop.cut(lens.back_net, 0), 1)
     for gain in (0.0, 1.8, 2.5):
         with pytest.raises(ValueError, match=r"--gain .* a gain above 2 enlarges the deviation"):
-            compensation.next_round(lens, lens.back_net, [cloud], Settings(gain=gain), [])
+            compensation.next_round(lens, lens.back_net, [cloud], CompensationSettings(gain=gain), [])
     with pytest.raises(ValueError, match=r"--cutoff 0.001: is not between"):
-        compensation.next_round(lens, lens.back_net, [cloud], Settings(cutoff=1e-3), [])
+        compensation.next_round(lens, lens.back_net, [cloud], CompensationSettings(cutoff=1e-3), [])
     with pytest.raises(ValueError, match="the rounds diverge: the deviation was .* check datum, sign and axes"):
-        compensation.next_round(lens, lens.back_net, [cloud], Settings(), [Statistics(1e-4, 1e-5)])
+        compensation.next_round(lens, lens.back_net, [cloud], CompensationSettings(), [Statistics(1e-4, 1e-5)])
     half = replace(cloud, points=cloud.points[cloud.points[:, 0] > 0])
     with pytest.raises(ValueError, match=r"part-1.csv: no correction is computed .* measured fraction of the face"):
-        compensation.next_round(lens, lens.back_net, [half], Settings(), [])
+        compensation.next_round(lens, lens.back_net, [half], CompensationSettings(), [])
 
 
 def test_a_folder_remembers_its_rounds(lens, small_design, tmp_path, capsys, monkeypatch):

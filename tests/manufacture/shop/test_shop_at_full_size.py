@@ -15,7 +15,7 @@ import torch
 from bstcad import commands
 from bstcad.designs import folder as folders
 from bstcad.manufacture.measured import compensation
-from bstcad.manufacture.measured.compensation import Settings
+from bstcad.manufacture.measured.compensation import CompensationSettings
 from bstcad.manufacture.shop import by_light
 from bstcad.manufacture.shop.as_built import AsBuilt
 from bstcad.optics.surfaces.bspline import interpolating_net
@@ -73,7 +73,9 @@ def test_two_rounds_bring_the_letters_back(letters, by):
 
     for number in (0, 1):
         cloud = shop.measure(shop.cut(cut, 10 * number), 100 + 10 * number, points=200_000)
-        found = compensation.next_round(lens, cut, [cloud], Settings(by=by), before, rate=rate, staying=staying)
+        found = compensation.next_round(
+            lens, cut, [cloud], CompensationSettings(by=by), before, rate=rate, staying=staying
+        )
         cut, before = found.net, [*before, found.deviation]
 
         def error(x, y, repeats, part=10 * (number + 1), cut=cut):

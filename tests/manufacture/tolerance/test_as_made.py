@@ -16,6 +16,7 @@ from bstcad.optics.trace.finish import Finish
 from bstcad.planning.preview import PreviewSize, preview
 from bstcad.scene.quality import GRADE_NAMES, Tolerance, tolerance_complaints
 from bstcad.scene.scene import load
+from tests import suite
 from tests.planning.conftest import typical_pilot
 
 FEW = PreviewSize(pixels=40, net=65, tubes=96, rounds=1, evaluations=4, blurred=4)
@@ -67,6 +68,7 @@ def test_the_contrast_is_one_of_the_target_and_none_of_even_light():
     assert contrast(np.ones((2, 2)), target) is None
 
 
+@suite.in_turn(1, 2)
 def test_a_part_as_designed_has_the_picture_of_the_preview(plate):
     """Without any error, finish and form, both ways to trace a lens and to blur it by the sun are one."""
     scene = plate.scene.changed({"tolerance": [{"grade": "none"}]})
@@ -78,6 +80,7 @@ def test_a_part_as_designed_has_the_picture_of_the_preview(plate):
     assert goal.rrmsds[0] == pytest.approx(plate.rrmsds[0], rel=0.05)
 
 
+@suite.in_turn(1, 2)
 def test_each_grade_loses_contrast_to_what_it_is_known_for(plate):
     """Layers of a print, roughness of a sanded face; a coat and polishing restore the picture."""
     found = {name: plate.as_made(name) for name in GRADE_NAMES}
@@ -92,6 +95,7 @@ def test_each_grade_loses_contrast_to_what_it_is_known_for(plate):
         assert goal.light <= goal.light_designed + 1e-6 and goal.made.sum() == pytest.approx(goal.target.sum())
 
 
+@suite.in_turn(1, 2)
 def test_finer_layers_make_a_better_picture(plate):
     """50 µm lose more than 25 µm, which lose more than 5 µm; the widths of terraces are proportional to the height."""
     kept = [plate.as_made("resin-printed", layer).goals[0].contrasts[1] for layer in (0.05, 0.025, 0.005)]

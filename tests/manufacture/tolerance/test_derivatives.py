@@ -16,8 +16,8 @@ from bstcad.optics.lens.interfaces import cross
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.media import refractive_index
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.rays import Rays
@@ -53,11 +53,11 @@ def setups(small_design):
     """Light that falls within the lens: none of its rim changes with what the lens cuts."""
     _, nominal = read_nominal(small_design.folder)
     (channel, *_), line = nominal.channels, nominal.channels[0].source.wavelength
-    cone = Point((0.5, 0.0, -60.0), profile="uniform", half_angle=2.0, wavelength=line)
-    beam = Collimated(Circle(2.5), z=0.0, wavelength=line, centre=(0.31, 0.17))
+    cone = PointSource((0.5, 0.0, -60.0), profile="uniform", half_angle=2.0, wavelength=line)
+    beam = CollimatedSource(Circle(2.5), z=0.0, wavelength=line, centre=(0.31, 0.17))
     near = Screen(150.0, (-8.0, 6.0), (-7.0, 5.0), (32, 24))  # where the beam is still wide
     return {
-        "cone": Setup(nominal.lens, (Channel(cone, channel.index),), nominal.goals[0].receiver),
+        "cone": Setup(nominal.lens, (Channel(cone, channel.index),), nominal.goals[0].screen),
         "beam": Setup(nominal.lens, (Channel(beam, channel.index),), near),
     }
 
@@ -108,7 +108,7 @@ def traced(setup: Setup, amounts: dict[str, torch.Tensor]) -> torch.Tensor:
         rays = cross(rays, interface).rays
     rays = moved(rays, setup.pivot("lens"), amounts, "lens")
     rays = moved(rays, screen.middle, amounts, "screen", back=True)
-    landed = screen.plane.to(rays)
+    landed = screen.receiver.to(rays)
     return collect(screen.pixels_of(landed.position[:2]), flux, screen.shape)[0]
 
 

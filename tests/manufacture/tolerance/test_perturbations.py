@@ -19,7 +19,7 @@ from bstcad.manufacture.tolerance.perturbations import (
 )
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.motion import Motion
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
@@ -67,7 +67,7 @@ def test_what_scales_everything_changes_nothing(setup, picture):
 def test_a_plate_that_is_tilted_shifts_a_beam_as_snell_says():
     """A plate of thickness t shifts the beam by t sin θ (1 - cos θ / (n cos θ'))."""
     plate, screen = plate_of(33), Screen(100.0, (-8.0, 8.0), (-8.0, 8.0), (64, 64))
-    setup = Setup(plate, (Channel(Collimated(Circle(4.0), z=0.0), plate.index),), screen)
+    setup = Setup(plate, (Channel(CollimatedSource(Circle(4.0), z=0.0), plate.index),), screen)
     theta, n = np.radians(5.0), plate.index
     wanted = 12.0 * np.sin(theta) * (1 - np.cos(theta) / (n * np.sqrt(1 - (np.sin(theta) / n) ** 2)))
     tilted = kinds(setup)["lens.tilt_x"].apply(setup, 5.0).picture(TUBES)

@@ -16,6 +16,7 @@ from bstcad.manufacture.tolerance.study import StudySettings
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import Tolerance
 from bstcad.scene.target import numbered
+from tests import suite
 
 FEW = StudySettings(tubes=65, trials=300, full=3, seed=2)
 OFF = (
@@ -78,6 +79,7 @@ def test_a_wave_without_a_limit_fails_no_lens(unlimited):
     assert "limit" not in unlimited.facts()["wavefront"] and "yield" not in unlimited.facts()["wavefront"]
 
 
+@suite.in_turn(0, 2)
 def test_each_target_is_studied_as_by_itself(alone, several):
     """Trials of the same lens are the same: no figure of the first target changes by a bit."""
     _, found = several
@@ -88,6 +90,7 @@ def test_each_target_is_studied_as_by_itself(alone, several):
     assert all("wavefront_change" not in item for item in alone.facts()["sensitivities"])
 
 
+@suite.in_turn(0, 2)
 def test_lenses_pass_that_keep_to_all_limits(several):
     _, found = several
     shares = [target.passed[1] for target in found.targets] + [found.wavefront.passed[1]]
@@ -98,6 +101,7 @@ def test_lenses_pass_that_keep_to_all_limits(several):
     assert low - 0.01 <= 0.3 <= high + 0.01
 
 
+@suite.in_turn(0, 2)
 def test_an_error_has_its_effect_on_each_goal(several):
     _, found = several
     names = [item.name for item in found.sensitivities]
@@ -109,6 +113,7 @@ def test_an_error_has_its_effect_on_each_goal(several):
     assert found.wavefront.model_off["median"] < 0.05
 
 
+@suite.in_turn(0, 2)
 def test_a_wavefront_that_does_not_superpose_is_not_trusted(several):
     _, found = several
     assert found.trusted
@@ -117,6 +122,7 @@ def test_a_wavefront_that_does_not_superpose_is_not_trusted(several):
     assert replace(found, wavefront=replace(poor, limit=None)).trusted  # no yield hangs on it
 
 
+@suite.in_turn(0, 2)
 def test_it_is_written_read_and_said(several, capsys, monkeypatch):
     folder, found = several
     facts = json.loads((folder / "tolerance.json").read_text())

@@ -230,6 +230,7 @@ def facts_of(folder):
     return json.loads((folder / "tolerance.json").read_text())
 
 
+@pytest.mark.thorough
 def test_no_bit_depends_on_how_many_workers_trace(pictures):
     """Threads of this process here; processes of their own, one of them killed, in the benchmark."""
     few = replace(pictures, perturbations=pictures.perturbations[::5], tubes=FEW_TUBES)

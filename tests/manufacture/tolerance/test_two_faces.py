@@ -26,8 +26,8 @@ from bstcad.manufacture.tolerance.perturbations import (
 from bstcad.manufacture.tolerance.study import Wavefronts
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.wavefront import PlaneWave, SphericalWave, ZernikeWave
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.motion import Motion
@@ -44,7 +44,7 @@ N, LINE, BACK, SEEN = 1.5, 500.0, 12.0, 40.0  # index, nm, vertex of the back, p
 def lit(front, back=None, light=None):
     """A lens of 24 x 24 mm in a parallel beam, before a screen 100 mm from the origin."""
     lens = Lens(front, back or net(None, BACK, 65, 12.5), Rectangle(24.0, 24.0), N)
-    light = light or Collimated(Circle(3.0), z=0.0, wavelength=LINE)
+    light = light or CollimatedSource(Circle(3.0), z=0.0, wavelength=LINE)
     return Setup(lens, (Channel(light, N),), Screen(100.0, (-8.0, 8.0), (-8.0, 8.0), (64, 64)))
 
 
@@ -101,7 +101,7 @@ def test_a_wedge_turns_the_back_about_its_vertex(axis):
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_decentred_front_tilts_light_by_its_power_times_the_decentre(axis):
     curvature, by = 0.02, 0.05
-    setup = lit(Sphere(8.0, curvature), light=Collimated(Circle(0.5), z=0.0, wavelength=LINE))
+    setup = lit(Sphere(8.0, curvature), light=CollimatedSource(Circle(0.5), z=0.0, wavelength=LINE))
     setup = replace(setup, screen=Screen(100.0, (-0.4, 0.4), (-0.4, 0.4), (64, 64)))  # the spot is 0.1 mm wide
     moved = kinds(setup)[f"front.decentre_{'xy'[axis]}"].apply(setup, by)
     found, power = leans(moved), (N - 1) * curvature
@@ -115,7 +115,7 @@ def test_a_decentred_front_tilts_light_by_its_power_times_the_decentre(axis):
 
 def test_a_decentred_front_is_that_front_elsewhere():
     """The front's net moves, and the back behind it stays."""
-    setup = lit(Sphere(2.0, 0.02), bowl(), light=Collimated(Circle(8.0), z=0.0, wavelength=LINE))
+    setup = lit(Sphere(2.0, 0.02), bowl(), light=CollimatedSource(Circle(8.0), z=0.0, wavelength=LINE))
     net = as_net(setup.lens.front, setup.lens.outline)
     x, y = (tuple(end + by for end in side) for side, by in ((net.x, 0.05), (net.y, 0.0)))
     wanted = seen(replace(setup, lens=setup.lens.with_front(replace(net, x=x, y=y))))
@@ -154,7 +154,7 @@ def waves(setup, kind, wave=PlaneWave(SEEN)):  # noqa: B008
 def test_form_of_either_face_shifts_the_wavefront_by_n_less_one_times_it():
     """Sooner where the front stands higher, later where the back does; what it shifts is the form without a plane."""
     flat = net(None, 8.0, 65, 12.5)
-    setup, by = lit(flat, light=Collimated(Circle(8.0), z=0.0, wavelength=LINE)), 1e-5  # mm: 1e-2 waves
+    setup, by = lit(flat, light=CollimatedSource(Circle(8.0), z=0.0, wavelength=LINE)), 1e-5  # mm: 1e-2 waves
     front, back = form_error(setup.lens, 6.0, 0, "front"), form_error(setup.lens, 6.0, 100, "back")  # one field
     sooner, later = (waves(setup, kind).vector([by]) for kind in (front, back))
     assert np.linalg.norm(sooner + later) < 2e-3 * np.linalg.norm(later)
@@ -172,7 +172,7 @@ def test_form_of_either_face_shifts_the_wavefront_by_n_less_one_times_it():
 
 def test_superposed_wavefronts_stand_up_to_full_traces():
     """A plate has a plane wave as its light: form errors of both faces add up as squares do."""
-    setup = lit(Plane(8.0), light=Collimated(Circle(8.0), z=0.0, wavelength=LINE))
+    setup = lit(Plane(8.0), light=CollimatedSource(Circle(8.0), z=0.0, wavelength=LINE))
     forms = [form_error(setup.lens, 6.0, seed, face) for seed, face in ((0, "back"), (1, "back"), (0, "front"))]
     errors = (*(Perturbation(kind, 1e-4, "field") for kind in forms), Perturbation(kinds(setup)["lens.wedge_x"], 0.1))
     goal = Wavefronts(setup, errors, PlaneWave(SEEN), LINE, rays=64)
@@ -192,7 +192,7 @@ WAVES = [PlaneWave(SEEN), SphericalWave((0.3, 0.0, 150.0), SEEN), ZernikeWave((0
 @pytest.mark.parametrize("wave", WAVES, ids=lambda wave: wave.kind)
 def test_the_wanted_wave_stays_in_the_room(wave):
     """Lens and light moved together are where a wave that is moved alike sees no difference."""
-    point = Point((0.5, 0.0, -60.0), profile="uniform", half_angle=5.0, wavelength=LINE)
+    point = PointSource((0.5, 0.0, -60.0), profile="uniform", half_angle=5.0, wavelength=LINE)
     setup, motion = lit(Sphere(2.0, 0.02), bowl(), light=point), Motion.of(shift=(0.2, -0.1, 0.0))
     moved = setup.moved("lens", motion).moved("source", motion)
     there = {"sphere": {"focus": (0.5, -0.1, 150.0)}, "zernike": {"centre": (0.2, -0.1)}}.get(wave.kind, {})

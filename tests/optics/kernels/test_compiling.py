@@ -1,5 +1,8 @@
 """A kernel is compiled anew when any kernel's file has changed, and follows the constants of the plain form."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +12,7 @@ import torch
 
 from bstcad.optics.lens import interfaces
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.numerics import compiling
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
@@ -66,7 +69,32 @@ def test_a_kernel_keeps_its_code_there():
     assert Path(kernel.stats.cache_path).is_relative_to(compiling._caches(before))
 
 
-SOURCE, SCREEN = Point((0.0, 0.0, -40.0), "lambertian"), Screen(400.0, (-80.0, 80.0), (-80.0, 80.0), (8, 8))
+THREADS = """
+import bstcad, numba, numpy as np
+from numba import prange
+from bstcad.optics.numerics.compiling import MIN_PART, compiled
+
+def count_threads(x, counts):
+    for k in prange(counts.size):
+        counts[k] = numba.get_num_threads()
+
+kernel, counts, found = compiled(threads_by="x")(count_threads), np.zeros(4, np.int64), []
+for size in (2 * MIN_PART - 1, 2 * MIN_PART):
+    kernel(np.zeros(size), counts)
+    found.append((set(counts.tolist()), numba.get_num_threads()))
+print(found, numba.threading_layer())
+"""
+
+
+def test_loops_over_few_elements_have_one_thread():
+    """A second process has two threads however few cores the machine has, and the layer that the package prefers."""
+    others = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    given = others | {"NUMBA_NUM_THREADS": "2", "PYTHONPATH": str(Path(compiling.__file__).parents[3])}
+    done = subprocess.run([sys.executable, "-c", THREADS], env=given, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "[({1}, 2), ({2}, 2)] omp", done.stderr
+
+
+SOURCE, SCREEN = PointSource((0.0, 0.0, -40.0), "lambertian"), Screen(400.0, (-80.0, 80.0), (-80.0, 80.0), (8, 8))
 CHANGED = {  # constant: (where it stands, a value that no ray can fail to feel)
     "NEWTON_STEPS": (interfaces, 1),
     "APPROACH_STEPS": (interfaces, 0),

@@ -7,8 +7,8 @@ import torch
 
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.outlines import Circle, Rectangle, Rounded
@@ -26,11 +26,11 @@ def deep(dtype=torch.float64, depth=4.0, m=17):
 
 
 SCENES = {  # a source, a front, an outline; every Status that rays through a window larger than the lens end with
-    "point": (Point(), Sphere(15.0, -0.02), Rectangle(20.0, 20.0), {0, 1, 2, 3}),
-    "point, plane front, round": (Point(position=(1.0, -2.0, 3.0)), Plane(15.0), Circle(10.0), {0, 1, 2, 3}),
-    "collimated": (Collimated(Circle(12.0)), Plane(15.0), Rectangle(20.0, 20.0), {0, 1, 3}),
-    "point, round corners": (Point(), Sphere(15.0, -0.02), Rounded(20.0, 18.0, corner_radius=6.0), {0, 1, 2, 3}),
-    "collimated, sphere": (Collimated(Circle(12.0)), Sphere(15.0, -0.05), Circle(10.0), {0, 1, 2, 3}),
+    "point": (PointSource(), Sphere(15.0, -0.02), Rectangle(20.0, 20.0), {0, 1, 2, 3}),
+    "point, plane front, round": (PointSource(position=(1.0, -2.0, 3.0)), Plane(15.0), Circle(10.0), {0, 1, 2, 3}),
+    "collimated": (CollimatedSource(Circle(12.0)), Plane(15.0), Rectangle(20.0, 20.0), {0, 1, 3}),
+    "point, round corners": (PointSource(), Sphere(15.0, -0.02), Rounded(20.0, 18.0, corner_radius=6.0), {0, 1, 2, 3}),
+    "collimated, sphere": (CollimatedSource(Circle(12.0)), Sphere(15.0, -0.05), Circle(10.0), {0, 1, 2, 3}),
 }
 
 
@@ -79,8 +79,8 @@ def test_a_grid_of_rays_is_traced_as_its_rays_are(scene):
 def test_a_beam_meets_a_front_that_reaches_beyond_where_it_begins():
     """12 mm before the front of a lens 20 mm wide: where a beam begins is a convention, to the closed form none."""
     front = replace(deep(depth=-30.0), z=15.0)
-    lens = Lens(front, deep(), Rectangle(20.0, 20.0), 1.6, shaped=(0, 1))
-    beam = Collimated(Rectangle(17.0, 17.0))
+    lens = Lens(front, deep(), Rectangle(20.0, 20.0), 1.6, tailored=(0, 1))
+    beam = CollimatedSource(Rectangle(17.0, 17.0))
     x, y = stratified(Rectangle(17.0, 17.0), 60, 0)
     rays, interface = beam.rays_through(x, y, 15.0, 1.0), lens.interfaces[0]
     assert float(front.sag_and_slope(x, y)[0].min()) < rays.z - 5.0
@@ -100,8 +100,8 @@ PLANES = {
 }
 LOSSES = Losses(FresnelLoss(587.6), AbsorptionLoss(0.01))
 NETS = {  # a lens, and the rays on their way to its net
-    "lens": (lens_of(deep(), index=1.6), Point()),
-    "lossy": (lens_of(deep(), index=1.6, losses=LOSSES), Point()),
+    "lens": (lens_of(deep(), index=1.6), PointSource()),
+    "lossy": (lens_of(deep(), index=1.6, losses=LOSSES), PointSource()),
     "mirror": (mirror(bumpy(5.0)), LIGHTS["lambertian"]),
     "lossy mirror": (
         replace(mirror(bumpy(5.0)), losses=Losses(FresnelLoss(587.6, metal=1.2 + 7j))), LIGHTS["lambertian"]
@@ -142,7 +142,7 @@ def test_the_gradient_in_the_rays_is_finite_differences():
     """The kernel's adjoint against the kernel's values."""
     lens = lens_of(deep(m=7, depth=1.0))
     x, y = stratified(Rectangle(12.0, 12.0), 5, 0)
-    coming = trace.to_first_net(Point().rays_through(x, y, 15.0, 1.0), lens)
+    coming = trace.to_first_net(PointSource().rays_through(x, y, 15.0, 1.0), lens)
 
     def landing(position, direction):
         return trace.from_first_net(
@@ -154,7 +154,9 @@ def test_the_gradient_in_the_rays_is_finite_differences():
 
 
 @pytest.mark.parametrize("form", [trace.from_first_net, from_first_net_plain])
-@pytest.mark.parametrize(("source", "name"), [(Point(), "direction"), (Collimated(Circle(12.0)), "position")])
+@pytest.mark.parametrize(
+    ("source", "name"), [(PointSource(), "direction"), (CollimatedSource(Circle(12.0)), "position")]
+)
 def test_a_ray_of_no_number_is_lost_alone(form, source, name):
     """An index made from it must not be out of range: on a GPU that would end the whole process."""
     lens = Lens(Plane(15.0), deep(), Rectangle(20.0, 20.0), 1.5)

@@ -11,7 +11,7 @@ import torch
 from bstcad.optics.lens.interfaces import Interface
 from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.sphere_light import SphereLight
 from bstcad.optics.numerics import ops
 from bstcad.optics.receivers.directions import Directions
@@ -26,10 +26,10 @@ from tests.optics.kernels.test_dome import INDEX, OUTLINE, R, Z, dome
 
 HALF_SPACE = math.pi / 2
 LAMPS = {
-    "lambertian": Point((0.0, 0.0, Z)),
-    "beside the axis": Point((0.7, -0.4, Z + 0.5)),
-    "cone": Point((0.2, 0.1, Z), profile="uniform", half_angle=60.0),
-    "diode": Point((0.0, 0.0, Z), profile="gaussian", half_angle_1e2=(30.0, 12.0), rotate=20.0),
+    "lambertian": PointSource((0.0, 0.0, Z)),
+    "beside the axis": PointSource((0.7, -0.4, Z + 0.5)),
+    "cone": PointSource((0.2, 0.1, Z), profile="uniform", half_angle=60.0),
+    "diode": PointSource((0.0, 0.0, Z), profile="gaussian", half_angle_1e2=(30.0, 12.0), rotate=20.0),
 }
 FRONTS: dict[str, Surface] = {
     "plane": Plane(Z + 1.5),
@@ -59,7 +59,7 @@ def test_a_simulation_is_that_of_the_plain_form(lamp, front):
         lights = [(0.25, light, each, 3), (0.75, light, each, 4)]
         [ours] = trace.simulate(lights, screens, 96)
         [plain] = trace.simulate_plain(lights, screens, 96)
-        assert trace.whole_kernel("trace.simulate", light, each, screens[0].plane) is not None
+        assert trace.whole_kernel("trace.simulate", light, each, screens[0].receiver) is not None
         assert ours.rays == pytest.approx(plain.rays, rel=1e-3)  # a flux of 1e-308 may be zero
         assert ours.flux["on target"] > 0.3
         for one, other in ((ours.box, plain.box), (ours.tent, plain.tent)):
@@ -72,7 +72,7 @@ def test_a_simulation_is_that_of_the_plain_form(lamp, front):
 def test_single_rays_are_those_of_the_plain_form(lamp, front):
     light, lens = scene(lamp, front)
     x, y = (p.reshape(-1) for p in tubes.corners(Circle(2.0 * R), 24))
-    for plane in (SCREENS["plane"].plane, Directions("B")):
+    for plane in (SCREENS["plane"].receiver, Directions("B")):
         land = trace.whole_kernel("trace.land", light, lens, plane)
         assert land is not None
         ours = land(light, lens, plane, x=x, y=y)

@@ -12,9 +12,9 @@ from bstcad.optics.kernels.forward import land
 from bstcad.optics.kernels.kernel_arguments import IRRADIANCE_TOLERANCE, MIN_IRRADIANCE
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.emitters import Emitter
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.profiles import Net, Profile
 from bstcad.optics.numerics import ops
 from bstcad.optics.receivers import irradiance
@@ -41,8 +41,11 @@ DOME = Lens(Sphere(1.37, -0.25), net(lambda x, y: -0.025 * (x**2 + y**2), 3.28, 
 RAMP = Lens(Plane(15.0), tilted(2.5, 22.0, 11.0), SQUARE, 1.05)
 CLEAR = Rounded(18.0, 20.0, corner_radius=4.0), Rounded(19.0, 18.0, corner_radius=7.0)
 CONE = {"profile": "uniform", "half_angle": 33.0}
-BEAM, NARROW = Collimated(Circle(12.0)), Collimated(Rectangle(22.0, 19.0), profile="gaussian", radius_1e2=8.0)
-ASIDE = Point(position=(1.0, -2.0, 3.0), profile="gaussian", half_angle_1e2=30.0)
+BEAM, NARROW = (
+    CollimatedSource(Circle(12.0)),
+    CollimatedSource(Rectangle(22.0, 19.0), profile="gaussian", radius_1e2=8.0),
+)
+ASIDE = PointSource(position=(1.0, -2.0, 3.0), profile="gaussian", half_angle_1e2=30.0)
 LEANING = replace(NARROW, tilt=(-10.0, 25.0), z=-6.0, centre=(-9.0, -3.0))
 HOT = Net(np.random.default_rng(3).random((12, 9)), (-10.0, 11.0), (-9.0, 12.0))
 TABLE = Net(np.random.default_rng(4).random((14, 11)), (-0.5, 0.4), (-0.45, 0.5))
@@ -50,19 +53,19 @@ TABLE = Net(np.random.default_rng(4).random((14, 11)), (-0.5, 0.4), (-0.45, 0.5)
 
 SCENES = {  # source, lens, the fates of rays through a window larger than the lens
     "collimated, sphere, round": (BEAM, deep(Sphere(15.0, -0.05), Circle(10.0)), {0, 1, 2, 3}),
-    "collimated, beyond the equator": (Collimated(SQUARE), deep(Sphere(15.0, 0.12)), {0, 1}),
+    "collimated, beyond the equator": (CollimatedSource(SQUARE), deep(Sphere(15.0, 0.12)), {0, 1}),
     "collimated, plane": (BEAM, deep(), {0, 1, 3}),
-    "point, plane": (Point(), deep(), {0, 1, 2, 3}),
+    "point, plane": (PointSource(), deep(), {0, 1, 2, 3}),
     "point, sphere": (ASIDE, deep(Sphere(15.0, 0.02)), {0, 1, 2, 3}),
-    "point, smallest net": (Point(**CONE), deep(Sphere(15.0, 0.02), m=5, depth=2.0), {0, 1, 2}),
-    "point, ramp": (Point((-9.0, 0.0, 10.0)), RAMP, {1, 2}),
-    "collimated, tilted, plane": (Collimated(Circle(9.0), tilt=(20.0, 30.0)), deep(), {0, 2, 3}),
+    "point, smallest net": (PointSource(**CONE), deep(Sphere(15.0, 0.02), m=5, depth=2.0), {0, 1, 2}),
+    "point, ramp": (PointSource((-9.0, 0.0, 10.0)), RAMP, {1, 2}),
+    "collimated, tilted, plane": (CollimatedSource(Circle(9.0), tilt=(20.0, 30.0)), deep(), {0, 2, 3}),
     "collimated, tilted, sphere": (LEANING, deep(Sphere(15.0, -0.05), Circle(10.0)), {0, 1, 2, 3}),
-    "point, lambertian cone": (Point(half_angle=33.0), deep(), {0, 2, 3}),
-    "point, lambertian, tilted": (Point(tilt=(60.0, 20.0)), deep(), {0, 1, 2, 3}),
+    "point, lambertian cone": (PointSource(half_angle=33.0), deep(), {0, 2, 3}),
+    "point, lambertian, tilted": (PointSource(tilt=(60.0, 20.0)), deep(), {0, 1, 2, 3}),
     "point, gaussian, tilted": (replace(ASIDE, tilt=(-25.0, 15.0)), deep(), {0, 1, 2, 3}),
-    "point, cone, tilted": (Point(**CONE, tilt=(0.0, -20.0)), deep(Sphere(15.0, 0.02)), {0, 1, 2, 3}),
-    "point, clear apertures": (Point(), deep(clear=CLEAR), {0, 1, 2, 3}),
+    "point, cone, tilted": (PointSource(**CONE, tilt=(0.0, -20.0)), deep(Sphere(15.0, 0.02)), {0, 1, 2, 3}),
+    "point, clear apertures": (PointSource(), deep(clear=CLEAR), {0, 1, 2, 3}),
     "point, conic": (ASIDE, deep(Conic(15.0, -0.04, -2.25)), {0, 2, 3}),
     "collimated, elliptical": (replace(NARROW, radius_1e2=(9.0, 4.0), rotate=30.0), deep(), {0, 1, 3}),
     "collimated, annular": (replace(BEAM, profile="annular", inner_radius=3.0), deep(), {0, 1, 3}),
@@ -78,7 +81,7 @@ SCENES = {  # source, lens, the fates of rays through a window larger than the l
         {0, 1, 2, 3},
     ),
     "point, intensity, tilted": (
-        Point(intensity=Measured(Profile(net=TABLE, stereographic=True, whole=2.0)), tilt=(10.0, 20.0)),
+        PointSource(intensity=Measured(Profile(net=TABLE, stereographic=True, whole=2.0)), tilt=(10.0, 20.0)),
         deep(),
         {0, 1, 2, 3},
     ),
@@ -95,7 +98,7 @@ SCENES = {  # source, lens, the fates of rays through a window larger than the l
     "mirror, lambertian": (LIGHTS["lambertian"], mirror(bumpy()), {0, 1}),
     "mirror, parallel, tilted": (LIGHTS["parallel, tilted"], replace(mirror(bumpy()), outline=Circle(7.0)), {0, 1}),
     "mirror, gaussian, tilted, steep": (LIGHTS["gaussian, tilted"], mirror(bumpy(10.0)), {0, 1, 4}),
-    "point, turned back": (Point(), DOME, {0, 4}),
+    "point, turned back": (PointSource(), DOME, {0, 4}),
 }
 
 
@@ -194,7 +197,7 @@ def test_light_without_a_closed_form_is_traced_by_a_table(name):
     assert (found.status[lit] == plain.status[lit]).double().mean() > 0.999  # a ray on a rim may end on either side
     near = there & (plain.position.abs() < 400.0).all(0)
     assert near.sum() > 1000 and (found.position - plain.position)[:, near].abs().max() < 1e-4  # mm
-    assert whole_kernel("trace.simulate", light, lens, SCREEN.plane) is forward.simulate
+    assert whole_kernel("trace.simulate", light, lens, SCREEN.receiver) is forward.simulate
     ours, theirs = (simulated(source, lens, SCREEN, 300, seed=5) for source in (light, known))
     assert ours.flux == pytest.approx(theirs.flux, abs=IRRADIANCE_TOLERANCE)
     apart = float((ours.tent - theirs.tent).norm() / theirs.tent.norm())
@@ -203,9 +206,9 @@ def test_light_without_a_closed_form_is_traced_by_a_table(name):
 
 def test_light_with_an_edge_and_of_few_rays_is_traced_by_the_plain_form():
     known, lens, _ = SCENES["collimated, plane"]
-    assert whole_kernel("trace.simulate", Unknown(known), lens, SCREEN.plane) is None
+    assert whole_kernel("trace.simulate", Unknown(known), lens, SCREEN.receiver) is None
     known, lens, _ = SCENES["point, sphere"]
-    assert whole_kernel("trace.simulate", Unknown(known), lens, SCREEN.plane, tables=False) is None
+    assert whole_kernel("trace.simulate", Unknown(known), lens, SCREEN.receiver, tables=False) is None
     few, plain = (run(Unknown(known), lens, SCREEN, 60, seed=5) for run in (simulated, simulated_plain))
     assert torch.equal(few.box, plain.box)
 
@@ -228,7 +231,7 @@ def test_a_sum_of_lights_is_the_sum_of_their_simulations():
 def test_every_cell_is_traced_once(n):
     """Rows shorter than a block, of just one and of a block and a bit."""
     source, lens, _ = SCENES["point, plane"]
-    wide = Collimated(Rectangle(15.0, 15.0))
+    wide = CollimatedSource(Rectangle(15.0, 15.0))
     assert simulated(wide, lens, SCREEN, n, 0).rays == n * n
     found, plain = simulated(source, lens, SCREEN, n, 2), simulated_plain(source, lens, SCREEN, n, 2)
     assert found.rays == plain.rays and found.flux == pytest.approx(plain.flux, abs=1e-13)
@@ -300,7 +303,7 @@ class Asphere(Sphere):
 def test_a_new_kind_of_front_is_traced_by_its_own_equation():
     """Not by the kernel, to which it would be a conic of the same curvature."""
     lens = replace(SCENES["collimated, plane"][1], front=Asphere(10.0, 0.01))
-    beam = Collimated(Circle(8.0))
+    beam = CollimatedSource(Circle(8.0))
     traced, plain = (run(beam, lens, SCREEN, 40, 0).box for run in (simulated, simulated_plain))
     sphere = simulated(beam, lens.with_front(Sphere(10.0, 0.01)), SCREEN, 40, 0).box
     assert torch.equal(traced, plain) and (traced - sphere).abs().sum() > 0.1 * sphere.sum()
@@ -315,7 +318,7 @@ def test_it_is_compiled_once():
             back = deep().back.to(dtype)
             for front in (Plane(15), Sphere(15, torch.tensor(0.01, dtype=dtype)), Sphere(15, 0)):
                 lens = Lens(front, back, Circle(radius), 2)
-                for source in (Point(position=(0, 0, 0)), Collimated(Circle(radius)), Point(**CONE)):
+                for source in (PointSource(position=(0, 0, 0)), CollimatedSource(Circle(radius)), PointSource(**CONE)):
                     simulated(source, lens, Screen(400, (-300, 500), (-400, 350), 40), 4, seed)
                     before = before or len(compiled.signatures)
     assert len(compiled.signatures) == before

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.numerics import ops
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Sphere
@@ -44,7 +44,7 @@ def test_the_kernel_finds_the_rays_of_the_plain_form(name, n, monkeypatch):
 
 def test_rays_meet_the_points_to_the_tolerance():
     """Through a strong front close to the source the rays are traced on to the back, independent of the search."""
-    source, lens = Point((1.0, -2.0, 10.0)), deep(Sphere(15.0, 0.05), depth=2.0)
+    source, lens = PointSource((1.0, -2.0, 10.0)), deep(Sphere(15.0, 0.05), depth=2.0)
     x, y = tubes.corners(Circle(8.0), 57)
     p, q, rays = tubes.rays_to(source, lens, x, y)
     coming = to_first_net(source.rays_through(p, q, lens.front.z, 1.0), lens.unbounded())
@@ -57,7 +57,7 @@ def test_rays_meet_the_points_to_the_tolerance():
 def test_points_that_no_ray_meets_are_lost_in_both_forms(monkeypatch):
     """Behind a front that ends at its equator, 4 mm from the axis, the corners of the square are dark."""
     lens = lens_of(wavy(m=17, depth=0.5, ripple=0.0, z=18.0, half=11.0), Sphere(15.0, 0.25), Circle(9.0), 1.5)
-    (_, _, rays), (_, _, plain) = both(monkeypatch, Point((0.0, 0.0, 5.0)), lens, 31, Rectangle(18.0, 18.0))
+    (_, _, rays), (_, _, plain) = both(monkeypatch, PointSource((0.0, 0.0, 5.0)), lens, 31, Rectangle(18.0, 18.0))
     assert 0.05 < float(rays.alive.double().mean()) < 0.9
     both_lost = ~rays.alive & ~plain.alive
     assert float(both_lost.sum()) >= 0.97 * float((~plain.alive).sum())  # the kernel starts nearer, and finds more
@@ -65,5 +65,5 @@ def test_points_that_no_ray_meets_are_lost_in_both_forms(monkeypatch):
 
 def test_light_without_a_formula_takes_the_plain_form(monkeypatch):
     monkeypatch.setitem(ops.KERNELS["tubes.search"], "cpu", lambda *given, **named: pytest.fail("the kernel is called"))
-    monkeypatch.setattr(Point, "beam", lambda self, z: None)
-    assert bool(tubes.rays_to(Point(), deep(), *tubes.corners(Circle(5.0), 8))[2].alive.all())
+    monkeypatch.setattr(PointSource, "beam", lambda self, z: None)
+    assert bool(tubes.rays_to(PointSource(), deep(), *tubes.corners(Circle(5.0), 8))[2].alive.all())

@@ -9,7 +9,7 @@ import torch
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.losses import FresnelLoss, Losses, reflectance
 from bstcad.optics.lens.passes import LENS
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.sphere_light import SphereLight
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
@@ -21,7 +21,7 @@ from tests.lenses import bundle, lens_of, net, wavy
 
 N = 1.49
 BARE = Losses(FresnelLoss(550.0))
-LAMP = Point((0.2, 0.0, 0.0), profile="lambertian", half_angle=60.0)
+LAMP = PointSource((0.2, 0.0, 0.0), profile="lambertian", half_angle=60.0)
 SCREEN = Screen(60.0, (-40.0, 40.0), (-40.0, 40.0), 24)
 
 
@@ -56,7 +56,7 @@ def test_a_front_in_its_own_index_is_invisible():
     cos = torch.linspace(0.05, 1, 20, dtype=torch.float64)
     assert torch.equal(front.losses[-1].share(cos, cos, cos), torch.ones_like(cos))
     rays = LAMP.rays_through(*(torch.linspace(-3, 3, 50, dtype=torch.float64) for _ in "xy"), 2.0, 1.0)
-    landed = [trace.trace(rays, immersed(N, f), SCREEN.plane).position for f in (Plane(4.0), Sphere(8.0, -0.1))]
+    landed = [trace.trace(rays, immersed(N, f), SCREEN.receiver).position for f in (Plane(4.0), Sphere(8.0, -0.1))]
     torch.testing.assert_close(landed[0], landed[1], rtol=0, atol=1e-12)
 
 

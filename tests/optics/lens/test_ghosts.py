@@ -9,8 +9,8 @@ import torch
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.losses import AbsorptionLoss, CoatingLayer, FresnelLoss, Losses, reflectance
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.outlines import EVERYWHERE, Circle, Rectangle
@@ -103,7 +103,7 @@ EFFORT = Effort(160, accuracy=0.0)
 def lens_and_channels():
     """Two wavelengths, some light beyond the critical angle."""
     lens = lens_of(wavy(depth=3.0), index=1.6)
-    sources = Point(half_angle=40.0, profile="uniform"), Point(half_angle=35.0, profile="uniform")
+    sources = PointSource(half_angle=40.0, profile="uniform"), PointSource(half_angle=35.0, profile="uniform")
     return lens, tuple(Channel(s, n, w, LOSSES) for s, n, w in zip(sources, (1.6, 1.65), (0.3, 0.7), strict=True))
 
 
@@ -124,7 +124,7 @@ def test_the_ledger_closes_with_the_ghost_in_it():
 
 def test_a_plate_lays_its_ghost_over_the_beam():
     """All of a parallel beam comes back to where it fell: T R R T of the light on the target."""
-    beam = Collimated(Circle(5.0))
+    beam = CollimatedSource(Circle(5.0))
     lens = plate(outline=Rectangle(20.0, 20.0))
     found = ghost_light(lens, (Channel(beam, N, losses=BARE),), Screen(100.0, (-8.0, 8.0), (-8.0, 8.0), 8), 200, 0)
     r = ((N - 1) / (N + 1)) ** 2

@@ -9,8 +9,8 @@ from bstcad.optics.lens.interfaces import Interface, Reflect, Refract, cross
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.lens.passes import Pass, Passes
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.surfaces.outlines import EVERYWHERE, Circle, Rectangle
@@ -43,7 +43,7 @@ WINDOW = (  # 4 mm of glass of index 1.52 from z = -8 on
     Interface(Plane(-4.0), Circle(30.0), Refract(1.52, 1.0), Status.VIGNETTED),
 )
 FOLD = (Interface(Plane(60.0), Circle(40.0), Reflect(), Status.VIGNETTED),)  # light goes on along -z
-SOURCE = Point((1.0, -2.0, -60.0))
+SOURCE = PointSource((1.0, -2.0, -60.0))
 
 
 def net(z, size, seed=1):
@@ -65,7 +65,9 @@ def test_a_window_before_a_lens_and_a_fold_mirror_behind_it_are_data():
     rays = rays_of(SOURCE, lens)
     folded = trace(rays, replace(lens, behind=FOLD), LevelPlane(60.0 - 35.0))
     torch.testing.assert_close(folded.position, trace(rays, lens, LevelPlane(60.0 + 35.0)).position, rtol=0, atol=1e-12)
-    assert replace(lens, behind=FOLD).freeform == (1,) and replace(lens, before=WINDOW, behind=FOLD).freeform == (3,)
+    assert replace(lens, behind=FOLD).tailored_numbers == (1,) and replace(
+        lens, before=WINDOW, behind=FOLD
+    ).tailored_numbers == (3,)
 
     seen = replace(lens, before=WINDOW)
     assert seen.entrance is WINDOW[0].surface and len(seen.interfaces) == 4
@@ -82,7 +84,7 @@ def test_a_system_is_simulated_as_its_rays_and_its_tubes_are_traced():
     """Plain rays, since no one kernel traces the whole system, and fused tubes: the same light on the same pixels."""
     lens = replace(Lens(Sphere(0.0, 0.01), net(6.0, 0.2), SQUARE, N), before=WINDOW, behind=FOLD)
     screen = Screen(10.0, (-40.0, 40.0), (-40.0, 40.0), 8)
-    source = Point((1.0, -2.0, -60.0), profile="uniform", half_angle=7.0)
+    source = PointSource((1.0, -2.0, -60.0), profile="uniform", half_angle=7.0)
     rays, tubes = simulated(source, lens, screen, 300, 0), launch_tubes(source, lens, 120).picture(lens, screen)
     assert sum(rays.flux.values()) == pytest.approx(1, abs=1e-12) and rays.flux["on target"] > 0.9
     assert float(tubes.sum()) == pytest.approx(rays.flux["on target"], rel=1e-3)
@@ -94,17 +96,18 @@ def test_a_system_is_simulated_as_its_rays_and_its_tubes_are_traced():
 
 MANGIN = Passes((Pass("front", Refract), Pass("back", Reflect), Pass("front", Refract)))
 LOSSES = Losses(FresnelLoss(587.6), AbsorptionLoss(0.01))
-TWO = Lens(net(0.0, 0.4, 2), net(6.0, 0.5), SQUARE, N, shaped=(0, 1))
+TWO = Lens(net(0.0, 0.4, 2), net(6.0, 0.5), SQUARE, N, tailored=(0, 1))
 MIRROR = replace(FOLD[0], surface=replace(net(60.0, 0.5, 3), x=(-40.0, 40.0), y=(-40.0, 40.0)))
 SYSTEMS = {
     "lens": TWO,
     "lossy lens": replace(TWO, losses=LOSSES),
-    "with a window": replace(TWO, before=WINDOW, shaped=(2, 3)),
+    "with a window": replace(TWO, before=WINDOW, tailored=(2, 3)),
     "with a fold mirror": replace(TWO, behind=FOLD),
-    "freeform fold mirror": replace(TWO, behind=(MIRROR,), shaped=(0, 1, 2)),
+    "freeform fold mirror": replace(TWO, behind=(MIRROR,), tailored=(0, 1, 2)),
     "lossy Mangin mirror": replace(TWO, own_passes=MANGIN, losses=Losses(absorption=AbsorptionLoss(0.01))),
     "a plate between them": replace(
-        TWO, behind=(*(replace(i, surface=i.surface.moved(i.surface.z + 30.0)) for i in WINDOW), MIRROR), shaped=(0, 4)
+        TWO, tailored=(0, 4),
+        behind=(*(replace(i, surface=i.surface.moved(i.surface.z + 30.0)) for i in WINDOW), MIRROR),
     ),
 }  # fmt: skip
 PLANES = {"level": LevelPlane(15.0), "tilted": TiltedPlane((3.0, 2.0, 15.0), (20.0, -10.0), 5.0)}
@@ -131,7 +134,7 @@ def test_a_mangin_mirror_is_simulated_as_its_tubes_are_traced():
     """Light that comes back to the front beside its rim is lost: a fifth of what enters."""
     lens = Lens(Sphere(0.0, 0.01), net(6.0, 0.2), SQUARE, N, own_passes=MANGIN)
     screen = Screen(-30.0, (-60.0, 60.0), (-60.0, 60.0), 8)
-    source = Point((1.0, -2.0, -60.0), profile="uniform", half_angle=30.0)
+    source = PointSource((1.0, -2.0, -60.0), profile="uniform", half_angle=30.0)
     rays, tubes = simulated(source, lens, screen, 600, 0), launch_tubes(source, lens, 240).picture(lens, screen)
     assert rays.flux["lost through the sides"] > 0.15 * rays.flux["on target"]
     assert float(tubes.sum()) == pytest.approx(rays.flux["on target"], rel=3e-3)
@@ -141,7 +144,7 @@ def test_the_metal_of_a_mangin_mirror_is_met_from_the_glass():
     """The face reflects |(m - n) / (m + n)|² at normal incidence, and light crosses a bare front before and after."""
     metal, flat = 1.2 + 6.0j, [net(z, 0.0) for z in (0.0, 6.0)]
     lens = Lens(*flat, SQUARE, N, own_passes=MANGIN, losses=Losses(FresnelLoss(587.6, metal=metal)))
-    rays = Collimated(Rectangle(4.0, 4.0)).rays_through(*stratified(Rectangle(4.0, 4.0), 4, 0), 0.0, 1.0)
+    rays = CollimatedSource(Rectangle(4.0, 4.0)).rays_through(*stratified(Rectangle(4.0, 4.0), 4, 0), 0.0, 1.0)
     left = trace(rays, lens, LevelPlane(-20.0)).flux / rays.flux
     wanted = (1 - ((N - 1) / (N + 1)) ** 2) ** 2 * abs((metal - N) / (metal + N)) ** 2
     torch.testing.assert_close(left, torch.full_like(left, wanted), rtol=1e-12, atol=0)
@@ -166,7 +169,7 @@ def test_the_gradient_through_several_nets_is_that_of_plain_torch(name, plane):
     for form in (through, plainly):
         heights = [surface.heights.clone().requires_grad_() for surface in lens.nets]
         moved = lens.with_heights(heights)
-        [landed] = form(to_first_net(rays, moved), moved.interfaces[moved.freeform[0] :], [goal])
+        [landed] = form(to_first_net(rays, moved), moved.interfaces[moved.tailored_numbers[0] :], [goal])
         value = torch.where(landed.alive, (landed.position * weight).sum(0) + landed.flux, 0.0).sum()
         found.append((landed, torch.autograd.grad(value, heights)))
     (fused, ours), (plain, wanted) = found
@@ -210,7 +213,7 @@ def test_tubes_wait_before_the_first_free_interface():
     lens, screen = SYSTEMS["freeform fold mirror"], Screen(15.0, (-60.0, 60.0), (-60.0, 60.0), 12)
     pictures = []
     for free in ((0, 1, 2), (1,), (2,)):
-        seen = replace(lens, shaped=free)
+        seen = replace(lens, tailored=free)
         pictures.append(launch_tubes(SOURCE, seen, 40).picture(seen, screen))
     assert float(pictures[0].sum()) > 0.01
     for picture in pictures[1:]:

@@ -20,8 +20,8 @@ from bstcad.optics.lens.losses import (
     reflectance,
 )
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
@@ -63,7 +63,7 @@ def rough_lens(m=13, heights=0.15, losses=ALL, front=None):
     return Lens(front or Sphere(8.0, -0.02), back, Rectangle(9.0, 9.0), N, losses=losses)
 
 
-SOURCES = (Collimated(Circle(4.0)), Point((0.2, -0.1, 0.0), profile="lambertian"))
+SOURCES = (CollimatedSource(Circle(4.0)), PointSource((0.2, -0.1, 0.0), profile="lambertian"))
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=("collimated", "point"))
@@ -77,7 +77,7 @@ def test_the_ledger_closes_over_reflected_absorbed_and_transmitted_light(source)
 def test_a_plate_takes_by_beer_lambert_and_by_fresnel(degrees):
     """One ray through a plate of 6 mm: T² exp(-a 6 / cos θ')."""
     distance = 8.0 / math.cos(math.radians(degrees))
-    source = Point((0.0, -math.sin(math.radians(degrees)) * distance, 0.0))
+    source = PointSource((0.0, -math.sin(math.radians(degrees)) * distance, 0.0))
     flat = rough_lens(heights=0.0, front=Plane(8.0), losses=Losses(FresnelLoss(WAVELENGTH), AbsorptionLoss(0.02)))
     origin = torch.zeros(1, dtype=torch.float64)
     rays = source.rays_through(origin, origin, 8.0, 1.0)

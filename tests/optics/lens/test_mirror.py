@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from bstcad.optics.lens.interfaces import Interface, Reflect, Refract, cross
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.outlines import EVERYWHERE, Circle
@@ -25,11 +25,11 @@ from tests.tracing import from_first_net_plain, simulated
 M, HALF, Z = 41, 10.0, 5.0
 PITCH = 2 * HALF / (M - 1)
 LIGHTS = {
-    "parallel": Collimated(Circle(8.0), z=90.0),
-    "point": Point((3.0, -2.0, 70.0), profile="uniform", half_angle=6.0),
-    "lambertian": Point((-4.0, 1.0, 40.0)),
-    "parallel, tilted": Collimated(Circle(8.0), z=90.0, tilt=(3.0, 10.0), centre=(15.0, -3.0)),
-    "gaussian, tilted": Point((3.0, -2.0, 70.0), profile="gaussian", half_angle_1e2=10.0, tilt=(-5.0, 8.0)),
+    "parallel": CollimatedSource(Circle(8.0), z=90.0),
+    "point": PointSource((3.0, -2.0, 70.0), profile="uniform", half_angle=6.0),
+    "lambertian": PointSource((-4.0, 1.0, 40.0)),
+    "parallel, tilted": CollimatedSource(Circle(8.0), z=90.0, tilt=(3.0, 10.0), centre=(15.0, -3.0)),
+    "gaussian, tilted": PointSource((3.0, -2.0, 70.0), profile="gaussian", half_angle_1e2=10.0, tilt=(-5.0, 8.0)),
 }
 
 
@@ -60,7 +60,7 @@ def test_a_paraboloid_gathers_parallel_light_in_its_focus():
     c = 1 / 80.0
     x = torch.linspace(-8.5, 8.5, 35, dtype=torch.float64)
     x, y = (p.reshape(-1) for p in torch.meshgrid(x, x, indexing="ij"))
-    rays = Collimated(Circle(20.0), z=200.0).rays_through(x, y, Z, 1.0)
+    rays = CollimatedSource(Circle(20.0), z=200.0).rays_through(x, y, Z, 1.0)
     for land in (from_first_net, from_first_net_plain):
         found = land(rays, mirror(paraboloid(c)), LevelPlane(Z + 1 / (2 * c)))
         assert found.alive.all() and float(found.position.abs().max()) < 1e-9
@@ -74,7 +74,7 @@ def test_an_ellipsoid_takes_light_from_one_focus_to_the_other(conic_constant):
     x = torch.linspace(-9, 9, 13, dtype=torch.float64)
     x, y = (p.reshape(-1) for p in torch.meshgrid(x, x, indexing="ij"))
     face = Interface(Conic(Z, 1 / radius, conic_constant), EVERYWHERE, Reflect(), Status.MISSED_FRONT)
-    hit = cross(Point((0.0, 0.0, near)).rays_through(x, y, Z, 1.0), face)
+    hit = cross(PointSource((0.0, 0.0, near)).rays_through(x, y, Z, 1.0), face)
     landed = LevelPlane(far).to(hit.rays)
     assert landed.alive.all() and float(landed.position[:2].abs().max()) < 1e-9
 

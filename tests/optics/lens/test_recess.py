@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.numerics import ops
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
@@ -52,13 +52,13 @@ def test_inside_it_is_its_optical_part_and_beyond_a_plane_through_the_rim(face):
 def test_a_ray_crosses_the_dome_inside_its_outline_alone():
     """Rays from the centre go on undeflected; a micron outside the rim they are lost."""
     r = torch.tensor([0.0, 5.0, EDGE - 1e-6, EDGE + 1e-6, 20.0], dtype=torch.float64)
-    rays = Point().rays_through(r * RADIUS / PLANE, 0 * r, RADIUS, 1.0)  # through r of the underside's plane
+    rays = PointSource().rays_through(r * RADIUS / PLANE, 0 * r, RADIUS, 1.0)  # through r of the underside's plane
     behind = to_first_net(rays, lens())
     assert behind.alive.tolist() == [True, True, True, False, False]
     assert set(behind.status[3:].tolist()) == {int(Status.MISSED_FRONT)}
     torch.testing.assert_close(behind.direction[:, :3], rays.direction[:, :3], rtol=0, atol=1e-12)
     assert bool((behind.position[:2, :3].norm(dim=0) <= EDGE).all())
-    beam = to_first_net(Collimated(Circle(RIM), z=-5.0).rays_through(r, 0 * r, RADIUS, 1.0), lens())
+    beam = to_first_net(CollimatedSource(Circle(RIM), z=-5.0).rays_through(r, 0 * r, RADIUS, 1.0), lens())
     assert beam.alive.tolist() == [True, True, True, False, False]  # also where the way needs no search
 
 
@@ -72,13 +72,13 @@ def test_the_light_beside_the_dome_is_a_line_of_the_ledger(rays, half_angle):
         return min(r * r / (r * r + PLANE**2) / whole, 1.0)
 
     through = simulate if rays == "kernel" else simulate_plain
-    [light] = through([(1.0, Point(half_angle=half_angle), lens(), 1)], [SCREEN], 400)
+    [light] = through([(1.0, PointSource(half_angle=half_angle), lens(), 1)], [SCREEN], 400)
     assert math.fsum(light.flux.values()) == pytest.approx(1, abs=1e-12)
     assert light.flux[UNDERSIDE] == pytest.approx(within(RIM) - within(EDGE), abs=3e-4)
     assert light.flux["missed the lens"] == pytest.approx(1 - within(RIM), abs=1e-3)
     enters = 1 - light.flux["missed the lens"] - light.flux[UNDERSIDE]
     assert enters == pytest.approx(within(EDGE), abs=1e-3)
-    [unsplit] = through([(1.0, Point(half_angle=half_angle), lens(), 1)], [SCREEN], 400, splits_missed=False)
+    [unsplit] = through([(1.0, PointSource(half_angle=half_angle), lens(), 1)], [SCREEN], 400, splits_missed=False)
     assert torch.equal(unsplit.box, light.box) and UNDERSIDE not in unsplit.flux
     assert unsplit.flux["missed the lens"] == pytest.approx(light.flux["missed the lens"] + light.flux[UNDERSIDE])
 
@@ -88,22 +88,22 @@ def test_the_underside_of_a_dome_ends_at_its_rim_in_space():
     lit = SphereChart(20.0).length(math.radians(75.0))
     back = RadialSurface.sphere(0.0, 20.0, (1.1 * lit, 1.1 * lit), (33, 33))
     dome = Lens(DOME, back, Circle(lit), 1.5, clear=(Circle(EDGE), Circle(lit)))
-    [light] = simulate_plain([(1.0, Point(), dome, 1)], [SCREEN], 200)
+    [light] = simulate_plain([(1.0, PointSource(), dome, 1)], [SCREEN], 200)
     rim = 20.0 * math.sin(math.radians(75.0))
     within = [r * r / (r * r + PLANE**2) for r in (rim, EDGE)]
     assert light.flux[UNDERSIDE] == pytest.approx(within[0] - within[1], abs=3e-4)
 
 
 def test_a_source_in_the_dome_lights_no_underside():
-    assert on_underside(Point((0.0, 0.0, PLANE + 0.5)), DOME, Circle(RIM)) == 0.0
+    assert on_underside(PointSource((0.0, 0.0, PLANE + 0.5)), DOME, Circle(RIM)) == 0.0
     bulge = Recess(Sphere(3.0, 1 / RADIUS), Circle(EDGE))  # towards the source: what meets it is not behind it too
-    beside = on_underside(Point((0.0, 0.0, -30.0)), bulge, Rectangle(50.0, 50.0))
+    beside = on_underside(PointSource((0.0, 0.0, -30.0)), bulge, Rectangle(50.0, 50.0))
     d = 30.0 + bulge.around.z
     assert 0.2 < beside < 50**2 / math.pi / d**2 - EDGE**2 / (EDGE**2 + d**2)
 
 
 def test_the_kernel_traces_a_dome_as_the_plain_form_does(monkeypatch):
-    source, wide = Point((0.5, -1.0, 1.0), half_angle=70.0), replace(lens(), outline=Rectangle(50.0, 40.0))
+    source, wide = PointSource((0.5, -1.0, 1.0), half_angle=70.0), replace(lens(), outline=Rectangle(50.0, 40.0))
     [fast] = simulate([(1.0, source, wide, 3)], [SCREEN], 300)
     [plain] = simulate_plain([(1.0, source, wide, 3)], [SCREEN], 300)
     torch.testing.assert_close(fast.box, plain.box, rtol=0, atol=1e-13)

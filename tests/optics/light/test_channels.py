@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from bstcad.optics.light.channels import Channel, channels_of, drawn_channels, merge_wavelengths, source_numbers
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.sampling import shifted_lattice
 
 LINES = ((486.1, 1.0), (587.6, 2.0), (656.3, 1.0))
-DISC = Point((1.0, -2.0, 3.0), profile="uniform", half_angle=40.0, diameter=2.0)
-SUN = Collimated(Circle(8.0), divergence=0.53)
+DISC = PointSource((1.0, -2.0, 3.0), profile="uniform", half_angle=40.0, diameter=2.0)
+SUN = CollimatedSource(Circle(8.0), divergence=0.53)
 ANGLES = np.linspace(0, np.pi, 30)
 CUTS = np.linspace(-0.98, 0.98, 99)
 
@@ -37,7 +37,7 @@ def test_weights_sum_to_one_and_channels_are_simple(source):
         assert channel.index == index(channel.source.wavelength)
 
 
-@pytest.mark.parametrize("source", [Point(), Collimated(Circle(8.0), z=-3.0)], ids=str)
+@pytest.mark.parametrize("source", [PointSource(), CollimatedSource(Circle(8.0), z=-3.0)], ids=str)
 def test_a_simple_source_is_one_channel_with_itself(source):
     [channel] = channels_of(source, index, 24)
     assert channel.source is source and channel.weight == 1.0
@@ -122,9 +122,9 @@ def test_each_line_has_its_share_of_points_in_pairs():
 
 
 def test_lines_that_nothing_tells_apart_are_one_channel():
-    alike = merge_wavelengths(channels_of(Point(wavelength=LINES), lambda nm: 1.0, 8))
-    assert len(alike) == 1 and alike[0].weight == 1.0 and alike[0].source == Point(wavelength=587.6)
-    apart = channels_of(Point(wavelength=LINES), index, 8)
+    alike = merge_wavelengths(channels_of(PointSource(wavelength=LINES), lambda nm: 1.0, 8))
+    assert len(alike) == 1 and alike[0].weight == 1.0 and alike[0].source == PointSource(wavelength=587.6)
+    apart = channels_of(PointSource(wavelength=LINES), index, 8)
     assert merge_wavelengths(apart) == apart
 
 
@@ -141,5 +141,5 @@ def test_drawn_points_are_spread_evenly_from_seed_to_seed(source):
 def test_places_are_counted_line_by_line():
     channels = channels_of(replace(DISC, wavelength=LINES), index, 16)
     assert sorted(source_numbers(channels)) == sorted([*range(8), *range(4), *range(4)])
-    assert source_numbers([Channel(Point(), 1.5, 0.5)] * 2) == (0, 0)
-    assert source_numbers(channels_of(Point(wavelength=LINES), index, 8)) == (0, 0, 0)
+    assert source_numbers([Channel(PointSource(), 1.5, 0.5)] * 2) == (0, 0)
+    assert source_numbers(channels_of(PointSource(wavelength=LINES), index, 8)) == (0, 0, 0)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.rays import axes
@@ -31,7 +31,7 @@ def flux(source, window, z=Z, n=1000):
 @pytest.mark.parametrize("aperture", [DISC, SQUARE], ids=str)
 @pytest.mark.parametrize("profile", [{}, {"profile": "gaussian", "radius_1e2": 7.0}], ids=str)
 def test_all_light_of_a_collimated_beam_passes_its_aperture(aperture, profile):
-    source = Collimated(aperture, **profile)
+    source = CollimatedSource(aperture, **profile)
     window = source.window(Rectangle(5.0, 5.0), Z, (0.0,))
     assert (window.width / 2, window.height / 2) == aperture.half_extent
     # cells on the rim of a disc are in or out as a whole: 1e-4 at 1000 cells a side
@@ -43,16 +43,16 @@ def test_all_light_of_a_collimated_beam_passes_its_aperture(aperture, profile):
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (3.0, -2.0, 5.0)], ids=str)
 def test_all_light_of_a_point_source_crosses_a_large_plane(place):
     d = Z - place[2]
-    gaussian = Point(position=place, profile="gaussian", half_angle_1e2=30.0)
+    gaussian = PointSource(position=place, profile="gaussian", half_angle_1e2=30.0)
     assert flux(gaussian, Rectangle(8 * d, 8 * d)) == pytest.approx(1, rel=1e-6)
-    cone = Point(position=place, profile="uniform", half_angle=35.0)
+    cone = PointSource(position=place, profile="uniform", half_angle=35.0)
     assert flux(cone, Rectangle(4 * d, 4 * d)) == pytest.approx(1, rel=1e-3)  # the rim's cells
-    cone = Point(position=place, half_angle=60.0)  # on a disc of radius 1.73 d
+    cone = PointSource(position=place, half_angle=60.0)  # on a disc of radius 1.73 d
     assert flux(cone, Rectangle(5 * d, 5 * d)) == pytest.approx(1, rel=1e-3)  # the rim's cells
     [disc, (x, y)] = cone.spot(Z)
     assert (disc.radius, x, y) == pytest.approx((d * math.tan(math.radians(60)), *place[:2]))
     half = 40 * d  # a share d² / (R² + d²) passes beside a disc of radius R; the square's inner circle has R = half
-    assert 1 - 1 / 40**2 - 1e-3 < flux(Point(position=place), Rectangle(2 * half, 2 * half)) < 1
+    assert 1 - 1 / 40**2 - 1e-3 < flux(PointSource(position=place), Rectangle(2 * half, 2 * half)) < 1
 
 
 @pytest.mark.parametrize("z", (4.0, 1000.0))
@@ -65,7 +65,7 @@ def test_irradiance_is_intensity_times_cosine_over_distance_squared(profile, hal
         within = cos / (math.pi * (1 - edge**2)) if profile == "lambertian" else 1 / (2 * math.pi * (1 - edge))
         return (cos >= edge).double() * within
 
-    source = Point(position=(1.0, 2.0, 3.0), **law)
+    source = PointSource(position=(1.0, 2.0, 3.0), **law)
     generator = torch.Generator().manual_seed(0)
     x, y = (torch.rand((2, 1000), generator=generator, dtype=torch.float64) - 0.5) * 3 * (z - 3)
     d2 = (x - 1) ** 2 + (y - 2) ** 2 + (z - 3) ** 2
@@ -74,14 +74,14 @@ def test_irradiance_is_intensity_times_cosine_over_distance_squared(profile, hal
 
 
 SOURCES = [
-    Collimated(DISC, z=2.0),
-    Collimated(SQUARE, profile="gaussian", radius_1e2=5.0, z=-7.0),
-    Point(position=(1.0, 2.0, 3.0)),
-    Point(position=(-4.0, 0.0, -100.0), profile="uniform", half_angle=20.0),
-    Point(profile="gaussian", half_angle_1e2=30.0),
-    Collimated(DISC, tilt=(0.0, 25.0)),
-    Collimated(SQUARE, profile="gaussian", radius_1e2=5.0, z=-7.0, tilt=(-10.0, 25.0), centre=(2.0, -3.0)),
-    Point(position=(1.0, 2.0, 3.0), tilt=(40.0, -30.0)),
+    CollimatedSource(DISC, z=2.0),
+    CollimatedSource(SQUARE, profile="gaussian", radius_1e2=5.0, z=-7.0),
+    PointSource(position=(1.0, 2.0, 3.0)),
+    PointSource(position=(-4.0, 0.0, -100.0), profile="uniform", half_angle=20.0),
+    PointSource(profile="gaussian", half_angle_1e2=30.0),
+    CollimatedSource(DISC, tilt=(0.0, 25.0)),
+    CollimatedSource(SQUARE, profile="gaussian", radius_1e2=5.0, z=-7.0, tilt=(-10.0, 25.0), centre=(2.0, -3.0)),
+    PointSource(position=(1.0, 2.0, 3.0), tilt=(40.0, -30.0)),
 ]
 
 
@@ -99,14 +99,14 @@ def test_rays_pass_the_points_they_were_asked_for(source, dtype):
     atol = 8 * eps * float(t.max())  # rounding of the distance to the source
     torch.testing.assert_close(rays.position + t * rays.direction, asked, rtol=0, atol=atol)
     torch.testing.assert_close(rays.flux, source.irradiance(x, y, Z) * 0.3, rtol=4 * eps, atol=0)
-    start = source.start(Z) if isinstance(source, Collimated) else source.position[2]
+    start = source.start(Z) if isinstance(source, CollimatedSource) else source.position[2]
     assert rays.z == start and not rays.position[2].any()
 
 
 FRONTS = [Plane(Z), Sphere(Z, -0.06), Sphere(Z, -0.03), Sphere(Z, 0.05)]
 PLACES = [(0.0, 0.0, 0.0), (3.0, 0.0, 5.0), (-30.0, 12.0, 0.0)]
-WIDE = [Point(position=place) for place in PLACES]
-WIDE += [Collimated(Circle(200.0), tilt=tilt) for tilt in ((0.0, 30.0), (-20.0, 10.0), (45.0, 0.0))]
+WIDE = [PointSource(position=place) for place in PLACES]
+WIDE += [CollimatedSource(Circle(200.0), tilt=tilt) for tilt in ((0.0, 30.0), (-20.0, 10.0), (45.0, 0.0))]
 
 
 @pytest.mark.parametrize("outline", [Rectangle(24.0, 6.0), Circle(10.0)], ids=str)
@@ -139,7 +139,7 @@ TILTS = [(20.0, 0.0), (-15.0, 30.0), (0.0, 60.0), (80.0, 10.0)]
 @pytest.mark.parametrize("law", PROFILES, ids=str)
 def test_a_tilted_source_is_the_same_source_seen_from_its_own_frame(law, tilt, z):
     """E / D of both: E = I D / d³, and I knows no frame.  To a plane below, all is turned about the axis."""
-    source, straight = Point((3.0, -2.0, 5.0), tilt=tilt, **law), Point(**law)
+    source, straight = PointSource((3.0, -2.0, 5.0), tilt=tilt, **law), PointSource(**law)
     frame, sense = np.array(source.axes), 1 if z > 5 else -1
     seen = 0
     for x, y in np.random.default_rng(0).uniform(-30, 30, (200, 2)):
@@ -158,7 +158,7 @@ def test_a_tilted_source_is_the_same_source_seen_from_its_own_frame(law, tilt, z
 @pytest.mark.parametrize("profile", [{}, {"profile": "gaussian", "radius_1e2": 7.0}], ids=str)
 @pytest.mark.parametrize("aperture", [DISC, SQUARE], ids=str)
 def test_a_tilted_beam_has_all_its_flux_on_any_plane_and_is_shifted_along_its_way(aperture, profile, z):
-    source = Collimated(aperture, tilt=(10.0, 30.0), z=z, centre=(1.0, -2.0), **profile)
+    source = CollimatedSource(aperture, tilt=(10.0, 30.0), z=z, centre=(1.0, -2.0), **profile)
     wide = Rectangle(80.0, 80.0)
     x, y = sampling.grid(wide, 1600)
     e = source.irradiance(x, y, Z) * wide.area / 1600**2
@@ -173,13 +173,13 @@ def test_a_tilted_beam_has_all_its_flux_on_any_plane_and_is_shifted_along_its_wa
 
 def test_a_tilted_beam_says_that_it_is_not_axial():
     x, y = sampling.grid(Rectangle(2.0, 2.0), 4)
-    rays = Collimated(DISC, tilt=(10.0, 30.0)).rays_through(x, y, Z, 1.0)
+    rays = CollimatedSource(DISC, tilt=(10.0, 30.0)).rays_through(x, y, Z, 1.0)
     assert not rays.axial and rays.z < 0
     assert rays.direction[:, 0, 0].tolist() == pytest.approx(axes((10.0, 30.0))[2], rel=1e-15)
-    below = Collimated(DISC, tilt=(10.0, 30.0), z=40.0).rays_through(x, y, Z, 1.0)
+    below = CollimatedSource(DISC, tilt=(10.0, 30.0), z=40.0).rays_through(x, y, Z, 1.0)
     torch.testing.assert_close(below.direction, -rays.direction)
     assert below.sense == -1
-    moved = Collimated(DISC, centre=(1.0, 0.0)).rays_through(x, y, Z, 1.0)
+    moved = CollimatedSource(DISC, centre=(1.0, 0.0)).rays_through(x, y, Z, 1.0)
     assert moved.axial and torch.equal(moved.position[0], x)
 
 
@@ -189,7 +189,7 @@ def test_a_tilted_beam_says_that_it_is_not_axial():
     ids=str,
 )
 def test_window_of_a_tilted_cone_holds_it_and_no_more(place, tilt):
-    cone = Point(place, half_angle=15.0, tilt=tilt)
+    cone = PointSource(place, half_angle=15.0, tilt=tilt)
     area = cone.window(Rectangle(250.0, 250.0), Z, (0.0,))
     x, y = sampling.grid(Rectangle(250.0, 250.0), 1000)
     lit = cone.irradiance(x, y, Z) > 0
@@ -210,7 +210,7 @@ def test_window_of_a_tilted_cone_holds_it_and_no_more(place, tilt):
     ids=str,
 )
 def test_the_main_line_is_the_heaviest_and_of_equals_the_middle_one(wavelength, main):
-    source = Point(wavelength=wavelength)
+    source = PointSource(wavelength=wavelength)
     lines = source.lines
     assert source.main_wavelength == lines[0][0] == main
     assert math.fsum(share for _, share in lines) == pytest.approx(1, abs=1e-15)

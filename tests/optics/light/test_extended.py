@@ -10,8 +10,8 @@ import torch
 from bstcad.optics.kernels.forward import land
 from bstcad.optics.lens.interfaces import cross
 from bstcad.optics.light.channels import Channel, channels_of, drawn_channels
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.outlines import Circle
@@ -71,7 +71,7 @@ def test_etendue_is_conserved_ray_by_ray(lens, sense):
 @pytest.mark.parametrize("z", [None, -7.0], ids=str)
 def test_a_tilted_beam_passes_a_plate_as_snell_says(tilt, z):
     """Shifted by the thickness times tan θ' in the glass, and on its old way behind it."""
-    lens, source, screen = plate(), Collimated(Circle(30.0), tilt=tilt, z=z), LevelPlane(60.0)
+    lens, source, screen = plate(), CollimatedSource(Circle(30.0), tilt=tilt, z=z), LevelPlane(60.0)
     x, y = (p.reshape(-1) for p in torch.meshgrid(*[torch.linspace(-2, 2, 9, dtype=torch.float64)] * 2, indexing="ij"))
     n_x, n_y, n_z = source.axes[2]
     sin = math.hypot(n_x, n_y)
@@ -97,7 +97,7 @@ def moments(channels, lens, screen):
 def test_the_suns_image_through_a_plate_is_as_wide_as_its_angle_times_the_throw(divergence):
     """A small aperture is a pinhole: the image has the variance of a disc of radius sin α (L + t / n), and its own."""
     throw, thickness = 1000.0, 4.0
-    lens, source = plate(thickness), Collimated(Circle(1.0), divergence=divergence)
+    lens, source = plate(thickness), CollimatedSource(Circle(1.0), divergence=divergence)
     half = 1.0 + math.sin(math.radians(divergence / 2)) * (throw + 5)
     screen = Screen(6.0 + throw, (-1.2 * half, 1.2 * half), (-1.2 * half, 1.2 * half), (200, 200))
     alone = moments([Channel(replace(source, divergence=None), 1.5)], lens, screen)
@@ -109,7 +109,7 @@ def test_the_suns_image_through_a_plate_is_as_wide_as_its_angle_times_the_throw(
 
 def test_the_image_of_two_divergences_has_both_widths():
     """The sun's image, stretched: along each axis the radius is that axis's sin α (L + t / n)."""
-    lens, source = plate(), Collimated(Circle(1.0), divergence=(4.0, 1.0))
+    lens, source = plate(), CollimatedSource(Circle(1.0), divergence=(4.0, 1.0))
     half = 1.2 * (1.0 + math.sin(math.radians(2.0)) * 305)
     screen = Screen(306.0, (-half, half), (-half, half), (200, 200))
     alone = moments([Channel(source.central, 1.5)], lens, screen)
@@ -124,7 +124,7 @@ def test_a_disc_behind_a_pinhole_makes_its_own_image(tilt):
 
     Tilted, it is foreshortened along x; what its points are nearer or farther does not change its middle by much.
     """
-    source = Point((0.0, 0.0, -100.0), profile="uniform", half_angle=5.0, diameter=4.0, tilt=tilt)
+    source = PointSource((0.0, 0.0, -100.0), profile="uniform", half_angle=5.0, diameter=4.0, tilt=tilt)
     lens = replace(plate(0.02), outline=Circle(0.05))
     if tilt is not None:
         source = replace(source, half_angle=60.0)
@@ -138,14 +138,14 @@ def test_a_disc_behind_a_pinhole_makes_its_own_image(tilt):
 def test_a_flat_mirror_shows_a_chip_as_large_as_the_distances_say():
     """Each place of the mirror is a pinhole: the image of a rectangle w x h has the variances w²/12 and h²/12."""
     mirror = lens_of(net(z=0.0, half=11.0), Plane(-3.0), reflects=True)
-    chip = Point((0.0, 0.0, 50.0), profile="uniform", half_angle=40.0, width=4.0, height=2.0)
+    chip = PointSource((0.0, 0.0, 50.0), profile="uniform", half_angle=40.0, width=4.0, height=2.0)
     found = images(channels_of(chip, lambda nm: 1.0, 64), mirror, Screen(150.0, (-60.0, 60.0), (-60.0, 60.0), 120))
     variances = (found.offset**2 * found.flux).sum((1, 2)) / found.flux.sum()  # pixels of 1 mm
     assert variances.tolist() == pytest.approx([12.0**2 / 12, 6.0**2 / 12], rel=0.02)
 
 
 SCREEN = Screen(120.0, (-14.0, 12.0), (-12.0, 12.0), (13, 12))
-LAMP = Point((2.0, 0.0, -60.0), profile="uniform", half_angle=7.0, diameter=8.0)
+LAMP = PointSource((2.0, 0.0, -60.0), profile="uniform", half_angle=7.0, diameter=8.0)
 
 
 def test_the_number_of_points_leaves_no_bias():
@@ -158,7 +158,7 @@ def test_the_number_of_points_leaves_no_bias():
         return drawn_channels(LAMP, lambda nm: 1.5, 8, seed)
 
     efforts = [Effort(128, seed, accuracy=0.0) for seed in range(8, 80, 8)]
-    found = [measure(curved(), (), SCREEN, target, effort, draw=draw) for effort in efforts]
+    found = [measure(curved(), (), SCREEN, target, effort, sampler=draw) for effort in efforts]
     errors = np.array([light.standard_error for light in found])
     off = np.array([light.rrmsd for light in found]) - exact.rrmsd
     assert abs(off.mean()) < 3 * math.hypot(np.sqrt((errors**2).mean() / len(found)), exact.standard_error)

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.profiles import Net, Profile
 from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.outlines import EVERYWHERE, Circle, Rectangle, Rounded
+from tests import suite
 from tests.lenses import Measured
 
 APERTURES = [Circle(5.0), Rectangle(8.0, 3.0), Rounded(9.0, 7.0, corner_radius=2.0)]
@@ -34,7 +35,7 @@ def summed(law, outline, n=3000):
 
 
 @pytest.mark.parametrize("outline", APERTURES, ids=str)
-@pytest.mark.parametrize("name", PROFILES)
+@pytest.mark.parametrize("name", suite.in_turns(PROFILES, 3))
 def test_the_flux_inside_an_outline_is_the_sum_over_small_cells(name, outline):
     assert PROFILES[name].flux(outline) == pytest.approx(
         summed(PROFILES[name], outline), rel=2e-3
@@ -66,11 +67,11 @@ def test_two_equal_radii_are_one():
     """The general profile against the closed forms of round beams, parallel and from a point, tilted and not."""
     x, y = (torch.rand(500, generator=torch.Generator().manual_seed(k), dtype=torch.float64) * 8 - 4 for k in (0, 1))
     for one in (
-        Collimated(Circle(4.5), profile="gaussian", radius_1e2=3.0),
-        Collimated(Rectangle(9.0, 7.0), profile="gaussian", radius_1e2=3.0, tilt=(5.0, 3.0)),
-        Point((0.5, 0.0, -6.0), profile="gaussian", half_angle_1e2=25.0),
-        Point((0.5, 0.0, -6.0), profile="gaussian", half_angle_1e2=25.0, tilt=(-20.0, 10.0)),
-        Point((0.5, 0.0, 6.0), profile="gaussian", half_angle_1e2=25.0, tilt=(-20.0, 10.0)),
+        CollimatedSource(Circle(4.5), profile="gaussian", radius_1e2=3.0),
+        CollimatedSource(Rectangle(9.0, 7.0), profile="gaussian", radius_1e2=3.0, tilt=(5.0, 3.0)),
+        PointSource((0.5, 0.0, -6.0), profile="gaussian", half_angle_1e2=25.0),
+        PointSource((0.5, 0.0, -6.0), profile="gaussian", half_angle_1e2=25.0, tilt=(-20.0, 10.0)),
+        PointSource((0.5, 0.0, 6.0), profile="gaussian", half_angle_1e2=25.0, tilt=(-20.0, 10.0)),
     ):
         key = "radius_1e2" if one.parallel else "half_angle_1e2"
         width = getattr(one, key)
@@ -81,7 +82,7 @@ def test_two_equal_radii_are_one():
 
 @pytest.mark.parametrize("tilt", [None, (15.0, -10.0)])
 def test_all_light_of_an_elliptical_cone_crosses_a_plane(tilt):
-    source = Point((0.0, 0.0, -10.0), profile="gaussian", half_angle_1e2=(35.0, 10.0), rotate=40.0, tilt=tilt)
+    source = PointSource((0.0, 0.0, -10.0), profile="gaussian", half_angle_1e2=(35.0, 10.0), rotate=40.0, tilt=tilt)
     x, y = sampling.grid(Rectangle(120.0, 120.0), 1500)
     light = source.irradiance(x, y, 0.0)
     assert float(light.sum()) * 120**2 / 1500**2 == pytest.approx(1, rel=1e-6)
@@ -99,7 +100,7 @@ def test_an_intensity_over_stereographic_coordinates_lights_a_plane_as_its_close
     u, v = np.meshgrid(*2 * (np.linspace(-half, half, 513),), indexing="ij")
     r2 = u * u + v * v
     net = Net(np.maximum((1 - r2) / (1 + r2), 0.0), (-half, half), (-half, half))
-    point = Point((1.0, -2.0, 3.0), tilt=tilt)
+    point = PointSource((1.0, -2.0, 3.0), tilt=tilt)
     table = replace(point, intensity=Measured(Profile(net=net, stereographic=True, whole=math.pi)))
     for z in (13.0, -7.0):
         x, y = sampling.grid(Rectangle(40.0, 40.0), 100)

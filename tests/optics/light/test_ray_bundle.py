@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.channels import Channel, Draw, drawn_channels, given_channels
+from bstcad.optics.light.channels import Channel, SourceSampler, drawn_channels, given_channels
 from bstcad.optics.light.measured_rays import PARTS, MeasuredRays, RayOrder
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.ray_bundle import RayBundle, fates
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.outlines import Circle
@@ -111,7 +111,7 @@ def test_rays_and_their_model_light_a_tilted_plane_alike(sense):
     direction = np.hstack([flat, np.ones((n, 1))])
     start = np.tile([0.4, -0.7, 0.3], (n, 1)) - direction * chance.random((n, 1))
     lamp = Given(ray_set(start, direction))
-    point = Point((1.0, 2.0, 0.0), 550.0, rays=lamp, tilt=(8.0, -5.0), rotate=35.0)
+    point = PointSource((1.0, 2.0, 0.0), 550.0, rays=lamp, tilt=(8.0, -5.0), rotate=35.0)
     assert np.allclose(lamp.facts.origin, (0.4, -0.7, 0.3), atol=1e-4) and lamp.facts.extent is None
     z = 20.0 * sense
     lens = Lens(Plane(z), Plane(z + 3.0), Circle(100.0), 1.5)
@@ -144,13 +144,14 @@ def test_a_lens_judged_by_rays_is_the_lens_judged_by_their_source():
     lens = Lens(Plane(14.0), wavy(), Circle(10.0), 1.5)
     screen = Screen(300.0, (-60.0, 60.0), (-60.0, 60.0), 12)
     target = np.ones((12, 12))
-    disc = Point((0.0, 0.0, 0.0), 550.0, diameter=1.0)
-    given = given_channels(Point((0.0, 0.0, 0.0), 550.0, rays=Given(lambertian_disc(400_000, 1.0))), lambda nm: 1.5)
+    disc = PointSource((0.0, 0.0, 0.0), 550.0, diameter=1.0)
+    given = given_channels(
+        PointSource((0.0, 0.0, 0.0), 550.0, rays=Given(lambertian_disc(400_000, 1.0))), lambda nm: 1.5
+    )
     effort, channel = Effort(rays=300, accuracy=0.0), Channel(disc.central, 1.5)
-    light = measure(lens, [channel], screen, target, effort,
-                    draw=Draw(lambda points, seed: drawn_channels(disc, lambda nm: 1.5, points, seed)))  # fmt: skip
-    own = measure(lens, [channel], screen, target, effort,
-                  draw=Draw(lambda points, seed: given(seed), given.largest_side))  # fmt: skip
+    by_disc = SourceSampler(lambda points, seed: drawn_channels(disc, lambda nm: 1.5, points, seed))
+    by_rays = SourceSampler(lambda points, seed: given(seed), given.largest_side)
+    light, own = (measure(lens, [channel], screen, target, effort, sampler=each) for each in (by_disc, by_rays))
     assert own.rays < 410_000 and sum(own.flux.values()) == pytest.approx(1.0, abs=1e-12)
     assert own.rrmsd == pytest.approx(light.rrmsd, abs=4 * (own.standard_error + light.standard_error))
     for line in ("on target", "missed the lens"):

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bstcad.optics.kernels.forward import angle_by_sine, land
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.receivers.directions import Directions
 from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
@@ -73,7 +73,7 @@ def test_the_angle_follows_from_its_sine_and_cosine_to_rounding():
 
 LENS = lens_of(wavy(m=17, depth=2.0, ripple=0.2, z=22.0, half=11.0), Sphere(15.0, -0.02), SQUARE, 1.5)
 SCENES = {
-    "lens": (Collimated(Circle(9.0), tilt=(5.0, 10.0)), LENS),
+    "lens": (CollimatedSource(Circle(9.0), tilt=(5.0, 10.0)), LENS),
     "mirror": (LIGHTS["gaussian, tilted"], mirror(bumpy())),
 }
 

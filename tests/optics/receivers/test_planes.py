@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from bstcad.optics.lens.interfaces import cross
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import TiltedPlane
@@ -28,9 +28,9 @@ from tests.lenses import bundle, lens_of, net
 TILT = (25.0, -40.0)
 SCREEN = Screen(300.0, (-40.0, 100.0), (-70.0, 60.0), (24, 20), TILT)
 LIGHTS = {  # a source, and does a lens or a mirror throw its light?
-    "parallel": (Collimated(Circle(9.0)), False),
-    "point": (Point((1.0, -2.0, -40.0), profile="uniform", half_angle=12.0), False),
-    "mirror": (Point((3.0, -2.0, 90.0), profile="uniform", half_angle=5.0), True),
+    "parallel": (CollimatedSource(Circle(9.0)), False),
+    "point": (PointSource((1.0, -2.0, -40.0), profile="uniform", half_angle=12.0), False),
+    "mirror": (PointSource((3.0, -2.0, 90.0), profile="uniform", half_angle=5.0), True),
 }
 ALL = pytest.mark.parametrize("light", LIGHTS)
 
@@ -63,7 +63,7 @@ def test_rays_land_on_the_plane(light, z):
     coming, lens = coming_through(light)
     lens = replace(lens, front=lens.front.moved(z), back=replace(lens.back, z=lens.back.z + z))
     plane = TiltedPlane((30.0, -5.0, 300.0 + z), TILT)
-    leaving = cross(replace(coming, z=coming.z + z), lens.last_freeform).rays
+    leaving = cross(replace(coming, z=coming.z + z), lens.last_tailored).rays
     landed = plane.to(leaving)
     x, y, height = landed.position[0] - 30.0, landed.position[1] + 5.0, landed.above(300.0 + z)
     n = plane.axes[2]
@@ -124,9 +124,9 @@ def test_the_gradient_of_the_merit_is_its_derivative(light):
 def test_irradiance_falls_as_the_cosine(tilt):
     """A collimated uniform beam of irradiance E behind a flat plate: E cos θ on the plane, θ from the axis to n."""
     plate = lens_of(net(z=5.0), Plane(0.0))
-    beam, side = Collimated(Rectangle(8.0, 8.0)), 16.0
+    beam, side = CollimatedSource(Rectangle(8.0, 8.0)), 16.0
     screen = Screen(200.0, (-side, side), (-side, side), 64, tilt)
-    cosine = screen.plane.axes[2][2]
+    cosine = screen.receiver.axes[2][2]
     assert cosine == pytest.approx(math.prod(math.cos(math.radians(t)) for t in tilt))
     for found in (picture(beam, plate, screen, 64), launch_tubes(beam, plate, 64).picture(plate, screen)):
         irradiance = found * screen.per_unit[0] * screen.per_unit[1]

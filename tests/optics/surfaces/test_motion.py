@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.motion import Motion
 from bstcad.optics.surfaces.outlines import Circle
@@ -32,7 +32,7 @@ def motion(request):
 
 def place(screen, x, y):
     """A place of a screen in space."""
-    return np.array(screen.plane.point(x, y))
+    return np.array(screen.receiver.point(x, y))
 
 
 def test_a_motion_and_its_inverse_are_none(motion):
@@ -63,10 +63,10 @@ def test_each_pixel_goes_where_the_motion_takes_it(name, motion):
 @pytest.mark.parametrize(
     "source",
     [
-        Point((1.0, -2.0, -5.0), profile="gaussian", half_angle_1e2=20.0),
-        Point((1.0, -2.0, -5.0), profile="lambertian", tilt=(5.0, 3.0)),
-        Collimated(Circle(8.0), z=-20.0),
-        Collimated(Circle(8.0), tilt=(4.0, -2.0)),
+        PointSource((1.0, -2.0, -5.0), profile="gaussian", half_angle_1e2=20.0),
+        PointSource((1.0, -2.0, -5.0), profile="lambertian", tilt=(5.0, 3.0)),
+        CollimatedSource(Circle(8.0), z=-20.0),
+        CollimatedSource(Circle(8.0), tilt=(4.0, -2.0)),
     ],
     ids=["point", "tilted point", "beam", "tilted beam"],
 )
@@ -76,7 +76,7 @@ def test_rays_of_a_moved_source_are_moved_rays(source, motion):
     after = source.moved(motion, z)
     x = torch.linspace(-3.0, 3.0, 7, dtype=torch.float64)
     x, y = torch.meshgrid(x, x, indexing="ij")
-    if isinstance(source, Collimated):
+    if isinstance(source, CollimatedSource):
         shift = after.shift(z)
         x, y = x + shift[0], y + shift[1]
     rays = after.rays_through(x, y, z, 1.0)
@@ -85,7 +85,7 @@ def test_rays_of_a_moved_source_are_moved_rays(source, motion):
     start = np.stack([p.numpy().ravel() for p in (*rays.position[:2], height)])
     places = np.array([back.point(tuple(p)) for p in start.T])
     direction = back.rotation @ rays.direction.expand(3, *x.shape).reshape(3, -1).numpy()
-    if isinstance(source, Point):
+    if isinstance(source, PointSource):
         off = np.array(source.position) - places
         assert np.abs(np.cross(off, direction.T)).max() < 1e-9
         return

@@ -9,7 +9,7 @@ from scipy.interpolate import BSpline
 from scipy.optimize import root
 
 from bstcad.optics.lens.interfaces import Refract, deflect, intersect
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.sphere_light import SphereLight
 from bstcad.optics.surfaces.charts import HEIGHTS, SphereChart
 from bstcad.optics.surfaces.outlines import Circle
@@ -308,7 +308,7 @@ def sphere_light(profile, position, half=HALF):
     """Return the light of a point at a position relative to the centre, within `half` of +z."""
     x, y, z = position
     angle = {"half_angle": 80.0} if profile == "uniform" else {}
-    return SphereLight(Point((x, y, z + Z), profile=profile, **angle), Z, CHART, half)
+    return SphereLight(PointSource((x, y, z + Z), profile=profile, **angle), Z, CHART, half)
 
 
 def flux_over_chart(light, n=600):

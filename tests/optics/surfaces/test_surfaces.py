@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.rays import Status
@@ -17,7 +17,7 @@ from tests.lenses import SQUARE, bundle, lens_of, net
 
 N = 1.5
 CONSTANTS = (-30.0, -2.25, -1.0, -1 / 2.25, 0.0, 0.7, 5.0)
-BEAM = Collimated(Circle(9.0))
+BEAM = CollimatedSource(Circle(9.0))
 
 
 def places(n=400, reach=8.0, dtype=torch.float64):
@@ -49,7 +49,7 @@ def test_an_ellipsoid_brings_a_parallel_beam_to_its_far_focus(radius):
 def test_a_hyperboloid_makes_the_light_of_its_far_focus_parallel():
     """A hyperboloid of eccentricity n: k = -n², from a point R / (n - 1) before the vertex."""
     radius = 10.0
-    rays = behind(Conic(15.0, 1 / radius, -(N**2)), Point((0.0, 0.0, 15.0 - radius / (N - 1))))
+    rays = behind(Conic(15.0, 1 / radius, -(N**2)), PointSource((0.0, 0.0, 15.0 - radius / (N - 1))))
     assert float(rays.direction[:2].abs().max()) < 1e-12
 
 
@@ -70,7 +70,9 @@ def test_points_fulfil_the_equation(constant, curvature):
 def test_rays_meet_it_where_it_is(constant, curvature):
     surface = Conic(15.0, curvature, constant)
     x, y = places(reach=6.0)
-    at, *_ = intersect(surface, Point((2.0, -1.0, 3.0)).rays_through(x, y, 15.0, 1.0), SQUARE, Status.MISSED_FRONT)
+    at, *_ = intersect(
+        surface, PointSource((2.0, -1.0, 3.0)).rays_through(x, y, 15.0, 1.0), SQUARE, Status.MISSED_FRONT
+    )
     assert at.alive.all()
     found = torch.from_numpy(sag(surface, *at.position[:2].numpy()))
     torch.testing.assert_close(at.above(0.0), found, rtol=0, atol=1e-12)
@@ -87,7 +89,7 @@ def test_the_other_sheet_of_a_hyperboloid_is_not_met():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_conic_of_constant_zero_is_the_sphere_to_the_bit(dtype):
     x, y = places(dtype=dtype)
-    rays = Point().rays_through(x, y, 15.0, 1.0)
+    rays = PointSource().rays_through(x, y, 15.0, 1.0)
     for c in (0.02, -0.05):
         conic, sphere = Conic(15.0, c), Sphere(15.0, c)
         assert all(map(torch.equal, conic.sag_and_slope(x, y), sphere.sag_and_slope(x, y)))

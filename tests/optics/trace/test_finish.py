@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
+from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.optics.surfaces.surfaces import Plane
@@ -33,7 +33,7 @@ def sag(x, y):
 def plate():
     surface = net(sag, BACK, 129, 1.05 * HALF)
     return Lens(Plane(0.0), surface, Rectangle(2 * HALF, 2 * HALF), N), Channel(
-        Collimated(Rectangle(2 * HALF, 2 * HALF), z=0.0, wavelength=587.6), N
+        CollimatedSource(Rectangle(2 * HALF, 2 * HALF), z=0.0, wavelength=587.6), N
     )
 
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from bstcad.optics.light.channels import Channel
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.outlines import Circle
@@ -30,7 +30,7 @@ def target():
     return np.random.default_rng(0).uniform(0.5, 1.5, SCREEN.shape)
 
 
-BEAM, LAMP = Collimated(Circle(8.0)), Point((2.0, 0.0, -60.0), profile="uniform", half_angle=7.0)
+BEAM, LAMP = CollimatedSource(Circle(8.0)), PointSource((2.0, 0.0, -60.0), profile="uniform", half_angle=7.0)
 
 
 def test_light_is_the_weighted_sum_of_its_channels():
@@ -164,7 +164,7 @@ class TestRealSource:
     def test_only_cells_narrower_than_the_image_are_blurred(self):
         goal, channels = Goal("target", SCREEN, target()), (Channel(BEAM, 1.5),)
         sharp, wide = (
-            measuring.measure_goals(LENS, channels, [goal], EFFORT, ghost=None, draw=None, images=images)[0]
+            measuring.measure_goals(LENS, channels, [goal], EFFORT, ghost=None, sampler=None, images=images)[0]
             for images in ((), (0.8,))
         )
         assert [each.blurred for each in sharp.by_cell] == [None] * 5

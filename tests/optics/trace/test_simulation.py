@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers import irradiance
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
@@ -30,7 +30,7 @@ def covered(screen, radius):
 
 
 SCREEN = Screen(300.0, (-7.3, 6.1), (-6.9, 7.7), (24, 21))  # pixels in no ratio to the cells of the rays
-DISC = Collimated(Circle(6.5))
+DISC = CollimatedSource(Circle(6.5))
 EXPECTED = torch.as_tensor(covered(SCREEN, 6.5) / (math.pi * 6.5**2))
 
 
@@ -48,14 +48,14 @@ def test_flux_through_the_lens_is_the_sources():
     """A Lambertian point, a plane front: what crosses the square outline is the view factor of a centred square,
     (4 / π) X / sqrt(1 + X²) atan(X / sqrt(1 + X²)), X = half side over distance (each quarter a standard factor)."""
     lens = lens_of(net(z=22.0), Plane(15.0))
-    result = simulated(Point(), lens, Screen(100.0, (-500.0, 500.0), (-500.0, 500.0), 8), 400, seed=0)
+    result = simulated(PointSource(), lens, Screen(100.0, (-500.0, 500.0), (-500.0, 500.0), 8), 400, seed=0)
     ratio = 10.0 / 15.0
     slant = math.sqrt(1 + ratio**2)
     share = 4 / math.pi * ratio / slant * math.atan(ratio / slant)
     assert 1 - result.flux["missed the lens"] == pytest.approx(share, rel=1e-5)
 
 
-@pytest.mark.parametrize("source", [Point(), DISC], ids=("point", "collimated"))
+@pytest.mark.parametrize("source", [PointSource(), DISC], ids=("point", "collimated"))
 def test_the_clear_window_loses_no_light_that_gets_through(source):
     lens = lens_of(wavy(z=22.0, depth=3.0, half=10.0), index=1.6)
     whole, clear = window(source, lens), clear_window(source, lens)

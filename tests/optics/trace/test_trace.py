@@ -8,8 +8,8 @@ import torch
 
 from bstcad.optics.lens.interfaces import Refract
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
@@ -23,7 +23,7 @@ from tests.tracing import from_first_net_plain, stratified
 
 def from_point(n=40, half=9.0, z=15.0, source=None, dtype=torch.float64):
     x, y = stratified(Rectangle(2 * half, 2 * half), n, 0, dtype)
-    return (source or Point()).rays_through(x, y, z, 1.0)
+    return (source or PointSource()).rays_through(x, y, z, 1.0)
 
 
 def heading(rays, surface, outline=SQUARE):
@@ -97,7 +97,7 @@ def test_a_ray_that_turns_back_does_not_land(form):
 
 def test_axial_closed_form_is_the_newton_answer():
     x, y = stratified(Rectangle(22.0, 22.0), 30, 0)
-    axial = Collimated(Circle(12.0)).rays_through(x, y, 8.0, 1.0)
+    axial = CollimatedSource(Circle(12.0)).rays_through(x, y, 8.0, 1.0)
     searched = replace(axial, axial=False)
     for front in (Plane(8.0), Sphere(8.0, -0.03)):
         lens = Lens(front, wavy(), SQUARE, N)
@@ -139,7 +139,7 @@ def test_paraxial_rays_follow_the_transfer_matrix(curvature, z):
     thickness, power = 6.0, (N - 1) * curvature
     lens = Lens(Sphere(14.0, curvature), net(), SQUARE, N)
     h = torch.tensor([1e-3, 2e-3], dtype=torch.float64)
-    rays = Collimated(Circle(5.0)).rays_through(h, -h, 0.0, 1.0)
+    rays = CollimatedSource(Circle(5.0)).rays_through(h, -h, 0.0, 1.0)
     expected = h * (1 - power * thickness / N) - h * power * (z - 20.0)
     landed = trace.trace(rays, lens, LevelPlane(z))
     atol = 10 * float(h.max()) ** 3 * curvature**2 * z * abs(curvature) + 1e-15 * z  # third-order aberration
@@ -153,7 +153,7 @@ def test_a_prism_deviates_by_its_closed_form():
     """Flat front, back tilted by α: sin(α + δ) = n sin α for rays along the axis, δ towards the thicker side."""
     slope = 0.3
     x, y = sampling.grid(SQUARE, 5)
-    rays = Collimated(Circle(30.0)).rays_through(x, y, 0.0, 1.0)
+    rays = CollimatedSource(Circle(30.0)).rays_through(x, y, 0.0, 1.0)
     landed = trace.trace(rays, Lens(Plane(8.0), tilted(slope), SQUARE, N), LevelPlane(1000.0))
     tilt = math.atan(slope)
     turn = math.asin(N * math.sin(tilt)) - tilt
@@ -170,7 +170,7 @@ def test_a_prism_deviates_by_its_closed_form():
 def test_gradient_in_curvature_net_and_start_is_finite_differences(kind, curvature):
     """The implicit gradient of both hits: everything a designer may tailor, and the rays themselves."""
     start = wavy(m=5)
-    source = Point() if kind == "point" else Collimated(Circle(12.0))
+    source = PointSource() if kind == "point" else CollimatedSource(Circle(12.0))
 
     def landing(heights, curvature, x, y):
         lens = Lens(Sphere(15.0, curvature), replace(start, heights=heights), SQUARE, N)

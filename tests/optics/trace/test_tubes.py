@@ -5,8 +5,8 @@ import itertools
 import pytest
 import torch
 
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen, rrmsd
 from bstcad.optics.surfaces.outlines import EVERYWHERE, Circle, Rectangle, Rounded
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
@@ -120,16 +120,28 @@ def lens_behind(front, outline):
 
 SMALL, LARGE = Rounded(11.0, 13.0, corner_radius=3.0), Rounded(12.0, 14.0, corner_radius=4.0)
 SOURCES = {
-    "beam inside the lens": (Collimated(Circle(8.0)), Plane(8.0), Rectangle(20.0, 20.0)),
-    "gaussian beam": (Collimated(Circle(8.0), profile="gaussian", radius_1e2=5.0), Plane(8.0), Circle(9.0)),
-    "beam larger than the lens": (Collimated(Rectangle(30.0, 30.0)), Plane(8.0), Circle(9.0)),
-    "beam cut by two sides": (Collimated(Rectangle(30.0, 8.0)), Sphere(8.0, 0.02), Rectangle(16.0, 16.0)),
-    "beam over part of the lens": (Collimated(Rectangle(10.0, 40.0)), Plane(8.0), Rectangle(20.0, 20.0)),
-    "point, cut by the back": (Point(profile="gaussian", half_angle_1e2=30.0), Plane(15.0), Rectangle(20.0, 20.0)),
-    "point near a round lens": (Point((1.0, -0.5, 9.0)), Sphere(15.0, 0.03), Circle(10.0)),
-    "narrow cone off axis": (Point((1.0, 0.5, 0.0), profile="uniform", half_angle=12.0), Plane(15.0), Circle(9.0)),
-    "beam cut by a front with round corners": (Collimated(Rectangle(30.0, 30.0)), Sphere(8.0, 0.02), (SMALL, LARGE)),
-    "point cut by a back with round corners": (Point((1.0, -0.5, 0.0)), Plane(15.0), (LARGE, SMALL)),
+    "beam inside the lens": (CollimatedSource(Circle(8.0)), Plane(8.0), Rectangle(20.0, 20.0)),
+    "gaussian beam": (CollimatedSource(Circle(8.0), profile="gaussian", radius_1e2=5.0), Plane(8.0), Circle(9.0)),
+    "beam larger than the lens": (CollimatedSource(Rectangle(30.0, 30.0)), Plane(8.0), Circle(9.0)),
+    "beam cut by two sides": (CollimatedSource(Rectangle(30.0, 8.0)), Sphere(8.0, 0.02), Rectangle(16.0, 16.0)),
+    "beam over part of the lens": (CollimatedSource(Rectangle(10.0, 40.0)), Plane(8.0), Rectangle(20.0, 20.0)),
+    "point, cut by the back": (
+        PointSource(profile="gaussian", half_angle_1e2=30.0),
+        Plane(15.0),
+        Rectangle(20.0, 20.0),
+    ),
+    "point near a round lens": (PointSource((1.0, -0.5, 9.0)), Sphere(15.0, 0.03), Circle(10.0)),
+    "narrow cone off axis": (
+        PointSource((1.0, 0.5, 0.0), profile="uniform", half_angle=12.0),
+        Plane(15.0),
+        Circle(9.0),
+    ),
+    "beam cut by a front with round corners": (
+        CollimatedSource(Rectangle(30.0, 30.0)),
+        Sphere(8.0, 0.02),
+        (SMALL, LARGE),
+    ),
+    "point cut by a back with round corners": (PointSource((1.0, -0.5, 0.0)), Plane(15.0), (LARGE, SMALL)),
 }
 
 
@@ -163,7 +175,7 @@ def test_rays_meet_the_back_where_they_are_sent(name):
 @pytest.mark.parametrize("front", [Plane(15.0), Sphere(15.0, 0.03)], ids=("plane", "sphere"))
 def test_rays_of_several_sources_are_those_of_each(front, n):
     """A tilted chip, whose points lie at different heights."""
-    chip = Point((1.0, -0.5, 2.0), width=2.0, height=1.0, tilt=(20.0, 30.0))
+    chip = PointSource((1.0, -0.5, 2.0), width=2.0, height=1.0, tilt=(20.0, 30.0))
     sources = [chip.element(x, y) for x, y in ((0.0, 0.0), (1.0, 0.5), (-1.0, 0.25))]
     lens, places = lens_behind(front, Circle(9.0)), tubes.corners(Circle(8.0), n)
     *points, rays = tubes.rays_to(sources, lens, *places)
@@ -185,8 +197,8 @@ def test_an_even_beam_gives_each_pixel_its_area(pixels):
     x, y = (e.clamp(-half, half).diff() for e, half in zip(edges, beam.half_extent, strict=True))
     exact = y.flip(0)[:, None] * x / beam.area  # row 0 = y max
     for found in (
-        tubes.picture(Collimated(beam), lens, screen, 31),
-        tubes.launch_tubes(Collimated(beam), lens, 31).picture(lens, screen),
+        tubes.picture(CollimatedSource(beam), lens, screen, 31),
+        tubes.launch_tubes(CollimatedSource(beam), lens, 31).picture(lens, screen),
     ):
         assert found.shape == screen.shape == (pixels[1], pixels[0])
         torch.testing.assert_close(found, exact, rtol=0, atol=1e-8)  # the sheet lies 1e-9 of its size inside the beam

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.wavefront import PlaneWave, SphericalWave, ZernikeWave, path_from_sphere
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere
@@ -18,7 +18,7 @@ from tests.lenses import net
 N, NM, F = 1.49, 632.8, 120.0
 WAVE = NM * 1e-6  # mm
 NIL = 1e-6  # waves; a millionth of what a good lens has
-BEAM = Collimated(Circle(10.0), wavelength=NM)
+BEAM = CollimatedSource(Circle(10.0), wavelength=NM)
 ROUND = Circle(12.0)
 
 
@@ -50,7 +50,7 @@ def focusing():
     return Lens(Conic(10.0, N / (F * (N - 1)), -1 / N**2), Sphere(20.0, 1 / (F - 10.0)), ROUND, N)
 
 
-LAMP = Point((0.0, 0.0, 10.0 - F), wavelength=NM, profile="uniform", half_angle=4.5)
+LAMP = PointSource((0.0, 0.0, 10.0 - F), wavelength=NM, profile="uniform", half_angle=4.5)
 STIGMATIC = {
     "a hyperbolic back": (plano_hyperbolic(), BEAM, SphericalWave((0.0, 0.0, 20.0 + F), 30.0)),
     "a hyperbolic front": (collimating(), LAMP, PlaneWave(30.0)),
@@ -132,7 +132,7 @@ BUMPY = Lens(bumps(0.02, 0.3, 10.0, 17), bumps(-0.03, 1.1, 20.0, 23), ROUND, N)
 
 @pytest.mark.parametrize("source", [
     BEAM, replace(BEAM, tilt=(4.0, -6.0), profile="gaussian", radius_1e2=6.0),
-    Point((1.0, -0.5, -80.0), wavelength=NM, profile="uniform", half_angle=4.0),
+    PointSource((1.0, -0.5, -80.0), wavelength=NM, profile="uniform", half_angle=4.0),
 ], ids=["beam", "tilted gaussian", "point"])  # fmt: skip
 @pytest.mark.parametrize("wave", [
     PlaneWave(30.0, (0.05, -0.1, 1.0)), SphericalWave((4.0, 0.0, 230.0), 30.0),

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import torch
 
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
@@ -27,10 +27,10 @@ MIRROR = lens(Plane(0.0), reflects=True)
 SCREEN = Screen(400.0, (-30.0, 30.0), (-20.0, 20.0), (48, 32))
 TILTED = replace(SCREEN, x=(-48.0, -34.0), y=(-34.0, -20.0), pixels=32, tilt=(20.0, -15.0))
 WIDE = replace(SCREEN, x=(-120.0, 90.0), y=(-90.0, 110.0))
-BEAM = Collimated(Rectangle(18.0, 16.0))
-TILTED_BEAM = Collimated(Circle(9.0), tilt=(4.0, -6.0), centre=(0.5, -0.3), z=5.0)
-LAMP = Point((1.0, -0.5, -20.0), profile="gaussian", half_angle_1e2=14.0)
-CONE = Point((0.5, 1.0, 90.0), profile="uniform", half_angle=5.0)
+BEAM = CollimatedSource(Rectangle(18.0, 16.0))
+TILTED_BEAM = CollimatedSource(Circle(9.0), tilt=(4.0, -6.0), centre=(0.5, -0.3), z=5.0)
+LAMP = PointSource((1.0, -0.5, -20.0), profile="gaussian", half_angle_1e2=14.0)
+CONE = PointSource((0.5, 1.0, 90.0), profile="uniform", half_angle=5.0)
 APERTURES = Rounded(14.0, 13.0, corner_radius=3.0), Rounded(15.0, 16.0, corner_radius=4.0)
 CASES = {
     "a beam": (lens(), BEAM, SCREEN),

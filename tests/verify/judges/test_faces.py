@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from bstcad.optics.light.channels import Channel, channels_of
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.surfaces.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere, sag
 from bstcad.verify.judges import faces, mitsuba
@@ -109,7 +109,7 @@ def without_mitsuba(monkeypatch):
 
 def test_a_slide_of_a_lambertian_point_has_the_view_factor_of_its_square(without_mitsuba, tmp_path):
     """A/√(1+A²) atan(A/√(1+A²)) · 4/π of a square of slopes up to A (Howell, catalogue of view factors, B-4)."""
-    source = Point((0.5, -1.0, -20.0), profile="lambertian")
+    source = PointSource((0.5, -1.0, -20.0), profile="lambertian")
     made = mitsuba.lamps((Channel(source, 1.49, weight=1.0),), lens(), tmp_path)
     half = math.tan(math.radians(made["lamp0"]["fov"] / 2))
     assert 11 / 32 < half < 1.1 * 11 / 32  # the farther rim of the lens, 10 + 1 mm off
@@ -119,18 +119,18 @@ def test_a_slide_of_a_lambertian_point_has_the_view_factor_of_its_square(without
 
 
 def test_a_spot_has_the_intensity_of_its_cone_and_a_beam_its_radiance(without_mitsuba, tmp_path):
-    cone = Point((0.0, 0.0, 90.0), profile="uniform", half_angle=5.0)
+    cone = PointSource((0.0, 0.0, 90.0), profile="uniform", half_angle=5.0)
     [spot] = mitsuba.lamps((Channel(cone, 1.49, weight=0.5),), lens(), tmp_path).values()
     solid_angle = 2 * math.pi * (1 - math.cos(math.radians(5.0)))
     assert spot["intensity"]["value"] * solid_angle == pytest.approx(0.5) and spot["to_world"][1][2] < 0  # down
-    beam = Collimated(Rectangle(4.0, 5.0), z=0.0)
+    beam = CollimatedSource(Rectangle(4.0, 5.0), z=0.0)
     [plate] = mitsuba.lamps((Channel(beam, 1.49, weight=1.0),), lens(), tmp_path).values()
     assert plate["emitter"]["radiance"]["value"] == pytest.approx(1 / 20.0) and (tmp_path / "lamp0.ply").exists()
 
 
 def test_mitsuba_declines_plates_of_light_that_stand_in_the_light():
     """One plate for each direction of the sun, and a plate before a mirror: all dark."""
-    beam, glass = Collimated(Rectangle(4.0, 5.0)), lens()
+    beam, glass = CollimatedSource(Rectangle(4.0, 5.0)), lens()
     suns = channels_of(replace(beam, divergence=0.5), lambda nm: glass.index, points=4)
     assert mitsuba.cannot(glass, (Channel(beam, 1.49),)) == ""
     assert "many directions" in mitsuba.cannot(glass, suns)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.collimated import Collimated
-from bstcad.optics.light.point import Point
+from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.point import PointSource
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
 from tests.verify.judges.lenses import MIRROR, waved
@@ -17,11 +17,11 @@ from tests.verify.judges.paths import paths_apart
 PATH, PLACE = 1e-6, 1e-9  # mm: a nanometre of path, a picometre of place
 SCREEN = 120.0  # mm
 APERTURE = Circle(8.5)
-BEAM = Collimated(Circle(8.0))
+BEAM = CollimatedSource(Circle(8.0))
 SOURCES = {
     "a beam": BEAM,
     "a tilted beam": replace(BEAM, tilt=(4.0, -6.0), centre=(0.5, -0.3), z=2.0),
-    "a point": Point((1.0, -0.5, -60.0), profile="gaussian", half_angle_1e2=5.0),
+    "a point": PointSource((1.0, -0.5, -60.0), profile="gaussian", half_angle_1e2=5.0),
 }
 
 
@@ -50,7 +50,7 @@ def test_batoid_agrees_through_one_net(batoid, front):
 
 
 def test_batoid_agrees_on_a_mirror(batoid):
-    lamp = Point((0.5, 1.0, 90.0), profile="uniform", half_angle=5.0)
+    lamp = PointSource((0.5, 1.0, 90.0), profile="uniform", half_angle=5.0)
     found = paths_apart(replace(MIRROR, outline=Rectangle(17.0, 17.0)), lamp, 400.0)
     assert found.path < PATH and found.place < PLACE
 
