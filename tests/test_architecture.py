@@ -446,7 +446,7 @@ def test_compiled_functions_read_nothing_of_other_files():
     assert offenders(overlooked_by_a_cache, allowed=one_cache) == {}
 
 
-SURFACES = ("Plane", "Sphere", "Conic", "Toroid", "BSplineSurface")
+SURFACES = ("Plane", "Sphere", "Conic", "Toroid", "BSplineSurface", "RadialSurface")
 
 
 def questions_of_type(tree):
@@ -504,6 +504,7 @@ BROKEN = [
     (overlooked_by_a_cache, "from bstcad.a import B\n@njit\ndef f():\n    return B"),
     (overlooked_by_a_cache, "from bstcad.a import B\nC = float(B)\n@njit(cache=True)\ndef f(x):\n    return x + C"),
     (questions_of_type, "isinstance(lens.front, Sphere)"),
+    (questions_of_type, "assert isinstance(lens.back, RadialSurface)"),
     (questions_of_type, "type(face) == Plane"),
     (questions_of_type, 'getattr(lens.front, "curvature", 0.0)'),
     (questions_of_type, "match face:\n    case BSplineSurface():\n        pass"),

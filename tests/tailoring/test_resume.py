@@ -133,7 +133,7 @@ def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
         assert np.array_equal(again.transport.source, whole.transport.source)
 
 
-@suite.in_turn(0, 2)
+@suite.in_turn(0, 3)
 def test_an_interrupt_anywhere_gives_a_lens_and_loses_nothing():
     """Asked at every look: before the first round there is no lens; later the best so far, and the way on."""
     scene = load(DISK, SCENES["paper"])
