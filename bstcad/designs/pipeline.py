@@ -31,12 +31,7 @@ from bstcad.scene.scene import Scene
 from bstcad.tailoring import effort as efforts
 from bstcad.tailoring import slope_map, stage1, stage2, two_faces
 from bstcad.tailoring.baselines import integration, paper
-from bstcad.tailoring.feasibility import find_demand, is_infeasible
-from bstcad.tailoring.grazing import without_reflection
-from bstcad.tailoring.machinability import BOUNDS_STAGE, active_bounds, enforce_bounds, place_back
-from bstcad.tailoring.merit import PictureError
-from bstcad.tailoring.reachable import Reach, reach_of
-from bstcad.tailoring.run import (
+from bstcad.tailoring.driver import (
     BEST_LENS_STAGE,
     NO_HOOKS,
     RRMSD_SECONDS,
@@ -52,6 +47,11 @@ from bstcad.tailoring.run import (
     Steps,
     Task,
 )
+from bstcad.tailoring.feasibility import find_demand, is_infeasible
+from bstcad.tailoring.grazing import without_reflection
+from bstcad.tailoring.machinability import BOUNDS_STAGE, active_bounds, enforce_bounds, place_back
+from bstcad.tailoring.merit import PictureError
+from bstcad.tailoring.reachable import Reach, reach_of
 from bstcad.tailoring.settings import Settings
 from bstcad.tailoring.source_image import ExtendedSource
 from bstcad.tailoring.stage2 import PrecisionComparison, compare_precisions
