@@ -15,7 +15,6 @@ if beside := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):
     for library in ("OMP", "OPENBLAS", "NUMBA"):
         os.environ.setdefault(f"{library}_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // beside)))
 
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -122,12 +121,8 @@ def proofs(patch):
 
 
 def verify_with(patch, few):
-    """Whatever verifies with no effort of its own, such as the command line, does so with this one.
-
-    The margins of the trace, too, are those of few rays.
-    """
+    """Whatever verifies with no effort of its own, such as the command line, does so with this one."""
     from bstcad.verify import checks
 
     verify = checks.verify
-    patch.setattr(checks, "margins", partial(checks.margins, n=64))
     patch.setattr(checks, "verify", lambda *given, effort=None, **more: verify(*given, effort=effort or few, **more))
