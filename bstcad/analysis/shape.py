@@ -23,7 +23,7 @@ from bstcad.optics.lens.interfaces import intersect
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import QUARTERS, BSplineSurface, span_points, weights
 from bstcad.optics.surfaces.outlines import EVERYWHERE, Outline
-from bstcad.optics.surfaces.radial import RadialSurface, dot
+from bstcad.optics.surfaces.radial import dot, require_radial
 from bstcad.optics.surfaces.rays import Rays, Status
 from bstcad.optics.surfaces.sampling import sample_rim
 from bstcad.optics.surfaces.surfaces import points_on, sag
@@ -271,10 +271,10 @@ def survey(lens: Lens, concave: float | None = None, convex: float | None = None
     """Find the extremes of the back; concave, convex: smallest radii (mm), slope: largest angle (degrees) allowed."""
     lens = lens.plain()
     back = lens.back_net
-    if isinstance(back, RadialSurface):
+    if not back.chart.flat:
         valley, ridge, steep = (
             Extreme(value, f"at ({', '.join(f'{p:.4g}' for p in place)}) mm", 0.0)
-            for value, place in extremes(back, lens.outline)
+            for value, place in extremes(require_radial(back), lens.outline)
         )
         return Survey(_radius(valley), _radius(ridge), steep)
     x, y, along_x, along_y = _grid(back)

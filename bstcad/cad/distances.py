@@ -20,7 +20,7 @@ from bstcad.optics.kernels import dome_distance
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import is_net
 from bstcad.optics.surfaces.outlines import Circle
-from bstcad.optics.surfaces.radial import RadialSurface, circle_radius
+from bstcad.optics.surfaces.radial import circle_radius, require_radial
 from bstcad.optics.surfaces.surfaces import MIN_COS2, Surface, sampled
 from bstcad.runs.kernel_cache import compiled_kernel
 
@@ -59,9 +59,7 @@ def _from_face(face: Surface, points: np.ndarray) -> np.ndarray:
 
 def _feet(face: Surface, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the heights (n,) (mm) of points (n, 3) over a radial surface, and unit normals (n, 3) at their feet."""
-    face = face.plain()
-    assert isinstance(face, RadialSurface)  # the only surface that is not one of heights
-    return dome_distance.heights(face, points - (0.0, 0.0, face.z))
+    return dome_distance.heights(require_radial(face), points - (0.0, 0.0, face.z))
 
 
 def distances_of_facets(vertices: np.ndarray, faces: np.ndarray, lens: Lens) -> Iterator[float]:
@@ -87,9 +85,7 @@ def distances_of_facets(vertices: np.ndarray, faces: np.ndarray, lens: Lens) -> 
 
 def _from_base_and_back(corners: np.ndarray, lens: Lens) -> float:
     """Return the largest distance (mm) of facets (n, 3, 3) from a lens on its base."""
-    back = lens.back.plain()
-    assert isinstance(back, RadialSurface)
-    middle = (0.0, 0.0, back.z)
+    back, middle = require_radial(lens.back), (0.0, 0.0, lens.back.z)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     over_base = np.abs(corners[..., 2] - lens.front.around.z)
     flat = over_base.max(axis=1) <= BASE_TOLERANCE

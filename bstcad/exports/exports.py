@@ -29,9 +29,8 @@ from bstcad.exports.tile_files import joints, tile_files
 from bstcad.exports.toolpath_files import toolpath_files
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import is_net
-from bstcad.optics.surfaces.charts import SphereChart
 from bstcad.optics.surfaces.outlines import Circle, Outline
-from bstcad.optics.surfaces.radial import RadialSurface, circle_radius
+from bstcad.optics.surfaces.radial import circle_radius, require_radial
 from bstcad.optics.surfaces.surfaces import Surface, points_and_normals, sag
 from bstcad.photometry import eulumdat, ies, intensity_files, tm25
 from bstcad.photometry.intensity import Intensity, Luminaire
@@ -158,7 +157,7 @@ def _files(
         raise ValueError(f"'{kind}' needs the light of a scene; export it from the folder of a design")
     count = min(max(lens.back_net.shape), MAX_POINTS) if points is None else points
     match kind:
-        case "sag" if isinstance(lens.back.chart, SphereChart):
+        case "sag" if not lens.back.chart.flat:
             yield "sag-polar.csv", polar_table(lens, count)
         case "sag":
             yield "sag.csv", sag_table(lens, count)
@@ -274,8 +273,7 @@ def polar_table(lens: Lens, points: int) -> str:
     Directions have the angle θ (degrees) from +z and the azimuth ψ (degrees) from +x towards +y; normals point out of
     the lens.  There are (points + 1) // 2 rings of equal spacing from the axis to the half angle.
     """
-    back = lens.back.plain()
-    assert isinstance(back, RadialSurface)  # the only surface in a chart of directions
+    back = require_radial(lens.back)
     half = back.chart.angle(circle_radius(lens.outline), back.radius)
     theta = np.append(0.0, np.repeat(np.linspace(0.0, half, (points + 1) // 2)[1:], 2 * points))
     psi = np.append(0.0, np.tile(np.arange(2 * points) * (math.pi / points), (points + 1) // 2 - 1))

@@ -27,7 +27,7 @@ from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.wavefront import SphericalWave
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
@@ -216,7 +216,7 @@ def test_compiled_or_not(holds, monkeypatch, dtype):
     monkeypatch.setitem(globals(), "RAYS", RAYS // 2)
     monkeypatch.setitem(globals(), "TUBES", TUBES // 2)
     wanted = image_and_gradient(dtype)
-    monkeypatch.setattr(ops, "ENABLED", False)
+    monkeypatch.setattr(kernel_choice, "ENABLED", False)
     for name, found in image_and_gradient(dtype).items():
         bound = (JUMPS if name == "gradient, rays" else AGREE)[dtype]
         holds(f"compiled against plain, {str(dtype)[6:]}: {name}", apart(name, found, wanted[name]), bound)

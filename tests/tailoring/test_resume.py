@@ -14,8 +14,8 @@ from bstcad.optics.trace.measure import Effort
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring import effort as efforts
+from bstcad.tailoring.driver import Hooks
 from bstcad.tailoring.minimise import AdamState, Best, LbfgsState, adam, lbfgs, minimise
-from bstcad.tailoring.run import Hooks
 from tests import domes, suite, two_faces
 from tests.conftest import DISK, SMALL
 

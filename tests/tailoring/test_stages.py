@@ -11,8 +11,8 @@ from bstcad.optics.receivers.irradiance import efficiency
 from bstcad.scene import scene
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.baselines import paper
+from bstcad.tailoring.driver import Driver, Hooks, StageStep, Task
 from bstcad.tailoring.merit import Landings, Merit
-from bstcad.tailoring.run import Driver, Hooks, StageStep, Task
 from tests import suite
 from tests.tracing import simulated
 

@@ -21,8 +21,8 @@ from bstcad.optics.trace.tubes import collect
 from bstcad.optics.trace.wavefront_error import wavefront_error
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import light_behind
+from bstcad.tailoring.driver import Hooks, Parameters
 from bstcad.tailoring.merit import Merit
-from bstcad.tailoring.run import Hooks, Parameters
 from tests import suite
 from tests.conftest import quick_effort
 from tests.lenses import SQUARE, rough

@@ -17,7 +17,6 @@ import numpy as np
 
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle
-from bstcad.optics.surfaces.radial import circle_radius
 from bstcad.optics.surfaces.surfaces import Conic, Recess, Sphere, sag
 
 BASE_MARGIN = 0.5  # largest default distance of the base plane below both lit rims (mm)
@@ -34,7 +33,6 @@ def on_base(lens: Lens, z: float | None = None) -> Lens:
     """
     if lens.shares_outline or lens.front.outline is not None:
         return lens
-    circle_radius(lens.outline)
     front, rim = lens.front.plain(), lens.back.rim(lens.outline)
     lowest = float(rim[:, 2].min())
     if front.level:

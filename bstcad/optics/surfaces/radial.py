@@ -52,6 +52,7 @@ DIRECTION_TOLERANCE = 1e-9  # largest distance of control points from their dire
 CARRYING_STEPS = 6  # corrections of the distances of a surface after a small motion
 DIRECTION_STEPS = 4  # corrections of (x, y) by which the surface is found in a given direction
 SILHOUETTE_RINGS = 181  # number of angles from the axis among which the silhouette is searched
+RIM_POINTS = 1440  # number of points of a rim at which its height and its distance from the axis are examined
 STANDOFF = 0.01  # distance before the surface at which rays to it start, as a fraction of R
 ROOT_TOLERANCE = 64  # distance from the ray at which the search ends, in units of R times the precision of the numbers
 
@@ -239,6 +240,10 @@ class RadialSurface(BSplineSurface):
             for value, base in zip(values, (float(self.z), 0.0, 0.0), strict=True)
         )
         return z, z_x, z_y
+
+    def rim(self, outline: Outline) -> np.ndarray:
+        """Return points (RIM_POINTS, 3) (mm) at equal angles over a circle of the chart; ValueError for no circle."""
+        return points_on(self, *Circle(circle_radius(outline)).around(RIM_POINTS + 1)[:-1].T)
 
     def opening(self, outline: Outline) -> Circle:
         """Return the smallest circle about the axis (mm) around the rim over an outline of the chart."""
@@ -437,6 +442,13 @@ class RadialSurface(BSplineSurface):
             now_x, now_y, h = self.chart.coordinates(self.at(x, y).position)
             x, y = (x + to_x - now_x).clamp(*self.x), (y + to_y - now_y).clamp(*self.y)
         return x, y, self.radius + h
+
+
+def require_radial(surface: Surface) -> RadialSurface:
+    """Return a radial surface, in float64; TypeError for another one."""
+    if not isinstance(surface, RadialSurface):
+        raise TypeError(f"the {surface.kind} is no surface of distances from a centre")
+    return surface.plain()
 
 
 def circle_radius(outline: Outline) -> float:

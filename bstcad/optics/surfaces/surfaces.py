@@ -21,7 +21,6 @@ from bstcad.optics.surfaces.rays import Rays
 
 MIN_COS2 = 1e-6  # 1 - (1 + k) c² r² (for a sphere cos² of the slope angle) up to which a surface is too steep
 MIN_ARRIVAL_COSINE = 1e-3  # smallest cosine with the axis by which a height is divided
-RIM_POINTS = 1440  # number of points of a rim at which its height and its distance from the axis are examined
 
 
 Vectors = tuple[Tensor, Tensor, Tensor]  # components x, y and z of vectors
@@ -110,8 +109,8 @@ class Surface(ABC):
         return (x, y, h), (-z_x, -z_y, torch.ones_like(h))
 
     def rim(self, outline: Outline) -> np.ndarray:
-        """Return points (n, 3) (mm) of the surface along an outline of its chart, at equal angles."""
-        return points_on(self, *outline.around(RIM_POINTS + 1)[:-1].T)
+        """Return points (n, 3) (mm) of the surface along an outline of its chart, in no particular order."""
+        return points_on(self, *outline.rim_points())
 
     def opening(self, outline: Outline) -> Outline:
         """Return the smallest outline, seen along the axis (mm), around the surface's rim over an outline."""
