@@ -43,8 +43,8 @@ from bstcad.tailoring.baselines.paper import TentMerit
 from bstcad.tailoring.merit import Merit, SobolevVariable
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.transport.density import Density
-from tests import domes, two_faces
-from tests.conftest import DISK, SMALL
+from tests import two_faces
+from tests.scenes import DISK, DOME, SMALL
 from tests.tracing import launch, simulated, simulated_plain
 
 ROOT = Path(__file__).parent.parent.parent
@@ -252,7 +252,7 @@ TAILORED = {  # a front that is searched for; two nets for two pictures, and for
 FEW_STEPS = {"rays": 190, "rounds": 2, "stage2_iterations": 4}
 QUICK_DESIGNS = {
     "two faces": two_faces.SMALL | two_faces.WITH_WAVE | {"tailoring": two_faces.SMALL["tailoring"] | FEW_STEPS},
-    "dome": domes.SMALL | {"tailoring": domes.SMALL["tailoring"] | FEW_STEPS},
+    "dome": DOME | {"tailoring": DOME["tailoring"] | FEW_STEPS},
 }
 
 
