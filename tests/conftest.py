@@ -5,8 +5,6 @@ And one small design, made once a session: every step of the main job on real ge
 
 import gc
 import os
-import pickle
-import shutil
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # Worker processes, and the processes that they start, share the cores.  A second thread for a core that is busy is
@@ -15,33 +13,13 @@ if beside := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):
     for library in ("OMP", "OPENBLAS", "NUMBA"):
         os.environ.setdefault(f"{library}_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // beside)))
 
-from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from tests.scenes import DISK, SMALL, designed
+
 pytest_plugins = ["tests.suite"]
-DISK = Path(__file__).parent.parent / "templates" / "disk.toml"
-SMALL = {  # a gentle lens: few triangles keep its mesh within the volume's tolerance
-    "name": "small",
-    "title": "A <small> disc",
-    "source.position": [0.5, 0.0, -60.0],
-    "lens.outline": {"shape": "rectangle", "width": 8.0, "height": 6.0},
-    "lens.front": {"kind": "sphere", "z": 15.0, "curvature": 0.002},
-    "lens.back.z": 25.0,
-    "lens.back.control_points": 33,
-    "target.x": [-30.0, 30.0],
-    "target.y": [-25.0, 25.0],
-    "target.pixels": [64, 48],
-    "target.outline": {"shape": "circle", "radius": 20.0},
-    "moulding.shrinkage": 0.005,
-    "tailoring.quality": "draft",
-    "tailoring.rays": 256,
-    "tailoring.rounds": 3,
-    "tailoring.stage2_iterations": 30,  # two rounds
-    "tailoring.transport_grid": 64,
-}
 
 
 def pytest_collection_finish():
@@ -60,23 +38,9 @@ def small_scene():
 
 @pytest.fixture(scope="session")
 def small_design(small_scene, tmp_path_factory):
-    """(folder, report) of the small scene as `generate` wrote it; everything is drawn but the 3-D picture.
-
-    The first of several processes designs it; each has a copy of its own.
-    """
-    from filelock import FileLock
-
-    from bstcad import commands
-
-    base, folder = tmp_path_factory.getbasetemp(), tmp_path_factory.mktemp("small") / "outputs" / "small"
-    shared = (base.parent if beside else base) / "shared"
-    with FileLock(f"{shared}.lock"):
-        if not (facts := shared / "facts").exists():
-            design, effort = shared / "design", quick_effort()
-            options = commands.ProofOptions(effort, flat_pictures())
-            report = commands.generate(small_scene, design, options, device="cpu")
-            facts.write_bytes(pickle.dumps(report.facts))
-    return SimpleNamespace(folder=shutil.copytree(shared / "design", folder), report=pickle.loads(facts.read_bytes()))
+    """(folder, report) of the small scene as `generate` wrote it; everything is drawn but the 3-D picture."""
+    folder = tmp_path_factory.mktemp("small") / "outputs" / "small"
+    return SimpleNamespace(folder=folder, report=designed(small_scene, quick_effort(), folder, flat_pictures()))
 
 
 def pictures(*kinds):
@@ -84,7 +48,9 @@ def pictures(*kinds):
     from bstcad.figures.figure_jobs import Pictures
 
     every = ("solid", "lens", "light", "numbers", "sheet", "judges", "part")
-    return type("Some", (Pictures,), {kind: lambda self, *given: None for kind in every if kind not in kinds})
+    return type(
+        f"Pictures of {kinds}", (Pictures,), {kind: lambda self, *given: None for kind in every if kind not in kinds}
+    )
 
 
 def flat_pictures():
@@ -122,12 +88,8 @@ def proofs(patch):
 
 
 def verify_with(patch, few):
-    """Whatever verifies with no effort of its own, such as the command line, does so with this one.
-
-    The margins of the trace, too, are those of few rays.
-    """
+    """Whatever verifies with no effort of its own, such as the command line, does so with this one."""
     from bstcad.verify import checks
 
     verify = checks.verify
-    patch.setattr(checks, "margins", partial(checks.margins, n=64))
     patch.setattr(checks, "verify", lambda *given, effort=None, **more: verify(*given, effort=effort or few, **more))

@@ -52,8 +52,14 @@ def turn(parts: int) -> int:
 
 
 def daily(values: Iterable, numbers: Container[int]) -> list:
-    """Return values for pytest.mark.parametrize, of which all but those with these numbers are `thorough`."""
-    params = [value if hasattr(value, "marks") else pytest.param(value) for value in values]
+    """Return values for pytest.mark.parametrize, of which all but those with these numbers are `thorough`.
+
+    A tuple has the values of several arguments.
+    """
+    params = [
+        value if hasattr(value, "marks") else pytest.param(*(value if isinstance(value, tuple) else (value,)))
+        for value in values
+    ]
     rest = pytest.mark.thorough
     return [each if k in numbers else each._replace(marks=(*each.marks, rest)) for k, each in enumerate(params)]
 

@@ -491,7 +491,7 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
         "IMAGE_PAIRS": 32,
     },
     "tailoring.machinability": {"THICKNESS_POINTS": 65, "QUARTER_RIM_POINTS": 129, "REPAIR_EVALUATIONS": 20},
-    "analysis.light": {"MOUNT_RAYS": 48, "MIN_MOUNT_RAYS": 16, "MARGIN_RAYS": 64, "NEEDED_RAYS": 17},
+    "analysis.light": {"MOUNT_RAYS": 48, "MIN_MOUNT_RAYS": 16, "NEEDED_RAYS": 17},
     "analysis.light.blur": {"__defaults__": (12,)},
     "analysis.neglected_effects": {"FACE_POINTS": 24, "GHOST_RAYS_PER_SIDE": 16},
     "analysis.shape": {"GRID_POINTS": 129},

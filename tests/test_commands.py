@@ -176,6 +176,7 @@ class TestGenerate:
         assert not re.search("https?:", re.sub(r"base64,[^\"]*", "", page))
         assert "A &lt;small&gt; disc" in page
 
+    @suite.in_turn(1, 2)
     def test_a_picture_with_y_up_travels_with_its_design(self, quick, small_design, monkeypatch, tmp_path):
         """A PNG bright at the top: row 0 is y max; its copy lies next to scene.toml, and the folder is enough."""
         (tmp_path / "in").mkdir()
@@ -256,6 +257,7 @@ class TestGenerate:
             with pytest.raises(SceneError, match=r"lens\.step: .* 0 s "):
                 commands.verify(path)
 
+    @suite.in_turn(0, 2)
     def test_the_3d_picture_is_drawn_where_the_machine_can(self, proved):
         commands.verify(proved, options=ProofOptions(drawing=pictures("solid")))
         page, drawn = (proved / "report.html").read_text(), proved / "figures" / "lens.png"

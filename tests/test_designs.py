@@ -88,6 +88,7 @@ def bumped(lens, by=2e-4):
 
 
 class TestOwnSurfaces:
+    @suite.in_turn(2, 3)
     def test_another_lens_is_judged_and_written_as_what_it_is(self, made, quick, tmp_path):
         lens = bumped(made.lens)
         design = made.with_lens(lens)

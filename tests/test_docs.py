@@ -20,7 +20,6 @@ import typer
 
 import bstcad
 from bstcad import cli, commands
-from bstcad.commands import ProofOptions
 from bstcad.manufacture.tolerance import tolerancing
 from bstcad.optics.surfaces.surfaces import sag
 from bstcad.planning import batch
@@ -30,6 +29,7 @@ from bstcad.scene.scene import load
 from tests import suite
 from tests.conftest import draws_nothing, quick_effort, verify_with
 from tests.planning.conftest import Synthetic, typical_pilot
+from tests.scenes import designed
 
 ROOT = Path(__file__).parent.parent
 sys.path.append(str(ROOT / "docs" / "_ext"))
@@ -92,10 +92,7 @@ def prepared(tmp_path_factory):
 
 def make_design(place, name):
     """Design a small template into the outputs of a folder, without pictures."""
-    with pytest.MonkeyPatch.context() as patch:
-        draws_nothing(patch)
-        scene = load(place / "templates" / f"{name}.toml")
-        commands.generate(scene, place / "outputs" / name, device="cpu", options=ProofOptions(quick_effort()))
+    designed(load(place / "templates" / f"{name}.toml"), quick_effort(), place / "outputs" / name)
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,6 @@ import pytest
 import torch
 
 import bstcad
-from bstcad import commands
-from bstcad.commands import ProofOptions
 from bstcad.figures.figure_jobs import side_view
 from bstcad.figures.light_figures import View
 from bstcad.manufacture.tolerance.perturbations import Setup
@@ -29,7 +27,8 @@ from bstcad.tailoring import slope_map
 from bstcad.verify import step_checks
 from bstcad.verify.judges.comparison import compare
 from tests import suite
-from tests.conftest import DISK, draws_nothing, quick_effort
+from tests.conftest import quick_effort
+from tests.scenes import DISK, designed
 
 ROUND = {"shape": "circle", "radius": 300.0}
 WINDOW = {
@@ -184,10 +183,7 @@ def test_a_scene_keeps_its_elements_and_one_without_them_names_none():
 def folder(tmp_path_factory):
     """The folder of a design through a window, by way of a fold mirror."""
     place = tmp_path_factory.mktemp("elements") / "folded"
-    with pytest.MonkeyPatch.context() as patch:
-        draws_nothing(patch)
-        scene = bstcad.load(DISK).changed(SMALL | FOLDED)
-        commands.generate(scene, place, ProofOptions(quick_effort()), device="cpu")
+    designed(bstcad.load(DISK).changed(SMALL | FOLDED), quick_effort(), place)
     return place
 
 

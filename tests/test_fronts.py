@@ -10,23 +10,19 @@ import pytest
 import torch
 
 import bstcad
-from bstcad import commands
 from bstcad.cad import step_reading
-from bstcad.commands import ProofOptions
 from bstcad.designs.folder import read_nominal
 from bstcad.manufacture.tolerance import perturbations
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.surfaces import Toroid, sag
 from bstcad.scene.scene import load
 from tests import suite
-from tests.conftest import draws_nothing, quick_effort
+from tests.conftest import quick_effort
+from tests.scenes import designed
 
 
 def made(scene, folder):
-    with pytest.MonkeyPatch.context() as patch:
-        draws_nothing(patch)
-        report = commands.generate(scene, folder, device="cpu", options=ProofOptions(quick_effort())).facts
-    return SimpleNamespace(scene=scene, folder=folder, report=report)
+    return SimpleNamespace(scene=scene, folder=folder, report=designed(scene, quick_effort(), folder))
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ from PIL import Image
 
 import bstcad
 from bstcad import commands
-from bstcad.commands import ProofOptions
 from bstcad.verify import step_checks
 from tests.conftest import draws_nothing, quick_effort
+from tests.scenes import designed
 from tests.test_seen import letter
 
 SMALL = {
@@ -30,9 +30,7 @@ def made(tmp_path_factory):
     scene = bstcad.load("templates/mirror.toml").changed(
         SMALL | PARALLEL | {"target.tilt": [0.0, 35.0], "target.image": str(place / "F.png"), "target.gamma": 1.0}
     )
-    with pytest.MonkeyPatch.context() as patch:
-        draws_nothing(patch)
-        commands.generate(scene, place / "out", device="cpu", options=ProofOptions(EFFORT))
+    designed(scene, EFFORT, place / "out")
     return place / "out", json.loads((place / "out" / "report.json").read_text()), scene
 
 

@@ -76,6 +76,7 @@ def test_float32_is_compared_when_a_report_asks_for_it():
     assert told.with_report_data() is told and now.with_report_data() is now
 
 
+@suite.in_turn(1, 2)
 def test_float32_comes_close_to_float64():
     value, _ = judged(pipeline.design(small("thu", **{"tailoring.precision": "float32"})))
     assert value == pytest.approx(judged(designed("thu")[0])[0], rel=0.3)
@@ -113,6 +114,7 @@ def test_a_back_that_would_reach_the_front_or_the_target_is_refused():
     pipeline.check_thickness(lens.with_back(lens.back.moved(23.5)), near)
 
 
+@suite.in_turn(0, 2)
 def test_a_target_that_is_not_square_gets_its_picture():
     """A round spot on 300 x 150 mm, on pixels of equal sides: as round and bright as asked."""
     wide = {"target.x": "[-150.0, 150.0]", "target.y": "[-75.0, 75.0]", "target.pixels": "64"}

@@ -110,7 +110,9 @@ def other(request, tmp_path_factory):
     return request.param, folder
 
 
-@pytest.mark.parametrize("script", ["housing.py", "flanged_lens.py", "lens_array.py", "mould_insert.py"])
+@pytest.mark.parametrize(
+    "script", suite.in_turns(["housing.py", "flanged_lens.py", "lens_array.py", "mould_insert.py"], 2)
+)
 def test_a_script_makes_a_part_of_any_design_or_says_why_not(other, script):
     kind, folder = other
     if words := REFUSED.get((kind, script)):

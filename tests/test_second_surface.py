@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 import bstcad
-from bstcad import commands
-from bstcad.commands import ProofOptions
 from bstcad.optics.lens.interfaces import Reflect, Refract
 from bstcad.scene.effects import Fresnel
 from bstcad.verify.judges.comparison import compare
 from tests import suite
-from tests.conftest import draws_nothing, quick_effort
+from tests.conftest import quick_effort
+from tests.scenes import designed
 from tests.test_seen import letter
 
 EFFORT = quick_effort()
@@ -32,9 +31,7 @@ def scene_of(**changes):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("glass") / "out"
-    with pytest.MonkeyPatch.context() as patch:
-        draws_nothing(patch)
-        commands.generate(scene_of(), place, device="cpu", options=ProofOptions(EFFORT))
+    designed(scene_of(), EFFORT, place)
     return place
 
 

@@ -148,7 +148,7 @@ def verify(
     wavefront, of_wavefront = _wavefront_checks(made_lens, nominal)
     cut = as_cut(lens, mount)
     shape = describe(cut, effort.places) | {"volume": whole.volume} | _ripple_rrmsd(made_lens, nominal)
-    stability, of_stability = _stability(made_lens, nominal, lights, shape)
+    stability, of_stability = _stability(made_lens, nominal, lights, shape, rays=effort.places // 2)
     of_shape, at_bounds = bound_checks(cut, nominal.scene.lens, shape)
     optic, accept = lens.passes.optic, nominal.scene.accept
     lit_goals = list(zip(nominal.goals, lights, strict=True))
@@ -257,10 +257,14 @@ def _aperture_check(name: str, measured: Outline, designed: Outline) -> Check:
 
 
 def _stability(
-    lens: Lens, nominal: Nominal, lights: Sequence[Light], shape: Mapping[str, float | None]
+    lens: Lens, nominal: Nominal, lights: Sequence[Light], shape: Mapping[str, float | None], rays: int
 ) -> tuple[dict[str, float | int | None], list[Check]]:
-    """Return figures of stability (record.Contents), and checks of total internal reflection and of finite values."""
-    margin = margins(nominal.channels, lens, nominal.goals[0].screen, nominal.scene.tailoring.seed + VERIFY_SEED)
+    """Return figures of stability (record.Contents), and checks of total internal reflection and of finite values.
+
+    rays: number of rays per side for the margins.
+    """
+    seed = nominal.scene.tailoring.seed + VERIFY_SEED
+    margin = margins(nominal.channels, lens, nominal.goals[0].screen, seed, n=rays)
     keys = (f"{face}radius_min_{kind}" for face in ("", "front_") for kind in ("concave", "convex"))
     radii = [radius for key in keys if (radius := shape.get(key))]
     non_finite = margin.non_finite + sum(int((~np.isfinite(light.picture)).sum()) for light in lights)

@@ -78,9 +78,7 @@ def test_plate_and_picture_take_the_proportions_of_a_photo_that_is_there(own, cr
     assert own.ask("/api/scene/small/photo.png").status == 400
 
 
-@pytest.mark.parametrize(
-    ("light", "size"), suite.in_turns([pytest.param("laser", (80, 120)), pytest.param("lamp", (120, 80))], 2)
-)
+@pytest.mark.parametrize(("light", "size"), suite.in_turns([("laser", (80, 120)), ("lamp", (120, 80))], 2))
 def test_a_photo_is_a_verified_lens_in_four_requests(own, light, size, tmp_path):
     name = with_scene(own, light, size)
     for key, words in FEW.items():

@@ -16,6 +16,7 @@ from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.surfaces import Sphere, sag
 from bstcad.scene.mount import LAND, Box, CircleRim
 from bstcad.step_text import part21
+from tests import suite
 from tests.cad.test_mounting import disc
 from tests.cad.test_trimming import occ_volume, plate, stadium, uses, waves, worst_gap
 
@@ -67,8 +68,10 @@ def lean_of(face, places=9):
 
 @pytest.mark.parametrize(
     "front, rim",
-    [("plane", "circle"), ("plane", "rounded"), ("convex", "circle"), ("concave", "rectangle"),
-     ("nearly flat", "rounded"), ("conic", "rectangle"), ("freeform", "rounded")],
+    suite.in_turns([
+        ("plane", "circle"), ("plane", "rounded"), ("convex", "circle"), ("concave", "rectangle"),
+        ("nearly flat", "rounded"), ("conic", "rectangle"), ("freeform", "rounded"),
+    ], 2),
 )  # fmt: skip
 def test_it_is_a_closed_solid_whose_walls_lean_by_the_draft(front, rim, tmp_path):
     """The walls lean in space, in the faces' planes, and for another reader of the file."""
@@ -134,7 +137,7 @@ PEANUT = (cq.Workplane("XY").moveTo(WAIST[0], -WAIST[1]).threePointArc((3.6, 0),
 
 
 @pytest.mark.parametrize(
-    "rim", [SLOT, BEAN.close().wires().val(), KITE, PEANUT], ids=["slot", "bean", "kite", "peanut"]
+    "rim", suite.in_turns([SLOT, BEAN.close().wires().val(), KITE, PEANUT], 2), ids=["slot", "bean", "kite", "peanut"]
 )
 def test_the_rim_may_be_any_smooth_wire_and_any_polygon(rim, tmp_path):
     """Walls on a spline are ruled; they, too, lean by the draft, below a straight corner's mitre as beside it."""

@@ -17,6 +17,7 @@ from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere
 from bstcad.scene.mount import Box
+from tests import suite
 from tests.cad.test_mounting import disc
 from tests.cad.test_trimming import plate, stadium
 from tests.exact_volume import exact_volume
@@ -119,6 +120,7 @@ def test_a_lens_in_a_body_is_both(kind):
     assert found.centroid == pytest.approx(moment / found.volume, abs=1e-6)
 
 
+@suite.in_turn(1, 2)
 def test_leaning_walls():
     """Cones, slanted planes and ruled walls."""
     solid = named_solid(plate("freeform"), wire(ROUNDED), draft=Draft(4.0, bevel=0.25)).solid

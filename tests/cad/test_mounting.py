@@ -11,6 +11,7 @@ from bstcad.cad import patches, step_writing
 from bstcad.cad.mounting import PlacedLens, body, mounted
 from bstcad.scene.mount import Box, CircleRim, Flange
 from bstcad.step_text import part21
+from tests import suite
 from tests.cad.test_trimming import FRONTS, occ_volume, plate, stadium, uses, worst_gap
 from tests.exact_volume import exact_volume
 
@@ -73,6 +74,7 @@ def test_the_lens_may_be_cut_to_any_wire(spline, tmp_path):
     assert again.isValid() and occ_volume(again) == pytest.approx(occ_volume(part.solid), rel=1e-9)
 
 
+@suite.in_turn(0, 2)
 def test_an_array_is_one_part():
     lens = plate("convex")
     base = cq.Workplane("XY", origin=(0, 0, 0.5)).rect(40, 34).extrude(1.5)

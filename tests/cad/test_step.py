@@ -21,6 +21,7 @@ from bstcad.runs import processes
 from bstcad.runs.files import SceneError
 from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks
+from tests import suite
 
 OUTLINES = [Rectangle(24.0, 20.0), Circle(12.0)]
 EXACT = 1e-11  # mm, the acceptance; the file holds 14 decimals
@@ -148,6 +149,7 @@ def test_a_damaged_file_is_refused_in_one_sentence(make_lens, tmp_path, damage):
     assert "\n" not in str(caught.value)
 
 
+@suite.in_turn(0, 2)
 def test_nothing_is_printed(make_lens, tmp_path):
     """OCC would print statistics of each transfer, into the middle of what the command line says."""
     torch.save(make_lens(m=7), tmp_path / "lens.pt")

@@ -26,6 +26,7 @@ from bstcad.optics.surfaces.surfaces import Conic, Plane, Recess, Sphere
 from bstcad.optics.trace.trace import trace
 from bstcad.scene.errors import SceneError
 from bstcad.scene.mount import Part
+from tests import suite
 from tests.cad.conftest import rough_back
 from tests.lenses import rough
 from tests.tracing import stratified
@@ -93,7 +94,7 @@ def rms(difference, mean):
     return float((difference / mean).square().mean().sqrt())
 
 
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("name", suite.in_turns(LENSES, 3))
 def test_tiles_are_valid_solids_of_the_lens_and_add_up_to_it(name, tmp_path):
     lens, tiling = lens_of(name), Tiling(*LENSES[name][2])
     found = list(tiles_of(lens, tiling))

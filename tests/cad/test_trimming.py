@@ -21,6 +21,7 @@ from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere, sag
 from bstcad.step_text import part21
+from tests import suite
 from tests.exact_volume import exact_volume
 from tests.lenses import net, rough
 
@@ -96,7 +97,7 @@ def occ_volume(solid, to=1e-6):
     return found.Mass()
 
 
-@pytest.mark.parametrize("front", FRONTS)
+@pytest.mark.parametrize("front", suite.in_turns(FRONTS, 2))
 def test_it_is_a_closed_solid_whose_edges_lie_on_all_they_bound(front, tmp_path):
     lens = plate(front)
     solid = lens_solid(lens, stadium(), [*HOLES, cq.Workplane("XY").center(-1, 0).rect(0.6, 0.9).wires().val()])
@@ -113,7 +114,7 @@ def test_it_is_a_closed_solid_whose_edges_lie_on_all_they_bound(front, tmp_path)
     assert np.abs(text.surface.control_points - lens.back.control_points()).max() < 1e-11  # the design's own net
 
 
-@pytest.mark.parametrize("front", FRONTS)
+@pytest.mark.parametrize("front", suite.in_turns(FRONTS, 2))
 def test_its_volume_is_that_of_calculus(front):
     """A wall that looked inwards would add volume instead of taking it away."""
     lens = plate(front)

@@ -40,8 +40,8 @@ from bstcad.report.units import mm
 from bstcad.scene.mount import Box, CircleRim, Flange, Mount, Screws
 from bstcad.scene.scene import load
 from tests import suite
-from tests.conftest import DISK
 from tests.exact_volume import exact_volume
+from tests.scenes import DISK
 
 LONG = "\u041b\u0456\u043d\u0437\u0430 \u00ab\u0388\u03bb\u03bb\u03b7\u03bd\u00bb \u65e5\u672c $x^2$ " + 12 * "and on "
 SCENES = {

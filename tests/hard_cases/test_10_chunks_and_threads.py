@@ -43,8 +43,8 @@ from bstcad.tailoring.baselines.paper import TentMerit
 from bstcad.tailoring.merit import Merit, SobolevVariable
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.transport.density import Density
-from tests import domes, two_faces
-from tests.conftest import DISK, SMALL
+from tests import suite, two_faces
+from tests.scenes import DISK, DOME, SMALL
 from tests.tracing import launch, simulated, simulated_plain
 
 ROOT = Path(__file__).parent.parent.parent
@@ -210,7 +210,7 @@ AGREE = {torch.float64: 1e-12, torch.float32: 1e-3}
 JUMPS = {torch.float64: 1e-12, torch.float32: 0.04}
 
 
-@pytest.mark.parametrize("dtype", AGREE, ids=str)
+@pytest.mark.parametrize("dtype", suite.in_turns(AGREE, 2), ids=str)
 def test_compiled_or_not(holds, monkeypatch, dtype):
     """Half as many rays and tubes each way as have four parts: the two forms do not differ by the number of parts."""
     monkeypatch.setitem(globals(), "RAYS", RAYS // 2)
@@ -252,7 +252,7 @@ TAILORED = {  # a front that is searched for; two nets for two pictures, and for
 FEW_STEPS = {"rays": 190, "rounds": 2, "stage2_iterations": 4}
 QUICK_DESIGNS = {
     "two faces": two_faces.SMALL | two_faces.WITH_WAVE | {"tailoring": two_faces.SMALL["tailoring"] | FEW_STEPS},
-    "dome": domes.SMALL | {"tailoring": domes.SMALL["tailoring"] | FEW_STEPS},
+    "dome": DOME | {"tailoring": DOME["tailoring"] | FEW_STEPS},
 }
 
 

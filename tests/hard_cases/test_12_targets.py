@@ -19,7 +19,7 @@ from bstcad.tailoring.driver import Hooks
 from bstcad.transport import Density, TransportStep, back_and_forth, mass_error, solve
 from bstcad.transport.mapping import FLOOR, STEPS_PER_GRID
 from bstcad.transport.monge_ampere import MAX_STEPS_FACTOR, newton_on_grids
-from tests.conftest import DISK, SMALL
+from tests.scenes import DISK, SMALL
 
 N = 64
 RANDOM = np.random.default_rng(0)

@@ -32,7 +32,8 @@ from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
 from tests import suite
-from tests.conftest import DISK, SMALL, draws_nothing, verify_with
+from tests.conftest import draws_nothing, verify_with
+from tests.scenes import DISK, SMALL
 
 ROOT = Path(__file__).parent.parent.parent
 CONTENTS = {

@@ -35,13 +35,11 @@ LEFT_OUT = "Not simulated: "
 INSIDE = "The light varies inside the pixels"  # near the limit of this remark on another machine
 
 
-def marked(name):
-    return pytest.param(name, marks=pytest.mark.bench) if DESIGNS[name].bench else name
+POSSIBLE = [name for name, hard in DESIGNS.items() if not hard.refused]
+LONG = [pytest.param(name, marks=pytest.mark.bench) for name in POSSIBLE if DESIGNS[name].bench]
 
 
-@pytest.mark.parametrize(
-    "name", suite.in_turns([marked(name) for name, hard in DESIGNS.items() if not hard.refused], 4)
-)
+@pytest.mark.parametrize("name", [*suite.in_turns([name for name in POSSIBLE if not DESIGNS[name].bench], 4), *LONG])
 def test_it_comes_through(name, tmp_path, monkeypatch):
     hard, pictures, folder = DESIGNS[name], tmp_path / "pictures", tmp_path / "lens"
     pictures.mkdir()

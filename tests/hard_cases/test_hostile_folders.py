@@ -30,8 +30,9 @@ from bstcad.optics.trace.measure import Effort
 from bstcad.report import record
 from bstcad.scene.picture import Picture, read_picture
 from bstcad.scene.scene import SceneError, load
-from tests.conftest import DISK, SMALL, draws_nothing, flat_pictures, verify_with
+from tests.conftest import draws_nothing, flat_pictures, verify_with
 from tests.hard_cases import fuzz
+from tests.scenes import DISK, SMALL
 
 GIGABYTE = 2**30
 

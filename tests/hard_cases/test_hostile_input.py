@@ -24,6 +24,7 @@ from bstcad.scene.picture import FORMATS, read_picture
 from bstcad.scene.scene import SceneError, load
 from bstcad.scene.target import Target
 from bstcad.step_text import part21
+from tests import suite
 from tests.hard_cases import fuzz
 
 SECONDS = 10.0  # largest CPU seconds of one input; machines differ by a factor of ten at most
@@ -172,6 +173,7 @@ AROUND = (
 )  # fmt: skip
 
 
+@suite.in_turn(1, 2)
 @pytest.mark.parametrize("size", [MEGABYTE // 20, pytest.param(MEGABYTE, marks=pytest.mark.bench)])
 def test_no_pattern_of_the_step_reader_takes_the_square_of_a_text(size, small_step, holds):
     """Repetitive texts of 0.05 MB, where a square law takes 1/400 of the time; in one piece, in data or header."""

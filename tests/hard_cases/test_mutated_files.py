@@ -45,12 +45,11 @@ from bstcad.tailoring.driver import Hooks, no_progress
 from tests import suite
 from tests.app.asking import bench, made, png
 from tests.app.conftest import SMALL
-from tests.conftest import DISK
 from tests.hard_cases import fuzz
 from tests.manufacture.measured.gauge_files import BY_SURFACE_TOPOGRAPHY, WRITERS
-from tests.planning.conftest import TINY
 from tests.planning.conftest import record as run_of
 from tests.runs.test_kernel_cache import hits, kernel
+from tests.scenes import DISK, TINY
 
 SECONDS = 10.0  # largest CPU seconds of one file; machines differ by a factor of ten at most
 MEGABYTES = 300.0  # largest memory of the files of a reader (MB), as Python and numpy count it

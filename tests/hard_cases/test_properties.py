@@ -25,9 +25,9 @@ from bstcad.optics.surfaces.surfaces import Sphere
 from bstcad.optics.trace import trace
 from bstcad.scene.scene import load
 from tests.by_slope import deflect, intersect
-from tests.conftest import DISK
 from tests.hard_cases.lenses import eps, examples, largest
 from tests.lenses import SQUARE, N, places, uniform, wavy
+from tests.scenes import DISK
 from tests.tracing import simulated, simulated_plain
 
 EPS = eps(torch.float64)

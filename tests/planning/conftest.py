@@ -11,12 +11,8 @@ from bstcad.planning.cold_run import DONE, FAILED, ColdRun, run_and_judge
 from bstcad.planning.prediction import Pilot, pilot_scene, typical_seconds, with_quality
 from bstcad.runs.cluster import THIS_MACHINE, Answer
 from bstcad.scene.scene import load
-from tests.conftest import DISK
+from tests.scenes import DISK, TINY
 
-TINY = {
-    "lens.back.control_points": 33, "target.pixels": 48, "tailoring.quality": "draft", "tailoring.rays": 128,
-    "tailoring.transport_grid": 64, "tailoring.rounds": 2,
-}  # fmt: skip
 REFUSED = ("target.pixels", 96)  # a setting that comes to no lens
 KERNEL = 0.2  # seconds of the calibration kernel
 FAR = "tcp://10.0.0.1:1"  # a worker

@@ -17,7 +17,7 @@ from bstcad.report.record import LEFT_OUT
 from bstcad.scene.scene import load
 from bstcad.tailoring.driver import Hooks
 from tests import suite
-from tests.conftest import DISK, SMALL
+from tests.scenes import DISK, SMALL
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
 THU, FEW = TEMPLATES / "thu.toml", {"target.pixels": 48}

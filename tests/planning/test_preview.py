@@ -37,7 +37,7 @@ BENCH = pytest.mark.bench
 @pytest.mark.parametrize(
     ("name", "lit"),
     [
-        *suite.in_turns([pytest.param("caustic_portrait", True), pytest.param("off_axis", False)], 2),
+        *suite.in_turns([("caustic_portrait", True), ("off_axis", False)], 2),
         pytest.param("mirror", True, marks=BENCH),
     ],
 )

@@ -16,9 +16,9 @@ from bstcad.report import prescription as order
 from bstcad.report.record import of_json
 from bstcad.report.report import first_figures, html
 from bstcad.scene.scene import load
-from tests.conftest import DISK
 from tests.exports.test_data_sheet import lens_of, scene_of, sheet
 from tests.report.test_report import CONTENTS
+from tests.scenes import DISK
 
 STATED = {
     "surface_profile": 0.005, "front_profile": 0.01, "roughness": 5.0, "coating": "AR <450> nm",

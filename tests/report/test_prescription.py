@@ -19,7 +19,7 @@ from bstcad.report import prescription as prescriptions
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.tailoring.stage1 import _curvature_of_sag
-from tests.conftest import DISK, SMALL
+from tests.scenes import DISK, SMALL
 
 FREE = {
     "lens.front": {"kind": "sphere", "z": 15.0, "curvature": 0.0, "optimise": True},

@@ -15,8 +15,8 @@ from bstcad.report.report import doubts
 from bstcad.report.units import remarks as written
 from bstcad.scene.scene import load
 from bstcad.verify.verdict import Check
-from tests import domes
 from tests.report.test_report import CONTENTS
+from tests.scenes import DOME
 
 FACTS = {
     "rrmsd": 0.03, "rrmsd_noise": 0.001, "efficiency": 1.0,
@@ -157,7 +157,7 @@ OF_A_DOME = [  # changes of the facts and of the scene of a dome, 7 mm thick; id
 
 @pytest.mark.parametrize(("changes", "asked", "id", "words"), OF_A_DOME)
 def test_a_dome_is_advised_by_keys_that_it_has(changes, asked, id, words):
-    small = load("templates/disk.toml", domes.SMALL | asked)
+    small = load("templates/disk.toml", DOME | asked)
     [remark] = said(small, {"shape.centre_thickness": 7.0} | changes)
     assert remark.id == id and [each for each in words if each not in remark.text] == []
     absent = ("lens.back.z", "lens.outline", "lens.max_thickness")

@@ -16,7 +16,7 @@ from bstcad.designs.pipeline import DesignState
 from bstcad.runs import checkpoint, signals
 from bstcad.scene.scene import load
 from tests import suite
-from tests.conftest import DISK, SMALL
+from tests.scenes import DISK, SMALL
 
 ROOT = Path(__file__).parent.parent.parent
 # First in a process that runs the command line: it verifies by as many tubes and rays as resolve the small design, and

@@ -22,7 +22,8 @@ from bstcad.scene.scene import load
 from bstcad.tailoring.machinability import RELIEF_RESERVE, enforce_bounds, excess, place_back
 from bstcad.tailoring.settings import Bounds
 from tests import lenses, suite
-from tests.conftest import DISK, SMALL, quick_effort
+from tests.conftest import quick_effort
+from tests.scenes import DISK, SMALL
 
 PLACE = r"at \([-\d.e]+, [-\d.e]+\) mm"
 TINY = SMALL | {

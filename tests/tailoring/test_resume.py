@@ -16,8 +16,8 @@ from bstcad.scene.scene import load
 from bstcad.tailoring import effort as efforts
 from bstcad.tailoring.driver import Hooks
 from bstcad.tailoring.minimise import AdamState, Best, LbfgsState, adam, lbfgs, minimise
-from tests import domes, suite, two_faces
-from tests.conftest import DISK, SMALL
+from tests import suite, two_faces
+from tests.scenes import DISK, DOME, SMALL
 
 TINY = SMALL | {"tailoring.rays": 64, "target.pixels": 32, "tailoring.transport_grid": 32, "tailoring.rounds": 3}
 SCENES = {
@@ -26,7 +26,7 @@ SCENES = {
     "free front": TINY | {"lens.front": {"kind": "sphere", "z": 15.0, "curvature": 0.002, "optimise": True}},
     "extended source": TINY | {"source.diameter": 1.0, "tailoring.source_points": 4, "tailoring.stage2_iterations": 12},
     "two faces, two pictures": two_faces.SMALL,
-    "dome": domes.SMALL,
+    "dome": DOME,
     "front alone": two_faces.SMALL | {"target": two_faces.CHANGES["target"][:1], "lens.back.optimise": False},
     "two faces, picture and wave": two_faces.SMALL
     | two_faces.WITH_WAVE

@@ -18,7 +18,7 @@ from bstcad.tailoring import stage2
 from bstcad.tailoring.effort import FULL
 from bstcad.tailoring.source_image import ExtendedSource
 from tests import suite, two_faces
-from tests.conftest import DISK, SMALL
+from tests.scenes import DISK, SMALL
 
 TINY = SMALL | {
     "tailoring.rays": 64,

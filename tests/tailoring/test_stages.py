@@ -185,6 +185,7 @@ def test_stage_1_finds_the_front_curvature_and_the_back_together():
     assert task.rrmsd(tailored) < 0.6 * task.rrmsd(replace(lens, back=lens.back.refined(17)))
 
 
+@suite.in_turn(0, 2)
 def test_the_paper_lowers_both_of_its_merits():
     task, lens = small("portrait", **{
         "tailoring.quality": "paper", "tailoring.stage1_iterations": "60", "tailoring.stage2_iterations": "30",

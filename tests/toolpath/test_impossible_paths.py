@@ -12,7 +12,8 @@ from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.runs.files import SceneError
 from bstcad.scene.scene import load
 from bstcad.toolpath.cutting import DEFAULTS, Cutting
-from tests.conftest import DISK, SMALL, quick_effort
+from tests.conftest import quick_effort
+from tests.scenes import DISK, SMALL
 from tests.toolpath.test_simulated_shop import lens_of, waves
 
 PLATE = Rectangle(8.0, 6.0)

@@ -21,6 +21,7 @@ from bstcad.optics.surfaces.bspline import BSplineSurface, interpolating_net, kn
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.toolpath.cutting import Cutting
+from tests import suite
 
 NUMBERED = re.compile(r"([GMFXYZ])(-?\d*\.?\d+)")
 
@@ -142,7 +143,9 @@ def mill(lens, spacing, step, **settings):
     return router, rough, found, files
 
 
-@pytest.mark.parametrize(("outline", "along"), [(Rectangle(9.0, 7.0), "x"), (Circle(4.0), "y")], ids=["plate", "disc"])
+@pytest.mark.parametrize(
+    ("outline", "along"), suite.in_turns([(Rectangle(9.0, 7.0), "x"), (Circle(4.0), "y")], 2), ids=["plate", "disc"]
+)
 def test_a_router_cuts_the_face_without_gouge_and_with_the_cusps_that_are_stated(outline, along):
     router, rough, found, files = mill(lens_of(waves, outline), 0.04, 0.03, along=along)
     gouge, cusp = stated(files["toolpath-raster.txt"])
@@ -193,7 +196,7 @@ def turned(lens, planes, spacing, **settings):
     return np.concatenate(found), files["toolpath-spiral.txt"]
 
 
-@pytest.mark.parametrize("outline", [Circle(3.0), Rectangle(5.0, 3.0)], ids=["disc", "plate"])
+@pytest.mark.parametrize("outline", suite.in_turns([Circle(3.0), Rectangle(5.0, 3.0)], 2), ids=["disc", "plate"])
 def test_a_lathe_cuts_the_face_without_gouge_and_with_the_cusps_that_are_stated(outline):
     planes = np.random.default_rng(3).uniform(0, 180, 20)
     found, text = turned(lens_of(waves, outline, wide=1.2), planes, 2e-3, cusp=4e-4)

@@ -467,7 +467,7 @@ def test_light_that_is_unaccounted_for_fails(folder, nominal, monkeypatch):
 
 def test_values_that_are_not_finite_fail(folder, nominal, monkeypatch):
     margins = checks.margins
-    monkeypatch.setattr(checks, "margins", lambda *what: replace(margins(*what), non_finite=1))
+    monkeypatch.setattr(checks, "margins", lambda *what, **more: replace(margins(*what, **more), non_finite=1))
     assert failing(checks.verify(folder, nominal)) == {"finite"}
 
 

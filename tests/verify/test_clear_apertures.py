@@ -29,8 +29,9 @@ from bstcad.scene.mount import Mount
 from bstcad.scene.scene import load
 from bstcad.verify import step_checks
 from tests import suite
-from tests.conftest import DISK, draws_nothing, proofs, quick_effort
+from tests.conftest import draws_nothing, proofs, quick_effort
 from tests.lenses import net
+from tests.scenes import DISK
 
 BOX = {"shape": "rectangle", "width": 6.4, "height": 5.6, "corner_radius": 1.5}
 CUT = {"datum": "front", "rim": {"shape": "circle", "diameter": 9.0}}

@@ -20,6 +20,7 @@ from bstcad.report.prescription import part
 from bstcad.scene.errors import SceneError
 from bstcad.step_text import part21
 from bstcad.verify import step_checks
+from tests import suite
 from tests.conftest import draws_nothing, quick_effort
 
 MOUNT = {
@@ -76,12 +77,12 @@ def test_what_is_sent_is_the_part_by_its_digest_volume_mass_and_size(written, de
     assert (order["datum"], order["origin"]) == ("the lower face of the flange", MOUNT["flange"]["z"])
 
 
-@pytest.mark.parametrize("harm, words", [
+@pytest.mark.parametrize("harm, words", suite.in_turns([
     ("missing", "generate the design again"),
     ("bent", "control point"),
     ("lighter", "the file states 9"),
     ("steeper", "edge at ("),
-])  # fmt: skip
+], 2))  # fmt: skip
 def test_a_part_that_is_not_the_design_s_fails_by_name(written, design, tmp_path, harm, words):
     scene, folder, _ = written
     text = (folder / "part.step").read_text()
@@ -141,11 +142,11 @@ def test_a_script_s_part_states_what_it_holds(design, tmp_path):
 ROUNDED = {"shape": "rectangle", "width": 7.0, "height": 5.0, "corner_radius": 1.0}
 
 
-@pytest.mark.parametrize("mount, outline, plane", [
+@pytest.mark.parametrize("mount, outline, plane", suite.in_turns([
     ({}, None, True),
     ({"rim": {"shape": "circle", "diameter": 5.0}, "draft": 3.0, "bevel": 0.2, "datum": "front"}, Circle(2.5), True),
     (MOUNT | {"rim": ROUNDED}, Rectangle(7.0, 5.0), True),
-])  # fmt: skip
+], 3))  # fmt: skip
 def test_a_part_passes_by_itself(design, tmp_path, mount, outline, plane):
     """The outline is that of the back, whatever walls are around it; the walls of a bare lens are checked, too."""
     lens = replace(design.lens, front=Plane(design.lens.front.z)) if plane else design.lens

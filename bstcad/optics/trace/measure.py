@@ -76,7 +76,7 @@ class Effort:
 
     rays: int = 2896  # maximum rays per side in each of SETS sets that are traced together: 67 million rays per line
     seed: int = 0  # seed of the rays
-    places: int = 1025  # points per side of the lens at which a verification evaluates the thickness
+    places: int = 1025  # points per side of the lens for its thickness in a verification; half as many rays for margins
     points: int = 1 << 17  # points per face at which the written file is compared with the design
     accuracy: float = 0.005  # relative standard error of the RRMSD at which tracing ends; 0: all rays are traced
     seconds: float = math.inf  # time limit (s): no sets of rays are started that would end later

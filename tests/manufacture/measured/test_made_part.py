@@ -186,6 +186,7 @@ def saved(path, found):
     return path
 
 
+@suite.in_turn(0, 2)
 def test_the_report_has_a_made_part_where_one_was_asked_for(small_design, nominal, tmp_path, quick):
     folder = shutil.copytree(small_design.folder, tmp_path / "design")
     given = dirty(cloud(with_form_error(nominal.lens, 1e-4, 2.0), 5000, 1e-5), 0.02, (1.0,))[0]

@@ -84,6 +84,7 @@ def test_a_defect_that_covers_an_area_is_form(nominal, clean, defect):
     assert hit[dust].mean() > 0.95
 
 
+@suite.in_turn(0, 2)
 def test_outliers_are_counted_and_remarked_and_too_many_fail(nominal, clean):
     def judged(share):
         given = clouds.Cloud(dirty(clean, share, DUST)[0], "mm", Path("cloud.csv"))

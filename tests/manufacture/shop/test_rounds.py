@@ -92,6 +92,7 @@ def test_two_rounds_lower_the_deviation_tenfold(lens):
     assert found.net.shape == lens.back_net.shape and (found.net.x, found.net.y) == (lens.back_net.x, lens.back_net.y)
 
 
+@suite.in_turn(0, 2)
 def test_a_gain_of_half_leaves_half(lens):
     shop = Shop(lens)
     _, before = shop.deviation(shop.cut(lens.back_net, 0))
@@ -180,6 +181,7 @@ def test_what_does_not_repeat_is_told_from_what_repeats(lens):
         compensation.next_round(lens, lens.back_net, perfect, CompensationSettings(), [])
 
 
+@suite.in_turn(1, 2)
 def test_rounds_that_diverge_are_refused(lens):
     shop = Shop(lens)
     cloud = shop.measure(shop.cut(lens.back_net, 0), 1)

@@ -11,8 +11,7 @@ import torch
 from bstcad.manufacture.tolerance.perturbations import Setup, form_error, inside_outline, kinds, random_field, ripple
 from bstcad.optics.surfaces.motion import Motion
 from bstcad.scene.scene import load
-from tests import domes
-from tests.conftest import DISK
+from tests.scenes import DISK, DOME
 
 CENTRE = 2.0  # mm, z of the centre of the dome and of the lamp
 
@@ -22,7 +21,7 @@ def setup_of(**changes):
     back = {"kind": "radial", "centre": [0.0, 0.0, CENTRE], "radius": 15.0, "half_angle": 60.0, "control_points": 33}
     lens = {"material": "PMMA", "front": {"kind": "sphere", "z": 8.0 + CENTRE, "curvature": -0.125}, "back": back}
     source = {"kind": "point", "profile": "lambertian", "position": [0.0, 0.0, CENTRE]}
-    scene = load(DISK, domes.SMALL | {"lens": lens, "source": source} | changes)
+    scene = load(DISK, DOME | {"lens": lens, "source": source} | changes)
     flat = scene.flat_lens(33)
     x, y = (torch.linspace(*ends, 33, dtype=torch.float64) for ends in (flat.back.x, flat.back.y))
     waves = 0.2 * torch.sin(x / 4 + 0.3)[:, None] * torch.cos(y / 5)

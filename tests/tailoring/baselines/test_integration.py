@@ -158,9 +158,7 @@ def followed(task, lens, steps):
     return Driver().run(steps(task, lens), task, lambda state: state, lambda: "").lens
 
 
-@pytest.mark.parametrize(
-    ("name", "worse"), suite.in_turns([pytest.param("thu", 2.0), pytest.param("portrait", 1.3)], 2)
-)
+@pytest.mark.parametrize(("name", "worse"), suite.in_turns([("thu", 2.0), ("portrait", 1.3)], 2))
 def test_off_axis_and_from_a_point_it_leaves_far_more_error_than_stage_1(name, worse):
     task, lens = small(name)
     points, slopes = (task.rrmsd(followed(task, lens, steps)) for steps in (integration.steps, stage1.steps))
@@ -180,6 +178,7 @@ def test_no_bit_of_it_depends_on_the_threads():
     assert torch.equal(heights[0], heights[1]) and torch.equal(heights[0], heights[2])
 
 
+@suite.in_turn(0, 2)
 def test_a_back_that_would_meet_the_front_begins_further_off():
     task, lens = small("thu", **{"lens.front.z": "17.0"})
     made = followed(task, lens, integration.steps)
@@ -187,6 +186,7 @@ def test_a_back_that_would_meet_the_front_begins_further_off():
     assert task.rrmsd(made) == pytest.approx(task.rrmsd(followed(*small("thu"), integration.steps)), rel=0.1)
 
 
+@suite.in_turn(1, 2)
 def test_a_design_by_it_has_its_stage_and_no_other():
     wanted = scene.load("templates/disk.toml", SMALL | {"source.diameter": "0.5"})
     found = pipeline.design(wanted, device="cpu")
