@@ -46,8 +46,8 @@ from bstcad.runs import progress as progresses
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import MIN_ROUND_POINTS
 from bstcad.scene.scene import Scene, load
+from bstcad.tailoring.driver import Hooks
 from bstcad.tailoring.merit import PictureError
-from bstcad.tailoring.run import Hooks
 from bstcad.transport.mapping import TransportMap
 
 if TYPE_CHECKING:

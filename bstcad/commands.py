@@ -54,7 +54,7 @@ from bstcad.manufacture.tolerance import tolerances
 from bstcad.manufacture.tolerance.tolerances import Tolerances
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.trace.measure import FULL, Effort, Light, SpectralLine
-from bstcad.planning.estimates import diagnosis, left_out
+from bstcad.planning.effect_estimates import diagnosis, left_out
 from bstcad.planning.net_choice import with_net
 from bstcad.report import prescription, record, report
 from bstcad.report.goal_figures import GoalFigures, figures_of, photometry
@@ -69,7 +69,7 @@ from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import numbered
 from bstcad.step_text import beginning
-from bstcad.tailoring.run import NO_HOOKS, Hooks, Progress, no_progress
+from bstcad.tailoring.driver import NO_HOOKS, Hooks, Progress, no_progress
 from bstcad.toolpath.cutting import CHOICES, DEFAULTS, Cutting
 from bstcad.verify import checks
 from bstcad.verify.checks import Proof
@@ -340,6 +340,7 @@ def verify(
             order = _order(made, proof.shape, path)
             contents = _contents(made, proof, _left_out(made, proof))
             contents = replace(contents, order=order, judges=tuple(each.judge for each in judged))
+            contents = record.with_earlier_remarks(contents, path / "report.json")
             if place is None:
                 drawn.sheet(data_sheet.draw, _sheet(made, proof, contents.goals, proof.lights[0].picture, order=order))
             drawn.begin(draw_convergence, contents)

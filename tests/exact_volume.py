@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from scipy.interpolate import BSpline, NdBSpline
 
+from bstcad.optics.lens.face_integrals import gauss_rule, rim_breaks
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.lens.quadrature import gauss_rule, rim_breaks
 from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface, knots, parameter
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.optics.surfaces.surfaces import Surface, sag

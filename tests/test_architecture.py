@@ -302,6 +302,11 @@ def test_every_library_that_is_imported_is_declared():
     assert {root for root, names in owners.items() if not names & declared} <= {"bstcad"}
 
 
+def test_no_folder_has_more_files_than_one_can_overlook():
+    sizes = Counter(Path(file).parent.as_posix() for file in SOURCES)
+    assert {folder: count for folder, count in sizes.items() if count > 20} == {"scene": sizes["scene"]}
+
+
 def test_no_files_import_each_other_in_a_circle():
     files = {".".join(("bstcad", *names_of(file))): file for file in SOURCES}
     ends = {file: {files.get(m) or files.get(m.rpartition(".")[0]) for m in imported(tree(file))} for file in SOURCES}

@@ -18,7 +18,7 @@ from bstcad import cli
 from bstcad.designs import folder as folders
 from bstcad.report import manual
 from bstcad.runs import progress, signals
-from bstcad.tailoring.run import Hooks
+from bstcad.tailoring.driver import Hooks
 
 ROOT = Path(__file__).parent.parent
 THU = str(ROOT / "templates" / "thu.toml")

@@ -496,7 +496,7 @@ COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which f
     "analysis.neglected_effects": {"FACE_POINTS": 24, "GHOST_RAYS_PER_SIDE": 16},
     "analysis.shape": {"GRID_POINTS": 129},
     "planning.preview": {"IMAGE_POINTS": 6, "TRANSPORT_CELLS": 16, "LEDGER_RAYS": 16, "SHAPE_POINTS": 33},
-    "planning.estimates": {
+    "planning.effect_estimates": {
         "COARSE_POINTS": 17,
         "COARSE_CELLS": 16,
         "COARSE_PIXELS": 24,

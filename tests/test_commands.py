@@ -27,6 +27,7 @@ from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import load
 from bstcad.verify import checks, jobs
 from bstcad.verify import step_checks as step_checks
+from tests import suite
 from tests.conftest import draws_nothing, flat_pictures, pictures, quick_effort, verify_with
 
 FILES = {
@@ -196,6 +197,7 @@ class TestGenerate:
         again = commands.verify(moved)
         assert (again.rrmsd, again.passed) == (made.rrmsd, made.passed)
 
+    @suite.in_turn(2, 3)
     def test_a_failure_while_it_is_written_keeps_the_design_and_resume_writes_the_same(
         self, small_scene, quick, monkeypatch, tmp_path
     ):
@@ -351,7 +353,7 @@ class TestVerify:
         "10 % brighter at the right edge": lambda light: light * np.linspace(0.9, 1.1, light.shape[1]),
     }
 
-    @pytest.mark.parametrize("change", CHANGED_LIGHT)
+    @pytest.mark.parametrize("change", suite.in_turns(CHANGED_LIGHT, 3))
     def test_an_irradiance_of_another_lens_is_found(self, folder, change):
         with np.load(folder / "design.npz") as data:
             arrays = dict(data)

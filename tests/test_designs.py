@@ -25,6 +25,7 @@ from bstcad.runs import files
 from bstcad.step_text import part21
 from bstcad.transport.mapping import nodes
 from bstcad.verify import step_checks as step_checks
+from tests import suite
 from tests.conftest import draws_nothing, proofs, quick_effort, verify_with
 
 FILES = {
@@ -159,6 +160,7 @@ def net(design, **more):
 
 
 class TestTransport:
+    @suite.in_turn(1, 3)
     def test_light_from_there_lands_where_the_map_says(self, made):
         """The finished lens traced: within a tenth of a pixel of 0.94 mm inside the lit disc."""
         sent, lens, source = made.transport, made.lens, made.scene.source
@@ -219,6 +221,7 @@ class TestWrite:
             fresh.write(tmp_path, progress=False)
         assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"] and fresh.folder is None
 
+    @suite.in_turn(0, 3)
     def test_what_cannot_be_written_is_kept_and_opened_again(self, fresh, small_design, quick, tmp_path, monkeypatch):
         """Two designs do not take each other's place; a design that is written at last is kept no longer."""
 

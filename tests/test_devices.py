@@ -13,14 +13,14 @@ import torch
 
 from bstcad.designs import pipeline
 from bstcad.designs.pipeline import design
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.surfaces import bspline
 from bstcad.optics.trace import tubes
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring import effort as efforts
+from bstcad.tailoring.driver import Hooks
 from bstcad.tailoring.merit import Merit
-from bstcad.tailoring.run import Hooks
 from bstcad.tailoring.stage2 import Problem
 from tests import suite
 from tests.conftest import pixels_of_all
@@ -173,8 +173,8 @@ def test_the_compiled_kernels_serve_no_tensor_of_the_gpu():
     with SecondDevice() as second:
         lens = wanted.flat_lens(33).to(torch.float64, "cuda")
         u = torch.ones(3, dtype=torch.float64, device="cuda")
-        assert not any(ops.kernel(name, lens.back.heights, u) for name in ops.KERNELS)
-        assert not ops.whole_kernel("trace.simulate", lens.interfaces)
+        assert not any(kernel_choice.kernel(name, lens.back.heights, u) for name in kernel_choice.KERNELS)
+        assert not kernel_choice.whole_kernel("trace.simulate", lens.interfaces)
     assert not second.mixed
 
 
@@ -188,7 +188,7 @@ def test_a_kernel_of_the_gpu_is_an_entry_of_the_table(monkeypatch):
             calls[name] += 1
             return plain(*given)
 
-        monkeypatch.setitem(ops.KERNELS[name], "cuda", kernel)
+        monkeypatch.setitem(kernel_choice.KERNELS[name], "cuda", kernel)
 
     enter("bspline.evaluate", bspline.evaluate_plain)
     enter("tubes.collect", lambda corner, flux, picture, thinnest: tubes.collect_plain(corner, flux, *picture))

@@ -19,6 +19,7 @@ from bstcad.manufacture.tolerance.study import StudySettings
 from bstcad.optics.surfaces.radial import RadialSurface
 from bstcad.optics.trace.measure import Effort
 from bstcad.scene.errors import SceneError
+from tests import suite
 from tests.conftest import draws_nothing, verify_with
 
 SCENE = """
@@ -84,6 +85,7 @@ def designed(tmp_path_factory):
     return commands.generate(scene, path / "out", device="cpu", options=options), path / "out"
 
 
+@suite.in_turn(0, 2)
 def test_a_dome_is_designed_written_and_proved_from_its_files(designed):
     """The files hold the dome and its part, its light passes the checks, and the opened folder has the same lens."""
     report, folder = designed
@@ -243,6 +245,7 @@ def _with_pole_moved(path):
     path.write_text(f"{text[: found.start(1)]}{float(found[1]) + 1e-3!r}{text[found.end(1) :]}")
 
 
+@suite.in_turn(0, 2)
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_folder_of_a_dome_ends_in_one_sentence(designed, tmp_path, monkeypatch, damage):
     monkeypatch.setattr(commands.processes, "submit", commands.processes.run_here)

@@ -11,7 +11,7 @@ from bstcad.designs import pipeline
 from bstcad.optics.receivers.irradiance import Screen, efficiency, rrmsd
 from bstcad.scene import scene
 from bstcad.scene.errors import SceneError
-from bstcad.tailoring.run import Hooks
+from bstcad.tailoring.driver import Hooks
 from tests import suite
 from tests.tracing import simulated
 

@@ -58,6 +58,7 @@ def test_a_flange_is_one_with_the_lens(design):
     assert part.Volume() > exact_volume(design.lens)
 
 
+@suite.in_turn(1, 2)
 def test_nine_lenses_on_a_plate(design):
     made = run("lens_array.py", design.folder)
     [part] = written(design.folder / "lens_array.step")
@@ -97,7 +98,7 @@ FEW = {  # settings that take no time
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=suite.in_turns(OTHER, 2))
+@pytest.fixture(scope="module", params=suite.in_turns(OTHER, 3))
 def other(request, tmp_path_factory):
     """Kind and folder of a design of another kind."""
     template, changes = OTHER[request.param]
@@ -166,6 +167,7 @@ def quick(monkeypatch):
     verify_with(monkeypatch, Effort(64, places=65, points=1024))
 
 
+@suite.in_turn(0, 2)
 def test_a_lens_for_each_picture_of_a_folder(design, quick, tmp_path, capsys):
     (tmp_path / "photos").mkdir()
     for k, picture in enumerate((skimage.data.astronaut(), skimage.data.coffee()), start=1):

@@ -1,6 +1,6 @@
 """Area, volume and centroid of a part with lenses, from its faces and edges, with a relative error of 1e-8.
 
-Each face is integrated along its boundary with Green's theorem: a freeform net in x and y (optics.lens.quadrature),
+Each face is integrated along its boundary with Green's theorem: a freeform net in x and y (optics.lens.face_integrals),
 which for a dome are those of its chart, any other face in its parameters u and v.  OCC's own integrals take minutes for
 a large net.  They have errors of 1e-5 for a face that shares an edge with a large net, since this edge is a curve of
 thousands of knots.
@@ -28,8 +28,8 @@ from OCP.TopoDS import TopoDS, TopoDS_Edge, TopoDS_Face, TopoDS_Shape
 
 from bstcad.cad import step_reading
 from bstcad.cad.step_reading import StepLens, parts_of
-from bstcad.optics.lens import quadrature
-from bstcad.optics.lens.quadrature import (
+from bstcad.optics.lens import face_integrals
+from bstcad.optics.lens.face_integrals import (
     EDGE_PARTS,
     GAUSS_POINTS_PER_PART,
     MIN_RELATIVE_DX,
@@ -90,7 +90,7 @@ def _of_face(face: TopoDS_Face, z_ref: float) -> Sums:
     if step_reading.is_freeform(surface):
         net = step_reading.freeform_surface(face)
         border = Border(*_concatenate(_edge_over_net(edge, face, net) for edge in _edges(face)))
-        return quadrature.of_face(net, border, net.z - z_ref)
+        return face_integrals.of_face(net, border, net.z - z_ref)
     if surface.GetType() not in GAUSS_POINTS_V:
         raise ValueError("a face is of an unknown kind; write the file again")
     return _in_parameters(face, surface, z_ref)
@@ -105,7 +105,7 @@ def _in_parameters(face: TopoDS_Face, surface: BRepAdaptor_Surface, z_ref: float
     u, v, du = (each[:, None] for each in _concatenate(_edge_in_parameters(edge, face) for edge in _edges(face)))
     spline = surface.GetType() == Kind.GeomAbs_BSplineSurface
     ruled = spline and surface.VDegree() == 1 and surface.NbVPoles() == 2
-    point, weight = quadrature.gauss_rule(STRAIGHT_POINTS if ruled else GAUSS_POINTS_V[surface.GetType()])
+    point, weight = face_integrals.gauss_rule(STRAIGHT_POINTS if ruled else GAUSS_POINTS_V[surface.GetType()])
     half = (v - BRepTools.UVBounds_s(face)[2]) / 2
     u, along, weight = np.broadcast_arrays(u, v + half * (point - 1), -du * half * weight)
     found = step_reading.points_and_tangents(surface, u.ravel().tolist(), along.ravel().tolist())
@@ -179,5 +179,5 @@ def _gauss_points(
             spline = curve.BSpline()
             knots.update(k for k in map(spline.Knot, range(1, spline.NbKnots() + 1)) if first < k < last)
     parts, points = (EDGE_PARTS, GAUSS_POINTS_PER_PART) if over_net or len(knots) > 2 else (ARC_PARTS, ARC_POINTS)
-    t, weight = quadrature.gauss_points(quadrature.divided(np.array(sorted(knots)), parts), points)
+    t, weight = face_integrals.gauss_points(face_integrals.divided(np.array(sorted(knots)), parts), points)
     return t, -weight if edge.Orientation() == TopAbs_Orientation.TopAbs_REVERSED else weight

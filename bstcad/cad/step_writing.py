@@ -62,9 +62,9 @@ from OCP.XCAFDoc import XCAFDoc_ColorSurf, XCAFDoc_DocumentTool, XCAFDoc_GeomTol
 from bstcad.cad import step_nets
 from bstcad.cad.solid import lens_shape
 from bstcad.cad.step_reading import parts_of, quiet_occ
-from bstcad.optics.lens import quadrature
+from bstcad.optics.lens import face_integrals
+from bstcad.optics.lens.face_integrals import MassProperties
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.lens.quadrature import MassProperties
 from bstcad.scene.mount import LENS_COLOUR, MIRROR_COLOUR, Part
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def write_lens(
     """
     part = part or Part(colour=LENS_COLOUR if lens.passes.enters else MIRROR_COLOUR)
     shape, faces = lens_shape(lens)
-    write(shape, path, name, part, faces=faces, properties=properties or quadrature.of_lens(lens))
+    write(shape, path, name, part, faces=faces, properties=properties or face_integrals.of_lens(lens))
 
 
 def encode(

@@ -17,8 +17,8 @@ from bstcad.cad.patches import FacePatch
 from bstcad.cad.solid import cap, prepared
 from bstcad.cad.tiling import Cell, Side, Tiling
 from bstcad.cad.wires import LoopPiece
+from bstcad.optics.lens.face_integrals import MassProperties
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.lens.quadrature import MassProperties
 from bstcad.optics.surfaces.bspline import is_net
 from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.scene.mount import Part

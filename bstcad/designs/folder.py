@@ -28,7 +28,7 @@ from bstcad.cad import mesh as meshes
 from bstcad.cad.mesh import MIRROR_RGBA, Label
 from bstcad.designs.as_designed import scene_text
 from bstcad.designs.made import Made
-from bstcad.optics.lens import quadrature
+from bstcad.optics.lens import face_integrals
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface, is_net, knots
 from bstcad.optics.surfaces.radial import RadialSurface
@@ -232,7 +232,7 @@ def write_geometry(design: Made, folder: Path, submit: Submit = run_here) -> Cal
     """
     scene, lens = design.scene, design.lens
     stated = scene.name, scene.part.of(scene.lens)
-    sums = quadrature.of_lens(lens)  # computed in this process, which has loaded the kernels
+    sums = face_integrals.of_lens(lens)  # computed in this process, which has loaded the kernels
     written = [submit(jobs.write_lens, lens, (folder / "lens.step").absolute(), *stated, sums)]
     if mount := scene.mount:
         written.append(submit(jobs.write_part, lens, mount, (folder / PART).absolute(), *stated))

@@ -31,13 +31,7 @@ from bstcad.scene.scene import Scene
 from bstcad.tailoring import effort as efforts
 from bstcad.tailoring import slope_map, stage1, stage2, two_faces
 from bstcad.tailoring.baselines import integration, paper
-from bstcad.tailoring.carried import carry_light
-from bstcad.tailoring.feasibility import find_demand, is_infeasible
-from bstcad.tailoring.grazing import without_reflection
-from bstcad.tailoring.machinability import BOUNDS_STAGE, active_bounds, enforce_bounds, place_back
-from bstcad.tailoring.merit import PictureError
-from bstcad.tailoring.reachable import Reach, reach_of
-from bstcad.tailoring.run import (
+from bstcad.tailoring.driver import (
     BEST_LENS_STAGE,
     NO_HOOKS,
     RRMSD_SECONDS,
@@ -53,6 +47,11 @@ from bstcad.tailoring.run import (
     Steps,
     Task,
 )
+from bstcad.tailoring.feasibility import find_demand, is_infeasible
+from bstcad.tailoring.grazing import without_reflection
+from bstcad.tailoring.machinability import BOUNDS_STAGE, active_bounds, enforce_bounds, place_back
+from bstcad.tailoring.merit import PictureError
+from bstcad.tailoring.reachable import Reach, reach_of
 from bstcad.tailoring.settings import Settings
 from bstcad.tailoring.source_image import ExtendedSource
 from bstcad.tailoring.stage2 import PrecisionComparison, compare_precisions
@@ -363,7 +362,7 @@ def _earlier_lens(task: Task, driver: Driver, lens: Lens, earlier: Earlier) -> S
         raise KeyboardInterrupt
     found, light = earlier.parameters.apply_to(lens), task.heaviest
     before = earlier.lens.to(found.like.dtype, found.like.device)
-    slopes = carry_light(light.source, before, light.through(found), task.goals[0])
+    slopes = slope_map.carry_light(light.source, before, light.through(found), task.goals[0])
     each = found, found.with_last_net(slopes.nets[-1])
     found, rrmsd = min(((lens, task.rrmsd(lens)) for lens in each), key=lambda rated: _or_infinite(rated[1]))
     require_light(found, rrmsd)

@@ -32,7 +32,7 @@ from bstcad.runs.cluster import Answer, Cluster, Machines
 from bstcad.runs.processes import ExitStatus, Tick
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import Scene, load
-from bstcad.tailoring.run import Progress, no_progress
+from bstcad.tailoring.driver import Progress, no_progress
 from bstcad.verify.verdict import NO_LIMIT, VERDICTS, Check
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ from bstcad.optics.lens.interfaces import cross
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.sides import Sides, as_pair, coarser, size_text, spread
 from bstcad.optics.trace.tubes import area_of, collect, launch_tubes
-from bstcad.planning.estimates import coarse_lens
+from bstcad.planning.effect_estimates import coarse_lens
 from bstcad.planning.prediction import REMAINING_BLUR, blur_rrmsd, memory_gb, typical_seconds
 from bstcad.report.units import about, two_digits
 from bstcad.scene.scene import Scene

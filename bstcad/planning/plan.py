@@ -19,7 +19,7 @@ from bstcad.optics.receivers.goal import worst
 from bstcad.optics.surfaces.sides import as_pair, scaled
 from bstcad.optics.trace.reach import unreached
 from bstcad.planning.cold_run import round_numbers
-from bstcad.planning.estimates import coarse_lens, left_out
+from bstcad.planning.effect_estimates import coarse_lens, left_out
 from bstcad.planning.net_choice import rrmsd_ratio
 from bstcad.planning.prediction import PILOT_QUALITIES, QUALITIES, REMAINING_BLUR, predict, replace_net, run_pilot
 from bstcad.report.record import simulated, too_steep

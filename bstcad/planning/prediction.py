@@ -29,7 +29,7 @@ from bstcad.optics.trace.measure import Effort, measure_goals
 from bstcad.planning.cold_run import KERNEL_REPEATS, calibration_kernel, measure_seconds
 from bstcad.runs.processes import Tick
 from bstcad.scene.scene import Scene
-from bstcad.tailoring.run import RRMSD_SECONDS, Hooks, Task
+from bstcad.tailoring.driver import RRMSD_SECONDS, Hooks, Task
 from bstcad.tailoring.settings import COARSEST_GRID
 from bstcad.tailoring.slope_map import SUBCELLS
 from bstcad.tailoring.stage2 import round_shares, sheet_sizes, stage3_sheet_sizes

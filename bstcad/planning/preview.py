@@ -29,9 +29,9 @@ from bstcad.optics.trace.measure import side_factor, simulated, tubes_picture
 from bstcad.optics.trace.source_images import landing_pixels
 from bstcad.optics.trace.tubes import corners, middle
 from bstcad.scene.scene import Scene
+from bstcad.tailoring.driver import Hooks, Progress
 from bstcad.tailoring.effort import PREVIEW
 from bstcad.tailoring.merit import Merit
-from bstcad.tailoring.run import Hooks, Progress
 from bstcad.tailoring.source_image import ExtendedSource
 
 COARSE_NET = 33  # control points per side in the first rounds of stage 1

@@ -41,7 +41,7 @@ from bstcad.runs.cluster import Answer, Machines
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import PRESETS
 from bstcad.scene.scene import Scene
-from bstcad.tailoring.run import Progress, no_progress
+from bstcad.tailoring.driver import Progress, no_progress
 
 # --- knobs ------------------------------------------------------------------------------------------------------------
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from bstcad.analysis.shape import MAX_RADIUS, describe, heights, survey_front, thickness_range
 from bstcad.designs.as_designed import vertex
-from bstcad.optics.lens import passes, quadrature
+from bstcad.optics.lens import face_integrals, passes
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.media import density
 from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface
@@ -270,7 +270,7 @@ def _corners(lens: Lens, whole: WholePart | None) -> tuple[Point, Point]:
 def _volume(lens: Lens, whole: WholePart | None) -> float | None:
     """Return the volume of a part (mm³); None: some faces cannot be integrated."""
     if whole is None:
-        return quadrature.of_lens(lens).volume
+        return face_integrals.of_lens(lens).volume
     return None if whole.properties is None else whole.properties.volume
 
 

@@ -233,6 +233,7 @@ ALL_KEYS = tuple(entry.name for entry in fields(Contents))
 KEYS = ALL_KEYS[: ALL_KEYS.index("seed") + 1]  # keys of every report.json, in this order
 # keys that a report.json has even if the value is null or empty
 KEYS_KEPT = {*KEYS, "leak", "contrast", "optic", "twins", "rrmsd_asked", "given_up", "remarks"}
+FOUND_BY_DESIGN = ("not-exported",)  # ids of remarks that a verification does not find again
 
 
 @dataclass(frozen=True)
@@ -336,6 +337,15 @@ def with_part(contents: Contents, part: MadePart, place: str = "") -> Contents:
 def with_failures(contents: Contents, failures: Mapping[str, str]) -> Contents:
     """Return the contents with a remark on each kind of output.export that is not possible, for the stated reason."""
     return _with_remarks(contents, *written("remarks.txt.j2", "failures", failures=failures))
+
+
+def with_earlier_remarks(contents: Contents, path: Path) -> Contents:
+    """Return the contents with the remarks of an earlier report.json that only the design itself can find."""
+    try:
+        earlier = read(path).all_remarks
+    except ValueError:
+        return contents
+    return _with_remarks(contents, *(remark for remark in earlier if remark.id in FOUND_BY_DESIGN))
 
 
 def _with_remarks(contents: Contents, *more: Remark) -> Contents:

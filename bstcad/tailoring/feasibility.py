@@ -24,8 +24,8 @@ import torch
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.trace.reach import largest_deflection
 from bstcad.tailoring import light_behind
+from bstcad.tailoring.driver import Task, no_progress
 from bstcad.tailoring.light_behind import LightBehind
-from bstcad.tailoring.run import Task, no_progress
 from bstcad.tailoring.slope_map import lit_corners, lit_window, square_grid
 from bstcad.tailoring.stage2 import with_pixels
 from bstcad.tailoring.two_faces import front_map

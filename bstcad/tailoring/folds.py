@@ -21,7 +21,7 @@ from scipy.ndimage import gaussian_filter, minimum_filter
 from torch import Tensor
 
 from bstcad.optics.light.channels import Channel, weighted_sum
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.numerics.reductions import total
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Scale, scaled
@@ -115,7 +115,8 @@ def fold_penalty(corner: Tensor, flux: Tensor, whole: float, scale: Scale, peak:
     where the triangle is overturned.
     """
     factor = peak * whole * _sense(corner, scale) * abs(scale[2] * scale[3])  # areas are in the receiver's unit
-    if corner.dtype == torch.float64 and flux.dtype == torch.float64 and (fast := ops.kernel("folds.penalty", corner)):
+    fast = kernel_choice.kernel("folds.penalty", corner)
+    if fast is not None and corner.dtype == flux.dtype == torch.float64:
         return fast(corner, flux, factor, (LEAST_AREA, MOST_LACK)) / whole
     first, second, third = triangles(corner)
     area = ((second - first)[0] * (third - first)[1] - (third - first)[0] * (second - first)[1]) / 2

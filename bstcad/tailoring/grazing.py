@@ -26,9 +26,9 @@ from bstcad.optics.lens.lens import Lens
 from bstcad.optics.numerics.reductions import total
 from bstcad.optics.surfaces.bspline import BSplineSurface, evaluate
 from bstcad.optics.surfaces.rays import Rays
+from bstcad.tailoring.driver import Edge
 from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.minimise import lbfgs, minimise
-from bstcad.tailoring.run import Edge
 from bstcad.tailoring.slope_map import face_grid, interpolate, lit_window, rays_at
 
 PENALTY_WEIGHT = 100.0  # weight of the penalty relative to RRMSD²

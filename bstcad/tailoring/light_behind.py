@@ -41,7 +41,7 @@ from bstcad.optics.receivers.receivers import Receiver
 from bstcad.optics.surfaces.rays import Vector
 from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.runs.files import SceneError
-from bstcad.tailoring.run import Task
+from bstcad.tailoring.driver import Task
 from bstcad.tailoring.slope_map import centroid, pixel_corners, resample_picture
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Points, Solver, grid_coordinates, solve

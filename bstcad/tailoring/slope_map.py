@@ -451,3 +451,34 @@ def aim_points(mapping: Mapping, lens: Lens, screen: Screen, x: Tensor, y: Tenso
     if not screen.receiver.is_level:
         sent = screen.receiver.from_level_plane(*sent, lens.front.z)
     return torch.stack([torch.from_numpy(np.ascontiguousarray(s)) for s in sent]).to(x)
+
+
+# --- an earlier lens --------------------------------------------------------------------------------------------------
+
+CARRIED_CELLS = 128  # points per side of the grid for `carry_light`
+CARRIED_FIT = Fit(bending=1e-3, steps=20, degree=5)  # fit of the change
+
+
+@torch.no_grad()
+def carry_light(source: Emitter, before: Lens, after: Lens, goal: Goal) -> Lens:
+    """Return `after`, whose last net is that of `before`, with slopes that send each ray where it landed before.
+
+    source: with the index of both lenses set for its wavelength.  goal: target, for its receiver.  Both lenses have the
+    same last net, but another front, thickness or index, so that a ray meets this net elsewhere and in another
+    direction.  At points b of the net the slope p(b, t) sends the new ray to the target point t of the earlier ray.  A
+    fit adds the change of the slopes to the net; the change is smooth even if the net is not, so that one fit on a
+    coarse grid does for a relief of any fineness.  The rays through b come from elsewhere on the source's cone, so that
+    the flux at t changes a little; stage 2 corrects this.
+    """
+    window = lit_window(source, after)
+    seen, receiver = (image_screen(lens, goal.screen).receiver for lens in (before, after))
+    old, new = (face_grid(source, lens, window, CARRIED_CELLS) for lens in (before, after))
+    landed = seen.land(behind(old.at_face, before.last_tailored))
+    aim = torch.stack(list(landed.position))
+    lit = (old.density > 0) & (new.density > 0) & landed.alive
+    wanted = torch.where(lit, aim, torch.zeros_like(aim))
+    needed = wanted_slopes(new.at_face, wanted, receiver, after.last_tailored.law)
+    x, y, z_x, z_y = (part[lit] for part in (*new.at_face.places, *needed))
+    net = after.nets[-1]
+    fitted = fit_slopes(net, x, y, z_x=z_x, z_y=z_y, weight=torch.ones_like(x), fit=CARRIED_FIT)
+    return after.with_last_net(fitted.from_vertex().moved(net.z))

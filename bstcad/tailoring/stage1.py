@@ -31,11 +31,11 @@ from bstcad.optics.surfaces.sides import as_pair, coarser
 from bstcad.optics.trace.reach import MAX_EXIT_ANGLE
 from bstcad.optics.trace.trace import clear_window, trace
 from bstcad.tailoring import slope_map
+from bstcad.tailoring.driver import Parameters, StageStep, Steps, Task
 from bstcad.tailoring.effort import FrontSearch
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.merit import mean_square_miss
 from bstcad.tailoring.reachable import resample
-from bstcad.tailoring.run import Parameters, StageStep, Steps, Task
 from bstcad.tailoring.settings import CONIC_CONSTANTS, SEARCH_RANGE
 from bstcad.tailoring.slope_fit import Fit, tailor_to_aim
 from bstcad.tailoring.slope_map import SlopeMap

@@ -34,6 +34,7 @@ from bstcad.optics.light.channels import Channel, channels_of, points_per_line
 from bstcad.optics.surfaces.sides import as_pair, coarser
 from bstcad.optics.trace.measure import rrmsd_by_tubes, side_factor
 from bstcad.optics.trace.source_images import images
+from bstcad.tailoring.driver import ROUGH_RAYS, TUBES_PER_SECOND, Parameters, Stage, StageStep, Steps, Task, maker
 from bstcad.tailoring.folds import Folds, needs_no_folds
 from bstcad.tailoring.grazing import Grazing
 from bstcad.tailoring.machinability import active_bounds, excess, round_weight
@@ -41,7 +42,6 @@ from bstcad.tailoring.merit import FOUR_POINTS, CoarseVariable, Merit, SobolevVa
 from bstcad.tailoring.minimise import PLATEAU, Best, Iterate, LbfgsState, Pairs, Plateau, lbfgs, minimise
 from bstcad.tailoring.net_variables import NetVariables, along_light
 from bstcad.tailoring.reachable import resample
-from bstcad.tailoring.run import ROUGH_RAYS, TUBES_PER_SECOND, Parameters, Stage, StageStep, Steps, Task, maker
 from bstcad.tailoring.settings import Bounds, Settings
 from bstcad.tailoring.source_image import ExtendedSource
 

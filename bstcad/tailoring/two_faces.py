@@ -31,10 +31,10 @@ from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.optics.surfaces.rays import Rays
 from bstcad.optics.trace.reach import limit_refraction, slopes_towards
 from bstcad.tailoring import slope_map, stage1
+from bstcad.tailoring.driver import Parameters, Steps, Task
 from bstcad.tailoring.effort import GATHERING
 from bstcad.tailoring.light_behind import LightBehind, light_for_task, without_crossings
 from bstcad.tailoring.machinability import place_back
-from bstcad.tailoring.run import Parameters, Steps, Task
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.tailoring.slope_map import FaceGrid, SlopeMap, Slopes
 from bstcad.transport.bfm import TransportStep

@@ -20,7 +20,7 @@ import torch
 from bstcad.analysis.light import Blur, blur, margins, mount_losses, rrmsd_of_ripple
 from bstcad.analysis.shape import AT_BOUND, Extreme, describe, survey, survey_front
 from bstcad.cad import mesh as meshes
-from bstcad.optics.lens import quadrature
+from bstcad.optics.lens import face_integrals
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.passes import Face
 from bstcad.optics.receivers.goal import Goal, worst
@@ -135,7 +135,7 @@ def verify(
     closed = Check.true("STL: watertight, winding consistent", meshes.is_closed(mesh), id="mesh-closed")
     return_freed()  # memory of the texts
     lens = _with_design_facts(_result(read, path), nominal.lens)
-    whole = quadrature.of_lens(lens)  # computed, not as stated in the file
+    whole = face_integrals.of_lens(lens)  # computed, not as stated in the file
     made_lens, of_aperture, why = (lens, [], "") if read_part is None else _mounted_lens(read_part, lens, nominal, path)
     on_lens(made_lens)
     lights, lines = zip(*_measure_targets(made_lens, nominal, effort, on_light), strict=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bstcad.optics.lens.face_integrals import MassProperties
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.passes import Passes
-from bstcad.optics.lens.quadrature import MassProperties
 from bstcad.scene.mount import Mount, Part
 from bstcad.verify.verdict import Check
 

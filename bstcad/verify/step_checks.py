@@ -21,9 +21,9 @@ from bstcad.analysis.shape import thickness_range
 from bstcad.cad import mounting, solid_properties, step_reading
 from bstcad.cad.solid_properties import WholePart
 from bstcad.cad.step_reading import StatedFace, StatedSolid, StepLens
+from bstcad.optics.lens.face_integrals import MassProperties
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.passes import LENS, Passes
-from bstcad.optics.lens.quadrature import MassProperties
 from bstcad.optics.surfaces.bspline import BSplineSurface, is_net
 from bstcad.optics.surfaces.surfaces import Surface, points_and_normals
 from bstcad.runs import processes

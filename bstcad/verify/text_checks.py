@@ -11,8 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from bstcad.optics.lens.face_integrals import MassProperties
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.lens.quadrature import MassProperties
 from bstcad.optics.surfaces.bspline import knots
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.scene.mount import Part

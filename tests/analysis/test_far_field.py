@@ -22,6 +22,7 @@ from bstcad.optics.trace.measure import GHOST_DIVISOR, simulated
 from bstcad.optics.trace.trace import ghost_light
 from bstcad.photometry import intensity_files, ray_files
 from bstcad.photometry.intensity import Intensity
+from tests import suite
 from tests.lenses import lens_of, net
 from tests.photometry.other_readers import assert_is_an_l, read_by_others
 
@@ -74,6 +75,7 @@ def test_the_grid_of_a_file_is_completed_to_90_degrees():
         assert np.array_equal(own, default)
 
 
+@suite.in_turn(0, 3)
 def test_a_design_exports_what_others_read(design):
     """All files have one flux, that of the ledger for 1000 lm; an L is upright for two packages of others."""
     [one, other, table, rays] = design.export("ies", "ldt", "csv", "tm25")

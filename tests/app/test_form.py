@@ -1,6 +1,7 @@
 """Every key of a scene has a field, which says what the schema says; and the form's HTML is sound."""
 
 import contextlib
+import functools
 import json
 import re
 import subprocess
@@ -46,16 +47,32 @@ def explains(field, row):
     return field.meaning in (row.meaning, HELP.get(without_numbers(field.key)))
 
 
+@functools.cache
+def form_of(text):
+    """Return the form of a text; most ways to a key begin with the same steps."""
+    return form(tomllib.loads(text))
+
+
+CHANGED = {}  # texts with a changed entry, by text, key and value
+
+
+def with_entry(text, key, value):
+    """Return the text with an entry changed."""
+    if (step := (text, key, repr(value))) not in CHANGED:
+        CHANGED[step] = changed(text, key, value)
+    return CHANGED[step]
+
+
 def ways_to(row, text, left=4):
     """Return True if some steps lead from a text to a form that has the key of a row, with its meaning."""
-    found = form(tomllib.loads(text))
+    found = form_of(text)
     key = row.key.replace("[]", "")
     if row.range in ("table", "tables"):
         if any(without_numbers(group.key) == key and group.meaning in (row.meaning, "") for group in found.groups()):
             return True
     elif any(without_numbers(field.key) == key and explains(field, row) for field in found.fields()):
         return True
-    return left > 0 and any(ways_to(row, changed(text, *step), left - 1) for step in steps(found, key))
+    return left > 0 and any(ways_to(row, with_entry(text, *step), left - 1) for step in steps(found, key))
 
 
 def test_every_key_can_be_reached():

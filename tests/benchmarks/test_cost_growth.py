@@ -14,7 +14,7 @@ from unittest import mock
 import pytest
 import torch
 
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces import bspline
 from bstcad.optics.trace import tubes
@@ -86,7 +86,7 @@ def test_the_fused_kernels_are_faster_than_plain_torch(name):
     }  # fmt: skip
     for kernel, (fused, plain) in pairs.items():
         quick = median_seconds(fused)
-        with mock.patch.object(ops, "ENABLED", False):  # no fused kernel, not even the spline below a plain trace
+        with mock.patch.object(kernel_choice, "ENABLED", False):  # no fused kernel, not even the spline
             slow = median_seconds(plain)
         print(f"\n{name} {kernel}: plain / fused = {slow / quick:.1f}", end="")
         assert slow > 1.5 * quick

@@ -19,7 +19,7 @@ from bstcad.optics.trace.measure import measure, side_factor, tubes_picture
 from bstcad.optics.trace.source_images import images
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage1, stage2
-from bstcad.tailoring.run import Driver, Task
+from bstcad.tailoring.driver import Driver, Task
 from bstcad.tailoring.source_image import ExtendedSource
 from tests.benchmarks.cold import TEMPLATES
 

@@ -22,9 +22,9 @@ from bstcad.cad import step_reading, step_writing
 from bstcad.cad.solid import lens_solid
 from bstcad.designs.pipeline import design
 from bstcad.exports.grid_sag import GridSag
+from bstcad.optics.lens.face_integrals import of_lens
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.losses import FresnelLoss, Losses
-from bstcad.optics.lens.quadrature import of_lens
 from bstcad.optics.surfaces.bspline import DEGREE, knots
 from bstcad.optics.trace.measure import tubes_picture
 from bstcad.optics.trace.trace import ghost_light, to_first_net, trace_ghost

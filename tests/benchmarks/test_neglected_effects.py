@@ -16,7 +16,7 @@ from bstcad.optics.lens import media
 from bstcad.optics.light.channels import channels_of
 from bstcad.optics.trace.measure import tubes_picture
 from bstcad.optics.trace.trace import ghost_light
-from bstcad.planning.estimates import DEFAULT_DIAMETER, DEFAULT_DIVERGENCE, band, coarse_lens, left_out
+from bstcad.planning.effect_estimates import DEFAULT_DIAMETER, DEFAULT_DIVERGENCE, band, coarse_lens, left_out
 from bstcad.scene.effects import Absorption, Fresnel
 from bstcad.scene.scene import load
 from tests.benchmarks.cold import TEMPLATES

@@ -7,7 +7,7 @@ import bstcad
 from bstcad.cad import solid_properties
 from bstcad.cad.tiles import tiles_of
 from bstcad.cad.tiling import Tiling
-from bstcad.optics.lens.quadrature import of_lens
+from bstcad.optics.lens.face_integrals import of_lens
 from bstcad.optics.receivers.irradiance import collect
 from bstcad.optics.trace.trace import trace
 from tests.cad.test_tiles import light_of_tile, rays_over, reread, rms

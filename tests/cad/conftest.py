@@ -9,8 +9,8 @@ import torch
 
 from bstcad.cad import step_writing
 from bstcad.cad.solid import named_solid
+from bstcad.optics.lens.face_integrals import of_lens
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.lens.quadrature import of_lens
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.outlines import Outline, Rectangle
 from bstcad.optics.surfaces.surfaces import Plane, Surface

@@ -12,7 +12,7 @@ from bstcad.analysis.shape import survey
 from bstcad.cad import distances, mesh, mounting, solid, solid_properties, step_reading, step_writing
 from bstcad.cad.radial_nets import radial_surface
 from bstcad.cad.walls import Draft
-from bstcad.optics.lens import quadrature
+from bstcad.optics.lens import face_integrals
 from bstcad.optics.lens.base import on_base
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.charts import SphereChart
@@ -65,7 +65,7 @@ def test_the_file_has_the_design_s_control_points_and_a_closed_solid(name, tmp_p
     assert text.closed and text.faces == (5 if based.front.outline else 4)
     assert reread.front.conic() == pytest.approx(lens.front.conic(), abs=1e-9)
     assert [check.name for check in step_checks.check(path, based, 1e-9, 100) if not check.passed] == []
-    stated, found = quadrature.of_lens(lens), solid_properties.of_solid(reread.shape)
+    stated, found = face_integrals.of_lens(lens), solid_properties.of_solid(reread.shape)
     assert text.properties.volumes == pytest.approx([stated.volume], rel=1e-12)
     assert found.volume == pytest.approx(stated.volume, rel=2e-9)
     assert found.area == pytest.approx(stated.area, rel=2e-9)
@@ -101,7 +101,7 @@ def test_occ_s_own_volume_of_the_faces_divided_at_their_knots_is_the_solid_s():
     assert divide.Perform()
     found = GProp_GProps()
     BRepGProp.VolumeProperties_s(divide.Result(), found)
-    assert found.Mass() == pytest.approx(quadrature.of_lens(CASES["sphere"]).volume, rel=1e-8)
+    assert found.Mass() == pytest.approx(face_integrals.of_lens(CASES["sphere"]).volume, rel=1e-8)
 
 
 def test_equal_distances_make_a_spherical_shell():
@@ -111,7 +111,7 @@ def test_equal_distances_make_a_spherical_shell():
     wanted = cap(rim, R - high) + math.pi * rim**2 * (high - base.around.z)
     wanted -= cap(base.outline.radius, INNER - base.around.z)
     assert math.hypot(base.outline.radius, base.around.z) == pytest.approx(INNER, rel=1e-12)
-    coarse, middle, fine = (quadrature.of_lens(dome(wave=0.0, m=m)).volume for m in (41, 81, 161))
+    coarse, middle, fine = (face_integrals.of_lens(dome(wave=0.0, m=m)).volume for m in (41, 81, 161))
     first, second = (4 * middle - coarse) / 3, (4 * fine - middle) / 3
     assert fine == pytest.approx(wanted, rel=5e-4) and (16 * second - first) / 15 == pytest.approx(wanted, rel=1e-6)
 
@@ -135,7 +135,7 @@ def test_the_mesh_is_closed_and_has_the_solid_s_volume(name):
 @pytest.mark.parametrize("name", ["sphere", "conic", "plane", "below the horizon"])
 def test_a_fine_mesh_has_the_solid_s_volume_without_extrapolation(name):
     made = mesh.lens_mesh(CASES[name], 2304)
-    assert mesh.volume_and_area(made)[0] == pytest.approx(quadrature.of_lens(CASES[name]).volume, rel=1e-6)
+    assert mesh.volume_and_area(made)[0] == pytest.approx(face_integrals.of_lens(CASES[name]).volume, rel=1e-6)
 
 
 def test_the_chordal_error_of_a_sphere_is_its_sagitta():
@@ -169,7 +169,7 @@ def test_a_flange_adds_its_volume_alone():
     part = mounting.mounted(body, [mounting.PlacedLens(lens)])
     x, y, _ = lens.back.rim(lens.outline).T  # trapezoids of a periodic curve
     inside = (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2
-    wanted = quadrature.of_lens(lens).volume + (math.pi * 18.0**2 - inside) * high
+    wanted = face_integrals.of_lens(lens).volume + (math.pi * 18.0**2 - inside) * high
     assert part.solid.isValid() and Counter(part.faces)["flange"] == 3
     assert solid_properties.of_solid(part.solid).volume == pytest.approx(wanted, rel=1e-6)
 

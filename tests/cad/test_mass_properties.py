@@ -12,8 +12,8 @@ from bstcad.cad.mounting import PlacedLens, mounted, wire
 from bstcad.cad.solid import lens_solid, named_solid
 from bstcad.cad.solid_properties import of_solid
 from bstcad.cad.walls import Draft
+from bstcad.optics.lens.face_integrals import MassProperties, of_lens
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.lens.quadrature import MassProperties, of_lens
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere
 from bstcad.scene.mount import Box

@@ -9,7 +9,7 @@ import pytest
 
 from bstcad.cad import step_reading, step_writing
 from bstcad.cad.solid import lens_solid
-from bstcad.optics.lens.quadrature import of_lens
+from bstcad.optics.lens.face_integrals import of_lens
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.scene.mount import LENS_COLOUR, Part
 from bstcad.step_text import part21

@@ -17,8 +17,8 @@ from bstcad import cli
 from bstcad.cad import patches, solid_properties, step_reading
 from bstcad.cad.tiles import tiles_of
 from bstcad.cad.tiling import Tiling
+from bstcad.optics.lens.face_integrals import of_lens
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.lens.quadrature import of_lens
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.receivers.irradiance import Screen, collect
 from bstcad.optics.surfaces.outlines import Circle, Rectangle

@@ -14,7 +14,7 @@ import trimesh
 from bstcad.cad import mesh, solid_properties, step_reading, step_writing
 from bstcad.cad.mounting import part_of
 from bstcad.cad.solid import lens_solid, named_solid
-from bstcad.optics.lens import quadrature
+from bstcad.optics.lens import face_integrals
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Conic, Recess, Sphere
@@ -48,7 +48,7 @@ def test_the_step_file_holds_the_lens_exactly(front, outline, tmp_path):
     assert abs(read.front.around.z - made.front.around.z) < 1e-12
     checks = step_checks.check(path, made, 1e-6, 1000)
     assert len(checks) > 6 and [check.name for check in checks if not check.passed] == []
-    by_faces, own = solid_properties.of_solid(read.shape), quadrature.of_lens(made)
+    by_faces, own = solid_properties.of_solid(read.shape), face_integrals.of_lens(made)
     assert by_faces.volume == pytest.approx(own.volume, rel=1e-9)
     assert by_faces.area == pytest.approx(own.area, rel=1e-8)
     np.testing.assert_allclose(by_faces.centroid, own.centroid, rtol=0, atol=1e-8)  # mm
@@ -61,7 +61,7 @@ def test_its_volume_is_that_without_the_cap_of_a_sphere():
     height = RADIUS - math.sqrt(RADIUS**2 - EDGE**2)
     flat = replace(made, front=made.front.around)
     cap = math.pi * height**2 * (3 * RADIUS - height) / 3
-    assert quadrature.of_lens(flat).volume - quadrature.of_lens(made).volume == pytest.approx(cap, rel=1e-11)
+    assert face_integrals.of_lens(flat).volume - face_integrals.of_lens(made).volume == pytest.approx(cap, rel=1e-11)
     assert named_solid(made).faces.count("underside") == 1
 
 
@@ -77,7 +77,7 @@ def test_the_mesh_is_closed_and_as_near_as_asked(front):
     made = lens(front)
     _, found = mesh.fit_mesh(made, 2e-3)
     volume, _ = mesh.volume_and_area(found)
-    whole = quadrature.of_lens(made)
+    whole = face_integrals.of_lens(made)
     assert mesh.is_closed(found) and mesh.chordal_error(found, made) <= 2e-3
     assert abs(volume - whole.volume) < 2e-3 * whole.area
     assert mesh.vertex_error(found, made) < 1e-12
@@ -93,12 +93,14 @@ def test_the_preview_of_a_dome_is_closed_and_shaded_by_its_own_normals():
     assert along.min() > 0.9  # an edge between dome and plane that were shaded as one would turn them
     closed = solid.copy()
     closed.merge_vertices(merge_norm=True, merge_tex=True)
-    assert closed.is_watertight and closed.volume == pytest.approx(1e-9 * quadrature.of_lens(lens()).volume, rel=1e-3)
+    assert closed.is_watertight and closed.volume == pytest.approx(
+        1e-9 * face_integrals.of_lens(lens()).volume, rel=1e-3
+    )
 
 
 def test_wires_stay_in_the_plane_around_the_front():
     drilled = lens_solid(lens(), holes=[(18.0, 0.0, 3.0)])
-    depth = quadrature.of_lens(lens()).volume - solid_properties.of_solid(drilled).volume
+    depth = face_integrals.of_lens(lens()).volume - solid_properties.of_solid(drilled).volume
     assert drilled.isValid() and 50 < depth < 120
     for hole in ((10.0, 0.0, 3.0), (0.0, 0.0, 3.0)):
         with pytest.raises(ValueError, match="a wire crosses the front, Ø21 mm, or lies inside it; move the wire"):
@@ -115,7 +117,7 @@ def test_a_flange_holds_it(z, tmp_path):
     assert part.solid.isValid()
     ring = math.pi * (30.0**2 - 25.0**2) * 2.5
     assert solid_properties.of_solid(part.solid).volume == pytest.approx(
-        quadrature.of_lens(made).volume + ring, rel=1e-8
+        face_integrals.of_lens(made).volume + ring, rel=1e-8
     )
     step_writing.write(part.solid, tmp_path / "part.step", "part", faces=part.faces)
     read = step_reading.read(tmp_path / "part.step")

@@ -22,7 +22,7 @@ from bstcad import Circle, Lens, Plane, Rectangle, Sphere, commands
 from bstcad.cad.mesh import Mesh
 from bstcad.figures import rendering
 from bstcad.figures.figure_jobs import Pictures
-from bstcad.optics.lens import quadrature
+from bstcad.optics.lens import face_integrals
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.surfaces import Recess
 
@@ -119,7 +119,7 @@ def test_a_dome_in_the_underside_is_drawn_with_the_plane_around_it(outline):
         assert flat.min() > 0
         volume += up * float((flat * (a + b + c + d)[2] / 4).sum())
         area += up * float(flat.sum())
-    assert volume == pytest.approx(quadrature.of_lens(made).volume, rel=2e-3) and abs(area) < 2e-3 * outline.area
+    assert volume == pytest.approx(face_integrals.of_lens(made).volume, rel=2e-3) and abs(area) < 2e-3 * outline.area
 
 
 def test_what_is_not_finite_is_not_drawn():

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, settings
 
 from bstcad.optics.kernels import forward
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.rays import Landed, Rays
@@ -28,7 +28,7 @@ NAMES = {torch.float32: "float32", torch.float64: "float64"}
 def tracing(engine: str) -> Iterator[Callable[[Rays, Lens, float], Landed]]:
     """Trace from the glass to the screen: plain torch; plain torch on the fused spline; the fused back face."""
     form = trace.from_first_net if engine == "fused" else from_first_net_plain
-    with mock.patch.object(ops, "ENABLED", ops.ENABLED and engine != "plain"):
+    with mock.patch.object(kernel_choice, "ENABLED", kernel_choice.ENABLED and engine != "plain"):
         yield lambda rays, lens, z: form(rays, lens, LevelPlane(z))
 
 

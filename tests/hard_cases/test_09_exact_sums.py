@@ -13,7 +13,7 @@ import torch
 
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.collimated import CollimatedSource
-from bstcad.optics.numerics import ops, reductions
+from bstcad.optics.numerics import kernel_choice, reductions
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces import bspline
@@ -37,7 +37,7 @@ FORMS = pytest.mark.parametrize("compiled", (True, False), ids=("compiled", "pla
 def plain(request, monkeypatch):
     """Switch all kernels off where a test asks for the plain form."""
     if "compiled" in request.fixturenames and not request.getfixturevalue("compiled"):
-        monkeypatch.setattr(ops, "ENABLED", False)
+        monkeypatch.setattr(kernel_choice, "ENABLED", False)
 
 
 def carried(dtype, count=SINGLE) -> torch.Tensor:

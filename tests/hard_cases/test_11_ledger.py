@@ -15,7 +15,7 @@ import torch
 
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.point import PointSource
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.receivers import irradiance
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.bspline import BSplineSurface
@@ -123,7 +123,7 @@ PICTURES = {
 @pytest.mark.parametrize("light", PICTURES)
 def test_nothing_is_piled_on_the_border(holds, monkeypatch, light, form):
     """Rays are in the same pixels; tubes are cut at the border, which leaves rounding of a few tubes' flux."""
-    monkeypatch.setattr(ops, "ENABLED", form is simulated)
+    monkeypatch.setattr(kernel_choice, "ENABLED", form is simulated)
     small, large = (PICTURES[light](screen, form) for screen in (SMALL, LARGE))
     assert float(large.sum()) > 1.1 * float(small.sum())  # light does leave the small screen
     piled = (border(small) - border(cut(large))).abs().max()

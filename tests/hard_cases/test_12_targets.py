@@ -15,7 +15,7 @@ from PIL import Image
 from bstcad.designs import pipeline
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
-from bstcad.tailoring.run import Hooks
+from bstcad.tailoring.driver import Hooks
 from bstcad.transport import Density, TransportStep, back_and_forth, mass_error, solve
 from bstcad.transport.mapping import FLOOR, STEPS_PER_GRID
 from bstcad.transport.monge_ampere import MAX_STEPS_FACTOR, newton_on_grids

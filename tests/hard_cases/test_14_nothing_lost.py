@@ -31,6 +31,7 @@ from bstcad.optics.trace.measure import Effort
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring import stage2
+from tests import suite
 from tests.conftest import DISK, SMALL, draws_nothing, verify_with
 
 ROOT = Path(__file__).parent.parent.parent
@@ -108,6 +109,7 @@ def intact(folder, digest):
     return {p.name for p in folder.iterdir()} == CONTENTS and digest_of(folder) == digest and "rrmsd" in report
 
 
+@suite.in_turn(1, 3)
 def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(tmp_path, monkeypatch, capsys, holds, small_design):
     """The command line itself, with its own checkpoints, against the design that nobody disturbed."""
     monkeypatch.setattr(commands.processes, "submit", commands.processes.run_here)
@@ -158,6 +160,7 @@ def full_disk(size):
         signal.signal(signal.SIGXFSZ, deaf)
 
 
+@suite.in_turn(0, 3)
 def test_a_full_disk_is_a_sentence_and_loses_nothing(small_scene, tmp_path, monkeypatch):
     """A disk of 60 kB holds neither the checkpoint nor lens.step; one of 0.5 MB holds these, but not lens.stl.
 
@@ -186,6 +189,7 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(small_scene, tmp_path, monk
     assert [p.name for p in folder.iterdir()] == ["report.json"] and (folder / "report.json").read_text() == "{}"
 
 
+@suite.in_turn(2, 3)
 def test_a_gradient_that_is_not_finite_is_counted_and_left_out(small_scene, small_design, monkeypatch, holds):
     call, calls, bad = stage2.Problem.__call__, [], {20: float("nan"), 23: float("inf")}  # calls of the first round
 

@@ -41,7 +41,7 @@ from bstcad.runs import checkpoint, environment
 from bstcad.runs.files import MachineError, SceneError
 from bstcad.scene.beam import table
 from bstcad.scene.scene import load
-from bstcad.tailoring.run import Hooks, no_progress
+from bstcad.tailoring.driver import Hooks, no_progress
 from tests import suite
 from tests.app.asking import bench, made, png
 from tests.app.conftest import SMALL

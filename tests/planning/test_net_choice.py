@@ -10,7 +10,7 @@ import bstcad
 from bstcad.cli import run
 from bstcad.optics.trace.measure import tubes_picture
 from bstcad.planning import net_choice
-from bstcad.planning.estimates import coarse_lens
+from bstcad.planning.effect_estimates import coarse_lens
 from bstcad.planning.net_choice import area_cells, choose_net, net_rrmsd, with_net
 from bstcad.scene.errors import SceneError
 

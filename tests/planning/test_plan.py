@@ -13,6 +13,7 @@ from bstcad.planning.prediction import PILOT_QUALITIES, QUALITIES, run_pilot
 from bstcad.report.record import simulated
 from bstcad.scene.errors import toml_positions
 from bstcad.scene.scene import load
+from tests import suite
 
 ROOT = Path(__file__).parent.parent.parent
 TEMPLATES = ROOT / "templates"
@@ -185,6 +186,7 @@ def test_a_chip_that_blurs_the_picture_is_said_first(tmp_path, capsys, monkeypat
 
 
 class TestCommand:
+    @suite.in_turn(0, 2)
     def test_what_is_not_predicted_is_said(self, capsys):
         """The plate would reach the target."""
         few = ["plan", str(TEMPLATES / "caustic_portrait.toml"), "--set", "target.pixels=48", "--set", "target.z=24.0"]

@@ -99,6 +99,7 @@ def test_a_scene_that_a_design_would_refuse_is_refused():
         preview(scene)
 
 
+@suite.in_turn(0, 2)
 def test_the_desk_answers_the_newest_request_of_each_page_in_order(monkeypatch):
     """Previews are small, and predictions have no pilots."""
     monkeypatch.setattr("bstcad.app.preview_desk.QUICK", FEW)

@@ -324,6 +324,7 @@ def test_a_lens_at_work_is_seen_from_near_by_and_with_the_wall(opened, bench, at
     assert page.said == []
 
 
+@pytest.mark.thorough
 def test_a_lens_drawn_anew_keeps_the_view_and_what_was_made_for_it(opened, bench):
     page = opened(COUNTED, path=bench)
     page.evaluate("shown.look('way')")

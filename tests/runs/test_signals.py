@@ -136,6 +136,7 @@ def test_ctrl_c_is_a_wish_first():
         signal.raise_signal(signal.SIGINT)
 
 
+@suite.in_turn(0, 2)
 def test_the_first_ctrl_c_ends_what_only_has_to_be_written_and_verified(tmp_path):
     """There is no better lens to wait for; the design is kept, and --resume has only these two left to do."""
     path = tmp_path / "small.toml"

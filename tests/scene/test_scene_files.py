@@ -20,7 +20,7 @@ from bstcad.report.prescription import prescription
 from bstcad.runs import checkpoint, files
 from bstcad.scene.scene import Scene, load
 from bstcad.scene.schema import FileContent, from_file
-from bstcad.tailoring.run import DesignRecord
+from bstcad.tailoring.driver import DesignRecord
 from tests.conftest import DISK
 
 RAMP = np.linspace(0.1, 1.0, 12).reshape(3, 4)

@@ -13,8 +13,8 @@ from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.trace.measure import Effort, measure
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import stage1, stage2
+from bstcad.tailoring.driver import BEST_LENS_STAGE, Hooks
 from bstcad.tailoring.merit import CoarseVariable
-from bstcad.tailoring.run import BEST_LENS_STAGE, Hooks
 from tests import suite
 
 LATER = DesignOptions(compare_later=True)

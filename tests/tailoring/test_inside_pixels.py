@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from bstcad.designs import pipeline
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.receivers.irradiance import CellTarget, picture_error
 from bstcad.optics.trace.measure import Effort, measure_goals
 from bstcad.scene.scene import Scene, load
@@ -114,7 +114,7 @@ def test_the_error_on_all_scales_and_its_gradient(shares, monkeypatch):
     flux = torch.tensor(1.3, dtype=torch.float64, requires_grad=True)
     found = []
     for enabled in (True, False):
-        monkeypatch.setattr(ops, "ENABLED", enabled)
+        monkeypatch.setattr(kernel_choice, "ENABLED", enabled)
         error, rrmsd = picture_error(image, flux, target)
         found.append((error.detach(), rrmsd, *torch.autograd.grad(error, (image, flux))))
         assert torch.autograd.gradcheck(lambda i, f: picture_error(i, f, target)[0], (image, flux))
@@ -135,7 +135,7 @@ def test_the_penalty_on_folds_and_its_gradient(monkeypatch):
     corner, flux = folded()
     found = []
     for enabled in (True, False):
-        monkeypatch.setattr(ops, "ENABLED", enabled)
+        monkeypatch.setattr(kernel_choice, "ENABLED", enabled)
         value = folds.fold_penalty(corner, flux, float(flux.sum()), (0.0, 0.0, 1.0, -1.0), peak=1 / 63)
         found.append((value.detach(), *torch.autograd.grad(value, corner)))
         assert torch.autograd.gradcheck(

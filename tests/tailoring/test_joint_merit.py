@@ -8,7 +8,7 @@ import torch
 from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.point import PointSource
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.tailoring.machinability import excess
@@ -101,7 +101,7 @@ def test_the_plain_form_is_the_fused_one(name, monkeypatch):
     """Tubes, merit, RRMSD and both gradients: a hit is found to 1e-13 mm by the one, and a step better by the other."""
     found = []
     for enabled in (True, False):
-        monkeypatch.setattr(ops, "ENABLED", enabled)
+        monkeypatch.setattr(kernel_choice, "ENABLED", enabled)
         problem = problem_of(name)
         found.append(problem([net.heights for net in problem.lens.nets]))
     (merit, gradients, rrmsd), (plain, wanted, known) = found

@@ -80,6 +80,7 @@ def test_the_gradient_for_a_back_alone_is_that_of_finite_differences():
     assert found.worst > 0 and (up - down) / (2 * step) == pytest.approx(along, rel=1e-5)
 
 
+@suite.in_turn(0, 2)
 def test_a_tool_of_50_mm_fits_and_the_picture_stays(free, bound):
     lens = bound.lens
     assert steepest(free.lens)[1] > 1.2 / 50 and steepest(lens)[1] <= 1 / 50
@@ -88,6 +89,7 @@ def test_a_tool_of_50_mm_fits_and_the_picture_stays(free, bound):
     assert max(judged["bounds on the back"], without) < 0.0115  # 0.0103, and 0.0078; stage 1 leaves 0.046
 
 
+@suite.in_turn(0, 2)
 def test_the_report_says_so_from_the_file(bound):
     contents = commands.prove(bound, ProofOptions(quick_effort()))
     [check] = [c for c in contents.checks if c.name.startswith("smallest concave radius")]

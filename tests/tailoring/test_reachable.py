@@ -18,8 +18,8 @@ from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.optics.trace.reach import largest_deflection
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
+from bstcad.tailoring.driver import Edge
 from bstcad.tailoring.grazing import Grazing
-from bstcad.tailoring.run import Edge
 from tests import suite
 from tests.conftest import draws_nothing, quick_effort, verify_with
 

@@ -14,8 +14,8 @@ from bstcad.optics.trace.measure import Effort
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring import effort as efforts
+from bstcad.tailoring.driver import Hooks
 from bstcad.tailoring.minimise import AdamState, Best, LbfgsState, adam, lbfgs, minimise
-from bstcad.tailoring.run import Hooks
 from tests import domes, suite, two_faces
 from tests.conftest import DISK, SMALL
 
@@ -133,7 +133,7 @@ def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
         assert np.array_equal(again.transport.source, whole.transport.source)
 
 
-@suite.in_turn(0, 2)
+@suite.in_turn(0, 3)
 def test_an_interrupt_anywhere_gives_a_lens_and_loses_nothing():
     """Asked at every look: before the first round there is no lens; later the best so far, and the way on."""
     scene = load(DISK, SCENES["paper"])

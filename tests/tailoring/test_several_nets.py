@@ -21,9 +21,9 @@ from bstcad.optics.surfaces.rays import Status
 from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.optics.trace.source_images import images
 from bstcad.scene.quality import Tailoring
+from bstcad.tailoring.driver import Parameters, Task
 from bstcad.tailoring.machinability import active_bounds, enforce_bounds
 from bstcad.tailoring.merit import Merit
-from bstcad.tailoring.run import Parameters, Task
 from bstcad.tailoring.stage2 import Problem, minimise_merit, steps, variables_of, with_best_nets
 from tests import lenses
 

@@ -20,8 +20,8 @@ from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Sphere
 from bstcad.optics.trace.measure import RayTubes, simulated, squared_distance
 from bstcad.scene.quality import Tailoring
+from bstcad.tailoring.driver import Task
 from bstcad.tailoring.merit import Merit
-from bstcad.tailoring.run import Task
 from bstcad.tailoring.source_image import ExtendedSource, LocalImages, _biquadratic, blur_error, blurs, with_border
 from bstcad.tailoring.stage2 import Problem, _overshoot_weight
 from tests.lenses import net

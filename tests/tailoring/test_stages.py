@@ -11,8 +11,9 @@ from bstcad.optics.receivers.irradiance import efficiency
 from bstcad.scene import scene
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.baselines import paper
+from bstcad.tailoring.driver import Driver, Hooks, StageStep, Task
 from bstcad.tailoring.merit import Landings, Merit
-from bstcad.tailoring.run import Driver, Hooks, StageStep, Task
+from tests import suite
 from tests.tracing import simulated
 
 SMALL = {
@@ -54,6 +55,7 @@ def tailored(task, lens):
     return driven(driver, task, stage2.steps(task, lens)).lens, driver
 
 
+@suite.in_turn(0, 2)
 def test_stage_1_goes_another_way_where_the_first_one_fails():
     """A source 5 mm before the lens: the slopes that a point needs change too much with the sag to settle."""
     near = {"source.position": "[0.0, 0.0, 10.0]", "tailoring.rounds": "3", "target.tilt": "[0.0, 20.0]"}
@@ -75,6 +77,7 @@ def test_the_map_settles_where_the_slopes_change_much_with_the_place():
     assert rounds[-1].slopes.moved < 0.1 * stage1.SETTLED_CHANGE
 
 
+@suite.in_turn(1, 2)
 def test_stage_1_goes_no_way_that_loses_the_light():
     """Glass of index 1.05: a back that follows the aims moves so far away that half of the light misses it."""
     outline = {"target.outline": "{ shape = 'rectangle', width = 400.0, height = 400.0 }"}
@@ -92,6 +95,7 @@ def test_stage_2_improves_what_stage_1_left():
     assert task.rrmsd(tailored(task, lens)[0]) < 0.9 * before
 
 
+@suite.in_turn(1, 2)
 def test_an_accuracy_that_is_reached_ends_stage_2():
     (task, _), lens = small("disk", **{"tailoring.stage2_iterations": "60", "tailoring.accuracy": "0.03"}), disk()
     assert task.rrmsd(lens) > 0.03
@@ -100,6 +104,7 @@ def test_an_accuracy_that_is_reached_ends_stage_2():
     assert len([point for point in driver.record.history if point[1] > 0]) < 60
 
 
+@suite.in_turn(0, 2)
 def test_an_accuracy_that_the_judge_denies_was_not_reached():
     """The tubes that tailor flatter a little; with one evaluation there is none left to make up for it."""
     lens = disk()

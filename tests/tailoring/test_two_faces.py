@@ -21,8 +21,9 @@ from bstcad.optics.trace.tubes import collect
 from bstcad.optics.trace.wavefront_error import wavefront_error
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import light_behind
+from bstcad.tailoring.driver import Hooks, Parameters
 from bstcad.tailoring.merit import Merit
-from bstcad.tailoring.run import Hooks, Parameters
+from tests import suite
 from tests.conftest import quick_effort
 from tests.lenses import SQUARE, rough
 
@@ -190,6 +191,7 @@ def scene_of(tmp_path, **more):
     return bstcad.load(path)
 
 
+@suite.in_turn(0, 2)
 def test_two_pictures_are_met_together(tmp_path):
     first = TWO["target"]
     scene = scene_of(tmp_path, target=[first, first | {"z": 80.0}])
@@ -201,6 +203,7 @@ def test_two_pictures_are_met_together(tmp_path):
     assert any("convex solution" in text for text in said)
 
 
+@suite.in_turn(1, 2)
 def test_a_front_alone_makes_a_picture(tmp_path):
     scene = scene_of(tmp_path, lens=TWO["lens"] | {"back": TWO["lens"]["back"] | {"optimise": False}})
     scene = scene.changed({"target.image": waves_of(0.0), "target.z": 60.0})

@@ -84,3 +84,5 @@ def test_a_design_whose_path_fails_is_written_with_a_remark(small_design, tmp_pa
     written = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"sag.csv", "lens.step", "report.html"} <= written and not [n for n in written if "toolpath" in n]
     assert commands.record.read(tmp_path / "out" / "report.json").remarks == report.remarks
+    again = commands.verify(tmp_path / "out", commands.ProofOptions(quick_effort(), NoPictures))
+    assert (again.remarks, again.given_up, again.verdict) == (report.remarks, report.given_up, report.verdict)

@@ -59,7 +59,7 @@ def held(design, mount, curvature=None):
     return replace(lens, clear=mount.clear(lens)), mount
 
 
-@pytest.mark.parametrize("name", suite.in_turns(MOUNTS, 3))
+@pytest.mark.parametrize("name", suite.in_turns(MOUNTS, 2))
 def test_the_light_is_that_of_rays_through_the_faces_of_the_part(design, name, tmp_path):
     """Polygons along the edges of part.step's faces decide which rays get through: all parallel, or from a point."""
     table = dict(MOUNTS[name])

@@ -9,7 +9,7 @@ import pytest
 
 from bstcad.cad import step_writing
 from bstcad.cad.solid import lens_solid
-from bstcad.optics.lens.quadrature import of_lens
+from bstcad.optics.lens.face_integrals import of_lens
 from bstcad.scene.mount import Part
 from bstcad.step_text import part21
 from bstcad.verify.text_checks import measure_checks, part_checks

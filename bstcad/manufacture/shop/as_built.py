@@ -29,7 +29,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import FIT_SIZES, FileNet, NetFront, fit_net, net_extent
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import effort as efforts
-from bstcad.tailoring.run import NO_HOOKS, Hooks, NetParameters, Parameters
+from bstcad.tailoring.driver import NO_HOOKS, Hooks, NetParameters, Parameters
 
 KEYS = "front", "thickness", "index"
 OPTION = "--as-built"

@@ -21,7 +21,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.numerics.compiling import MIN_PART, compiled
 
 MAX_PARTS = 16  # maximum number of parts; a power of two, so that two, four or eight threads have equal work
@@ -74,7 +74,7 @@ def elementary(function: Callable[..., Tensor], *t: Tensor) -> Tensor:
 
 def dot(a: Tensor, b: Tensor) -> float:
     """Return Σ a b of two vectors without gradient: summed in float64 by the kernel, else in their precision."""
-    fast = ops.kernel("reductions.dot", a)
+    fast = kernel_choice.kernel("reductions.dot", a)
     return fast(a, b) if fast else float(total(a * b))
 
 
@@ -96,7 +96,7 @@ def _dot(a, b, sums):
 
 def shift(q: Tensor, y: Tensor, factor: float, along: Tensor, scale: float = 1.0) -> float:
     """Replace q by scale q + factor y, in place, and return its `dot` with `along`; vectors without gradient."""
-    if ops.kernel("reductions.dot", q, y, along):
+    if kernel_choice.kernel("reductions.dot", q, y, along):
         sums = np.empty(MAX_PARTS)
         _shift(q.numpy(), y.numpy(), factor, along.numpy(), scale, sums)
         return float(sums.sum())

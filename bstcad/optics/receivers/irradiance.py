@@ -16,7 +16,7 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.numerics.reductions import quotient, total
 from bstcad.optics.receivers.receivers import LevelPlane, Receiver, TiltedPlane
 from bstcad.optics.surfaces.motion import Motion
@@ -151,7 +151,7 @@ def collect(rays: Landed, screen: Screen) -> tuple[Tensor, Tensor]:
     Binning gives no gradient to a ray outside the screen; the second sum does.
     """
     flux = landed_flux(rays)
-    if (fast := ops.kernel("irradiance.collect", rays.position, flux)) and not flux.requires_grad:
+    if (fast := kernel_choice.kernel("irradiance.collect", rays.position, flux)) and not flux.requires_grad:
         (left, _), (_, top), (per_x, per_y) = screen.x, screen.y, screen.per_unit
         position = rays.position.reshape(2, -1).contiguous()
         return fast(position, flux.reshape(-1).contiguous(), (left, per_x, top, per_y), screen.shape)
@@ -232,7 +232,8 @@ def picture_error(image: Tensor, flux: Tensor, target: CellTarget) -> tuple[Tens
 
     differentiable in image (k rows, k columns) and flux (0-d), float64.  The RRMSD has no gradient.
     """
-    if image.dtype == torch.float64 and (fast := ops.kernel("irradiance.picture_error", image, target.picture)):
+    fast = kernel_choice.kernel("irradiance.picture_error", image, target.picture)
+    if fast is not None and image.dtype == torch.float64:
         return fast(image, flux, target)
     d, last = quotient(image, flux) - target.picture, len(target.weights) - 1
     error = sum(

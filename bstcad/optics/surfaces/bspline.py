@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 from typing_extensions import TypeIs
 
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.surfaces.motion import Motion, along_axis
 from bstcad.optics.surfaces.outlines import Outline, inside
 from bstcad.optics.surfaces.sides import Sides, as_pair, side
@@ -109,7 +109,7 @@ def evaluate_plain(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tenso
 
 def evaluate(heights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the values of `evaluate_plain`, from the fused kernel if it supports these tensors (equal to rounding)."""
-    if fast := ops.kernel("bspline.evaluate", heights, u, v):
+    if fast := kernel_choice.kernel("bspline.evaluate", heights, u, v):
         return fast(heights, *torch.broadcast_tensors(u, v))
     return evaluate_plain(heights, u, v)
 
@@ -119,7 +119,7 @@ def net_gradient(heights: Tensor, u: Tensor, v: Tensor, seeds: tuple[Tensor, Ten
 
     This adjoint of `evaluate` does not depend on the heights; `heights` gives the net's size, type and device.
     """
-    if fast := ops.kernel("bspline.net_gradient", heights, u, v):
+    if fast := kernel_choice.kernel("bspline.net_gradient", heights, u, v):
         return fast(heights, u, v, seeds)
     net = torch.zeros_like(heights, requires_grad=True)
     with torch.enable_grad():

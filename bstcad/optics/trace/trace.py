@@ -29,7 +29,7 @@ from bstcad.optics.lens.losses import REFLECTED
 from bstcad.optics.light.channels import Channel, source_numbers, weighted_sum
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.light.ray_bundle import RayBundle
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.numerics.reductions import total
 from bstcad.optics.receivers import irradiance
 from bstcad.optics.receivers.irradiance import Screen, joined_cells
@@ -80,7 +80,7 @@ def _net_kernel(name: str, rays: Rays, interface: Interface) -> Callable[..., An
     net = interface.surface
     if not is_net(net) or (isinstance(net, RadialSurface) and rays.sense < 0):  # domes: light along +z only
         return None
-    return ops.kernel(f"{name} {net.kind}", net.heights, rays.position, rays.direction)
+    return kernel_choice.kernel(f"{name} {net.kind}", net.heights, rays.position, rays.direction)
 
 
 def whole_kernel(
@@ -90,7 +90,7 @@ def whole_kernel(
 
     tables: allow a table of the source's light, which costs as much as some ten thousand rays.
     """
-    fast = ops.whole_kernel(name, lens.interfaces) if receiver.has_kernel and not source.is_given else None
+    fast = kernel_choice.whole_kernel(name, lens.interfaces) if receiver.has_kernel and not source.is_given else None
     return fast if fast and beam(source, lens, tables) is not None else None
 
 

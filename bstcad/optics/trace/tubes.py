@@ -20,7 +20,7 @@ from bstcad.optics.lens.interfaces import cross
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.light.path import MAX_BROYDEN_STEPS, MIN_BROYDEN_DIVISOR, Found, Path
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.numerics.reductions import total
 from bstcad.optics.receivers.irradiance import Scale, Screen, scaled
 from bstcad.optics.receivers.receivers import LevelPlane, Receiver
@@ -308,7 +308,7 @@ def search(path: Path, x: Tensor, y: Tensor, height: Tensor) -> Found:
     """
     fast = None
     if x.dtype == torch.float64:
-        fast = ops.front_kernel("tubes.search", path.before, x)
+        fast = kernel_choice.front_kernel("tubes.search", path.before, x)
     if fast is not None and all(source.beam(path.start) is not None for source in path.sources):
         return fast(path, x=x, y=y, height=height)
     return search_plain(path, x, y, height)
@@ -414,7 +414,7 @@ def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int], scale: Scale =
     scale = (x_0, y_0, s_x, s_y).  flux: flux of the tubes, (n, m).
     outside: Σ flux · (mean squared distance of corners to the picture, pixel²), so that light outside has a gradient.
     """
-    if corner.dtype == torch.float64 and (fast := ops.kernel("tubes.collect", corner)):
+    if corner.dtype == torch.float64 and (fast := kernel_choice.kernel("tubes.collect", corner)):
         return fast(corner, flux, (shape, scale), MIN_TRIANGLE_AREA)
     return collect_plain(corner, flux, shape, scale)
 

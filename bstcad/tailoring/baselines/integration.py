@@ -37,8 +37,8 @@ from bstcad.optics.trace.unfolding import image_from_last_net
 from bstcad.runs.files import SceneError
 from bstcad.tailoring import slope_map
 from bstcad.tailoring.baselines.paper import transport
+from bstcad.tailoring.driver import StageStep, Task
 from bstcad.tailoring.machinability import place_back
-from bstcad.tailoring.run import StageStep, Task
 from bstcad.tailoring.slope_fit import conjugate_gradients, monomials, with_polynomial
 from bstcad.transport.mapping import Mapping
 

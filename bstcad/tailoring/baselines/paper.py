@@ -25,9 +25,9 @@ from bstcad.optics.surfaces.rays import Landed, Rays
 from bstcad.optics.surfaces.sides import Sides
 from bstcad.optics.trace.trace import clear_window, trace
 from bstcad.tailoring import slope_map
+from bstcad.tailoring.driver import Parameters, StageStep, Task, maker
 from bstcad.tailoring.merit import mean_square_miss
 from bstcad.tailoring.minimise import AdamState, Best, Iterate, adam, minimise
-from bstcad.tailoring.run import Parameters, StageStep, Task, maker
 from bstcad.transport.bfm import TransportStep
 from bstcad.transport.mapping import Mapping, Solver
 

@@ -129,7 +129,7 @@ FAULTS = {  # a cloud of a lens, the check that fails, words of its sentence
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("fault", suite.in_turns(FAULTS, 2))
 def test_a_fault_is_named(nominal, same_light, fault):
     made, check, words = FAULTS[fault]
     part = judged(np.array(made(nominal.lens)), nominal)
@@ -215,6 +215,7 @@ def test_the_report_has_a_made_part_where_one_was_asked_for(small_design, nomina
     assert all((folder / name).is_file() for name in again["deviation_map"])
 
 
+@suite.in_turn(0, 3)
 def test_many_parts_of_one_design_are_judged_beside_it(small_design, nominal, tmp_path, quick, capsys):
     """The command and Python agree; the design's folder stays as it is to the last bit, and the map is the form."""
     folder, place = shutil.copytree(small_design.folder, tmp_path / "design"), tmp_path / "serial-17"
@@ -259,6 +260,7 @@ def test_a_turned_part_is_aligned_by_its_relief(degrees):
     assert abs(found.pose.angles[2]) == pytest.approx(degrees, abs=0.05)
 
 
+@suite.in_turn(2, 3)
 def test_equal_poses_are_stated_in_terminal_and_report(small_design, nominal, tmp_path, quick, capsys, monkeypatch):
     """Two poses that fit equally well are stated in one sentence, which is absent where there is one pose."""
     folder = shutil.copytree(small_design.folder, tmp_path / "design")
@@ -275,6 +277,7 @@ def test_equal_poses_are_stated_in_terminal_and_report(small_design, nominal, tm
     assert written["alignment"]["equal_turns"] == [180.0] and words in (folder / "report.html").read_text()
 
 
+@suite.in_turn(1, 3)
 def test_the_largest_rrmsd_of_equal_poses_is_judged(nominal, light):
     """The lens of the disc is the same upside down, but for a tilt, and so is its light, within 15 % of noise."""
     part = judged(as_designed(nominal.lens), nominal)

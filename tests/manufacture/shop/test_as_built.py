@@ -48,6 +48,7 @@ def test_the_back_is_tailored_to_the_blank(made, key):
     assert float(lens.front.curvature) == pytest.approx(0.0035 if key == "curvature" else 0.002, abs=1e-15)
 
 
+@suite.in_turn(1, 3)
 def test_a_measured_front_becomes_the_front(made, tmp_path):
     """Points of a front with 3 µm of astigmatism, misplaced and noisy: the front of the new design has this form."""
 
@@ -105,6 +106,7 @@ def test_blanks_that_no_lens_can_have_are_refused(made):
         as_built.as_built(made, AsBuilt(front=Path("missing.csv")))
 
 
+@suite.in_turn(0, 3)
 def test_the_command_writes_a_design_of_its_own(small_design, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(commands, "FULL", quick_effort())
     before = (small_design.folder / "design.npz").read_bytes()

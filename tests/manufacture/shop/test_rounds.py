@@ -25,6 +25,7 @@ from bstcad.manufacture.shop import rounds as rounds_of_shop
 from bstcad.optics.surfaces.bspline import BSplineSurface, interpolating_net
 from bstcad.optics.surfaces.surfaces import sag
 from bstcad.optics.trace.measure import Effort
+from tests import suite
 from tests.conftest import quick_effort
 
 POINTS, GAUGE, MISPLACED, TURNED = 10_000, 20e-6, 0.03, 0.05  # number, noise (mm), mm, degrees
@@ -147,6 +148,7 @@ def test_the_light_chooses_a_low_pass_that_keeps_noise_out(lens):
     assert cutoffs[0] > cutoffs[1] <= 4 * max(design.pitch)
 
 
+@suite.in_turn(1, 2)
 def test_by_light_less_is_cut_and_the_picture_is_the_same(small_design, lens):
     """Low orders that hardly move the light stay; what is left makes the RRMSD at most a tenth larger."""
     made = commands.read(small_design.folder)
@@ -168,6 +170,7 @@ def test_by_light_less_is_cut_and_the_picture_is_the_same(small_design, lens):
         compensation.next_round(lens, lens.back_net, [cloud], CompensationSettings(by="colour"), [])
 
 
+@suite.in_turn(0, 2)
 def test_what_does_not_repeat_is_told_from_what_repeats(lens):
     """Three parts show how far their mean is uncertain; a perfect part is not corrected by the noise of its gauge."""
     [(found, _)] = rounds(Shop(lens, varying=3e-4), 1, parts=3)
@@ -192,6 +195,7 @@ def test_rounds_that_diverge_are_refused(lens):
         compensation.next_round(lens, lens.back_net, [half], CompensationSettings(), [])
 
 
+@suite.in_turn(1, 3)
 def test_a_folder_remembers_its_rounds(lens, small_design, tmp_path, capsys, monkeypatch):
     folder = tmp_path / "design"
     shutil.copytree(small_design.folder, folder)

@@ -102,6 +102,7 @@ def test_finer_layers_make_a_better_picture(plate):
     assert kept == sorted(kept) and kept[2] - kept[0] > 0.4
 
 
+@suite.in_turn(0, 2)
 def test_plan_predicts_the_part_as_made(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("bstcad.planning.preview.REFINED", FEW)
     monkeypatch.setattr("bstcad.planning.plan.run_pilot", typical_pilot)
@@ -122,6 +123,7 @@ def test_plan_refuses_what_has_no_grade(given, capsys):
     assert "--made" in capsys.readouterr().err
 
 
+@suite.in_turn(1, 2)
 def test_a_finished_design_is_predicted_in_python(small_design):
     design = bstcad.open(small_design.folder)
     made = design.as_made("resin-printed", layer_height=0.1)

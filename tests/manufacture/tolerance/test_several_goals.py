@@ -74,6 +74,7 @@ def several(small_design, goals, unlimited, tmp_path_factory):
     return folder, tolerancing.tolerance(folder, replace(FEW, wanted=0.3))
 
 
+@suite.in_turn(1, 2)
 def test_a_wave_without_a_limit_fails_no_lens(unlimited):
     assert unlimited.passed[1] == 1.0
     assert "limit" not in unlimited.facts()["wavefront"] and "yield" not in unlimited.facts()["wavefront"]

@@ -13,7 +13,7 @@ from bstcad.optics.lens.losses import AbsorptionLoss, FresnelLoss, Losses
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.sphere_light import SphereLight
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.receivers.directions import Directions
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.charts import SphereChart
@@ -106,7 +106,7 @@ def test_the_search_is_that_of_the_plain_form(monkeypatch):
     light = replace(light, chart=SphereChart(0.8 * R))
     x, y = tubes.corners(Circle(R), 20)
     ours = tubes.rays_to(light, lens, x, y)
-    monkeypatch.setattr(ops, "front_kernel", lambda name, *given: None)
+    monkeypatch.setattr(kernel_choice, "front_kernel", lambda name, *given: None)
     plain = tubes.rays_to(light, lens, x, y)
     assert torch.equal(ours[2].status, plain[2].status) and torch.equal(ours[2].position, plain[2].position)
     for one, other in ((ours[0], plain[0]), (ours[1], plain[1]), (ours[2].direction, plain[2].direction)):

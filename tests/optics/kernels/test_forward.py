@@ -16,7 +16,7 @@ from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.profiles import Net, Profile
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.receivers import irradiance
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane, TiltedPlane
@@ -275,15 +275,15 @@ def test_memory_does_not_grow_with_the_rays():
 
 def test_what_the_kernel_takes(monkeypatch):
     source, lens, _ = SCENES["point, plane"]
-    assert ops.whole_kernel("trace.simulate", lens.interfaces) is forward.simulate
+    assert kernel_choice.whole_kernel("trace.simulate", lens.interfaces) is forward.simulate
     for other in (lens.back.heights.to(torch.float16), lens.back.heights.to("meta")):
-        assert not ops.whole_kernel("trace.simulate", lens.with_heights([other]).interfaces)
+        assert not kernel_choice.whole_kernel("trace.simulate", lens.with_heights([other]).interfaces)
     freeform = replace(lens, front=replace(lens.back, z=6.0, heights=lens.back.heights - 10))
     window = replace(lens.interfaces[0], surface=Plane(1.0))
     for unknown in (freeform, replace(lens, before=(window,))):
-        assert not ops.whole_kernel("trace.simulate", unknown.interfaces)
+        assert not kernel_choice.whole_kernel("trace.simulate", unknown.interfaces)
     monkeypatch.setitem(
-        ops.KERNELS["trace.simulate bspline"], "cpu", lambda *given: pytest.fail("the kernel is called")
+        kernel_choice.KERNELS["trace.simulate bspline"], "cpu", lambda *given: pytest.fail("the kernel is called")
     )
     assert simulated(source, freeform, SCREEN, 50, 0).rays == 2500  # by the plain form
 

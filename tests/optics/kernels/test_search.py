@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from bstcad.optics.light.point import PointSource
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Sphere
 from bstcad.optics.trace import tubes
@@ -23,7 +23,7 @@ def both(monkeypatch, source, lens, n, shape=None):
     points = tubes.corners(shape or Rectangle(2 * HALF, 2 * HALF), n)
     found = tubes.rays_to(source, lens, *points)
     with monkeypatch.context() as off:
-        off.setattr(ops, "front_kernel", lambda name, *given: None)
+        off.setattr(kernel_choice, "front_kernel", lambda name, *given: None)
         return found, tubes.rays_to(source, lens, *points)
 
 
@@ -64,6 +64,8 @@ def test_points_that_no_ray_meets_are_lost_in_both_forms(monkeypatch):
 
 
 def test_light_without_a_formula_takes_the_plain_form(monkeypatch):
-    monkeypatch.setitem(ops.KERNELS["tubes.search"], "cpu", lambda *given, **named: pytest.fail("the kernel is called"))
+    monkeypatch.setitem(
+        kernel_choice.KERNELS["tubes.search"], "cpu", lambda *given, **named: pytest.fail("the kernel is called")
+    )
     monkeypatch.setattr(PointSource, "beam", lambda self, z: None)
     assert bool(tubes.rays_to(PointSource(), deep(), *tubes.corners(Circle(5.0), 8))[2].alive.all())

@@ -8,7 +8,7 @@ import torch
 
 from bstcad.analysis import shape
 from bstcad.optics.kernels import spline
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.receivers import irradiance
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces import bspline
@@ -23,10 +23,10 @@ from tests.optics.kernels.arrays import DTYPES, LAYOUTS, close
 def test_kernels_serve_matching_cpu_tensors_only(dtype):
     a = torch.zeros(3, dtype=dtype)
     other = torch.zeros(3, dtype=torch.float64 if dtype == torch.float32 else torch.float32)
-    for name, by_device in ops.KERNELS.items():
-        assert by_device.keys() == {"cpu"} and callable(ops.kernel(name, a, a))
+    for name, by_device in kernel_choice.KERNELS.items():
+        assert by_device.keys() == {"cpu"} and callable(kernel_choice.kernel(name, a, a))
         for wrong in ((a, a.to(torch.float16)), (a, other), (a.to("meta"), a.to("meta"))):
-            assert ops.kernel(name, *wrong) is None
+            assert kernel_choice.kernel(name, *wrong) is None
 
 
 @DTYPES

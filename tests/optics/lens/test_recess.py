@@ -11,7 +11,7 @@ import torch
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.point import PointSource
-from bstcad.optics.numerics import ops
+from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.charts import SphereChart
@@ -111,7 +111,7 @@ def test_the_kernel_traces_a_dome_as_the_plain_form_does(monkeypatch):
     x = torch.linspace(-15, 15, 40, dtype=torch.float64)
     rays = source.rays_through(*torch.meshgrid(x, x, indexing="ij"), RADIUS, 1.0)
     first = trace(rays, wide, LevelPlane(500.0))
-    monkeypatch.setattr(ops, "ENABLED", False)
+    monkeypatch.setattr(kernel_choice, "ENABLED", False)
     second = trace(rays, wide, LevelPlane(500.0))
     assert torch.equal(first.status, second.status) and 100 < int(first.alive.sum()) < 1500
     alive = first.alive

@@ -21,7 +21,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.tailoring import stage1
 from bstcad.tailoring.baselines import integration
 from bstcad.tailoring.baselines.integration import FINEST_FIT, fit_heights, march
-from bstcad.tailoring.run import Driver, Task
+from bstcad.tailoring.driver import Driver, Task
 from tests import suite
 from tests.by_slope import deflect, intersect
 from tests.lenses import net

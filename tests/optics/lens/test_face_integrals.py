@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.lens.quadrature import Border, gauss_points, of_face, of_wall, outline_border
+from bstcad.optics.lens.face_integrals import Border, gauss_points, of_face, of_wall, outline_border
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere
 from tests import lenses

@@ -12,10 +12,10 @@ import pytest
 import bstcad
 from bstcad.designs import pipeline
 from bstcad.optics.trace.measure import Effort, measure, tubes_picture
-from bstcad.planning.estimates import coarse_lens, diagnosis, left_out
+from bstcad.planning.effect_estimates import coarse_lens, diagnosis, left_out
 from bstcad.report.record import LEFT_OUT
 from bstcad.scene.scene import load
-from bstcad.tailoring.run import Hooks
+from bstcad.tailoring.driver import Hooks
 from tests import suite
 from tests.conftest import DISK, SMALL
 
