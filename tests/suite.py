@@ -131,6 +131,7 @@ def pytest_configure(config):
     config.pluginmanager.register(Spent(config.stash[SPENT]))
 
 
+@pytest.hookimpl(optionalhook=True)  # without xdist
 def pytest_xdist_make_scheduler(config, log):
     """Return the scheduler that deals out long files; --dist loadfile is the one that it replaces."""
     from xdist.scheduler import LoadFileScheduling
