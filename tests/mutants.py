@@ -8,8 +8,6 @@ A mutant is killed if a test fails, or if the tests take longer than TIMEOUT.  A
 asks for a test.  `<` becomes `>=`, not `<=`, which differs only for equal numbers.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import copy
@@ -19,9 +17,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = "optics", "transport", "tailoring", "cad", "verify", "step_text"
@@ -31,24 +27,11 @@ PAIRS = (
     (ast.Lt, ast.GtE), (ast.Gt, ast.LtE), (ast.Eq, ast.NotEq), (ast.Is, ast.IsNot), (ast.In, ast.NotIn),
     (ast.Add, ast.Sub), (ast.Mult, ast.Div), (ast.And, ast.Or),
 )  # fmt: skip
-OTHER = {one: other for pair in PAIRS for one, other in (pair, pair[::-1])} | {
-    ast.Pow: ast.Mult,
-    ast.FloorDiv: ast.Mult,
-}
+OTHER = {one: two for pair in PAIRS for one, two in (pair, pair[::-1])} | {ast.Pow: ast.Mult, ast.FloorDiv: ast.Mult}
 
 
-class Mutant(NamedTuple):
-    """One changed place of a file."""
-
-    file: str  # path from the root of the tree
-    line: int
-    before: str
-    after: str
-    text: str  # text of the whole file
-
-
-def changes(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield a changed copy of a node, if there is a change for its kind."""
+def changed(node):
+    """Return a changed copy of a node, or None if there is no change for its kind."""
     new = copy.deepcopy(node)
     match new:
         case ast.Compare(ops=[op]) if type(op) in OTHER:
@@ -56,7 +39,7 @@ def changes(node: ast.AST) -> Iterator[ast.AST]:
         case ast.BinOp(op=op) | ast.BoolOp(op=op) if type(op) in OTHER:
             new.op = OTHER[type(op)]()
         case ast.UnaryOp(op=ast.USub() | ast.Not()):
-            new = new.operand
+            return new.operand
         case ast.Constant(value=bool(value)):
             new.value = not value
         case ast.Constant(value=int(value)):
@@ -66,88 +49,82 @@ def changes(node: ast.AST) -> Iterator[ast.AST]:
         case ast.IfExp():
             new.test = ast.UnaryOp(ast.Not(), new.test)
         case _:
-            return
-    yield new
+            return None
+    return new
 
 
-def skipped(tree: ast.AST) -> set[ast.AST]:
-    """Return the nodes that state a type, decorate or only guard (`strict=True`): their change changes no result."""
-    found = {node.value for node in ast.walk(tree) if isinstance(node, ast.keyword) and node.arg == "strict"}
+def without_effect(tree):
+    """Yield the nodes that state a type, decorate or only guard (`strict=True`): their change changes no result."""
     for node in ast.walk(tree):
-        for part in (
+        if isinstance(node, ast.keyword) and node.arg == "strict":
+            yield node.value
+        parts = [
             getattr(node, "annotation", None),
             getattr(node, "returns", None),
             *getattr(node, "decorator_list", ()),
-        ):
-            found |= set(ast.walk(part)) if part is not None else set()
-    return found
-
-
-def mutants_of(file: str) -> Iterator[Mutant]:
-    """Yield all mutants of a file; several nodes of one text give one mutant."""
-    text = (ROOT / file).read_text(encoding="utf-8")
-    tree, lines = ast.parse(text), text.encode().splitlines(keepends=True)
-    starts = [sum(map(len, lines[:k])) for k in range(len(lines))]
-    without = skipped(tree)
-    for node in ast.walk(tree):
-        for new in changes(node) if node not in without else ():
-            begin, end = starts[node.lineno - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset
-            after, data = f"({ast.unparse(new)})", text.encode()
-            changed = data[:begin] + after.encode() + data[end:]
-            yield Mutant(file, node.lineno, data[begin:end].decode(), after, changed.decode())
-
-
-def tests_of(module: str) -> list[str]:
-    """Return the test files that import a module, such as bstcad.optics.lens.lens."""
-    package, _, name = module.rpartition(".")
-    found = []
-    for path in sorted((ROOT / "tests").rglob("test_*.py")):
-        nodes = [
-            node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.ImportFrom)
         ]
-        direct = any(node.module == module for node in nodes)
-        if direct or any(node.module == package and name in {each.name for each in node.names} for node in nodes):
-            found.append(path.relative_to(ROOT).as_posix())
-    return found
+        for part in filter(None, parts):
+            yield from ast.walk(part)
 
 
-def is_killed(mutant: Mutant, tree: Path, marks: list[str]) -> bool:
-    """Return True if a test of the mutant's module fails in the copy `tree`."""
-    module = mutant.file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-    if not (files := tests_of(module)):
-        return False
-    (tree / mutant.file).write_text(mutant.text, encoding="utf-8")
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *marks, *files]
+def mutants_of(file):
+    """Yield (file, description, text of the whole file) of all mutants of a file."""
+    data = (ROOT / file).read_bytes()
+    tree, lines = ast.parse(data), data.splitlines(keepends=True)
+    starts, without = [sum(map(len, lines[:k])) for k in range(len(lines))], {*without_effect(tree)}
+    for node in ast.walk(tree):
+        if node not in without and (new := changed(node)) is not None:
+            begin, end = starts[node.lineno - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset
+            after = f"({ast.unparse(new)})"
+            text = (data[:begin] + after.encode() + data[end:]).decode()
+            yield file, f"{file}:{node.lineno}  {data[begin:end].decode()}  ->  {after}", text
+
+
+def tests_of(file):
+    """Return the test files that import the module of a file, and those of its name; else all tests of its room."""
+    module = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    package, _, name = module.rpartition(".")
+    found, room = [], ROOT / "tests" / Path(*package.split(".")[1:])
+    for path in sorted((ROOT / "tests").rglob("test_*.py")):
+        nodes = [node for node in ast.walk(ast.parse(path.read_bytes())) if isinstance(node, ast.ImportFrom)]
+        names = {each.name for node in nodes if node.module == package for each in node.names}
+        if name in names or any(node.module == module for node in nodes) or path == room / f"test_{name}.py":
+            found.append(path)
+    return [path.relative_to(ROOT).as_posix() for path in found or sorted(room.rglob("test_*.py"))]
+
+
+def is_killed(file, text, tree, marks):
+    """Return True if a test of the file's module fails in the copy `tree` with this text."""
+    (tree / file).write_text(text, encoding="utf-8")
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *marks, *tests_of(file)]
     known = {**os.environ, "PYTHONPATH": str(tree)}
     try:
         return subprocess.run(command, cwd=tree, env=known, capture_output=True, timeout=TIMEOUT).returncode == 1
     except subprocess.TimeoutExpired:
         return True
     finally:
-        shutil.copy(ROOT / mutant.file, tree / mutant.file)
+        shutil.copy(ROOT / file, tree / file)
 
 
-def main() -> None:
-    """Draw mutants, and print the state of each and the share that is killed."""
+def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=150)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--all", action="store_true", help="run the thorough tests, too")
     parser.add_argument("--only", type=int, nargs="*", help="numbers of the mutants to run, from 0")
     given = parser.parse_args()
-    files = [path for room in ROOMS for path in sorted((ROOT / "bstcad" / room).rglob("*.py"))]
-    every = [mutant for path in files for mutant in mutants_of(path.relative_to(ROOT).as_posix())]
-    drawn = random.Random(given.seed).sample(every, given.count)
-    numbers, killed = range(len(drawn)) if given.only is None else given.only, 0
+    paths = [path for room in ROOMS for path in sorted((ROOT / "bstcad" / room).rglob("*.py"))]
+    every = [mutant for path in paths for mutant in mutants_of(path.relative_to(ROOT).as_posix())]
+    drawn, killed = random.Random(given.seed).sample(every, given.count), 0
+    numbers = range(len(drawn)) if given.only is None else given.only
     with tempfile.TemporaryDirectory() as folder:
         for name in COPIED:
-            copied = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
-            copied(ROOT / name, Path(folder, name))
+            (shutil.copytree if (ROOT / name).is_dir() else shutil.copy)(ROOT / name, Path(folder, name))
         for number in numbers:
-            mutant = drawn[number]
-            died = is_killed(mutant, Path(folder), ["-m", "not slow and not bench"] if given.all else [])
+            file, change, text = drawn[number]
+            died = is_killed(file, text, Path(folder), ["-m", "not slow and not bench"] if given.all else [])
             killed, word = killed + died, "killed  " if died else "SURVIVED"
-            print(f"{number:4} {word} {mutant.file}:{mutant.line}  {mutant.before}  ->  {mutant.after}", flush=True)
+            print(f"{number:4} {word} {change}", flush=True)
     print(f"{killed} of {len(numbers)} mutants killed ({len(every)} possible)")
 
 

@@ -16,7 +16,7 @@ CONIC_CONSTANTS = (-1e3, 1e3)  # range of conic constants
 SEARCH_RANGE = 0.999  # fraction of the possible range of a front's sag at the rim that tailoring searches
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Settings:
     """Settings of tailoring, each with its value; scene/quality.py finds those of a scene."""
 
@@ -31,9 +31,9 @@ class Settings:
     stage2_iterations: int  # maximum number of evaluations of the merit in stage 2 or 3
     overshoot: float  # weight of light beside the target, per pixel² of distance
     source_points: int  # number of points that represent an extended source
-    precision: Precision  # precision of the arrays in tailoring
     # two faces and two targets: no rays (convex) or all (concave) cross between them; None: feasibility.py chooses
     solution: Solution | None = None
+    precision: Precision  # precision of the arrays in tailoring
     accuracy: float | None = None  # RRMSD on pixels at which tailoring ends; None: it ends by its other limits
     max_time: float | None = None  # maximum time (s), report included; None: no limit
 

@@ -214,15 +214,15 @@ def sag(surface: Surface, x: Any, y: Any) -> np.ndarray:
 
 def points_on(surface: Surface, x: Any, y: Any) -> np.ndarray:
     """Return the points (…, 3) (mm) of a surface at (x, y) (mm) of its chart, in float64."""
-    return _in_space(surface, surface.plain().at(*_tensors(x, y)).position)
+    position, _ = surface.plain().position_and_normal(*_tensors(x, y))
+    return _in_space(surface, position)
 
 
 def points_and_normals(surface: Surface, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return points (…, 3) (mm) and unit normals (…, 3), along +z or outward, at (x, y) (mm) of the chart."""
-    patch = surface.plain().at(*_tensors(x, y))
-    normal = patch.normal
-    unit = normal / torch.sqrt((normal * normal).sum(0))
-    return _in_space(surface, patch.position), np.moveaxis(unit.numpy(), 0, -1)
+    position, (n_x, n_y, n_z) = surface.plain().position_and_normal(*_tensors(x, y))
+    length = torch.sqrt(n_x * n_x + n_y * n_y + n_z * n_z)
+    return _in_space(surface, position), np.stack([(n / length).numpy() for n in (n_x, n_y, n_z)], axis=-1)
 
 
 def _tensors(x: Any, y: Any) -> tuple[Tensor, Tensor]:
@@ -230,8 +230,8 @@ def _tensors(x: Any, y: Any) -> tuple[Tensor, Tensor]:
     return a, b
 
 
-def _in_space(surface: Surface, position: Tensor) -> np.ndarray:
-    points = np.moveaxis(position.numpy(), 0, -1).copy()
+def _in_space(surface: Surface, position: Vectors) -> np.ndarray:
+    points = np.stack([part.numpy() for part in position], axis=-1)
     points[..., 2] += float(surface.z)
     return points
 
