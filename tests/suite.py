@@ -82,8 +82,12 @@ def samples(count: int, parts: int, bench: int) -> list:
     return [*in_turns(shares, parts), pytest.param(range(bench), id=f"{bench}", marks=pytest.mark.bench)]
 
 
-def pytest_report_header() -> str:
-    return f"daily shares by commit {commit()[:12]}: {', '.join(f'{turn(n) + 1} of {n}' for n in (2, 3, 4))}"
+def pytest_sessionstart(session):
+    """Print the shares; pytest leaves out its header with -q."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if reporter is not None and not hasattr(session.config, "workerinput"):
+        shares = ", ".join(f"{turn(parts) + 1} of {parts}" for parts in range(2, 7))
+        reporter.write_line(f"Shares of the tests that take turns, by commit {commit()[:12]} ({COMMIT}): {shares}")
 
 
 # --- the choice and the order -----------------------------------------------------------------------------------------

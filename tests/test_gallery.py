@@ -11,6 +11,7 @@ import pytest
 import zxingcpp
 
 import bstcad
+from tests import suite
 
 GALLERY = Path(__file__).parent.parent / "docs" / "gallery-scripts"
 WORDS = "https://pypi.org/project/bstcad"
@@ -30,6 +31,7 @@ def chosen_script():
     return scripts[zlib.crc32((commit.stdout or bstcad.__version__).encode()) % len(scripts)]
 
 
+@suite.in_turn(1, 3)
 def test_a_script_of_the_gallery_runs_to_its_end(tmp_path):
     """One of the scripts, which another commit changes, in draft quality; `make docs` runs all."""
     script = chosen_script()

@@ -17,6 +17,7 @@ from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.surfaces import Sphere
 from bstcad.scene.moulding import Moulding
 from bstcad.scene.mount import Mount, Part
+from tests import suite
 from tests.cad.test_dome import dome
 from tests.cad.test_trimming import occ_volume
 
@@ -56,7 +57,7 @@ PARTS = {  # lens, mount, faces that are nets
 
 
 @pytest.mark.parametrize("moulding", [UNIFORM, OF_PART], ids=["uniform", "per axis"])
-@pytest.mark.parametrize("kind", PARTS)
+@pytest.mark.parametrize("kind", suite.in_turns(PARTS, 2))
 def test_the_nets_are_scaled_exactly_and_the_solid_is_valid(kind, moulding, tmp_path):
     make, mount, nets = PARTS[kind]
     made = make()

@@ -22,6 +22,7 @@ from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere
 from bstcad.scene.mount import CircleRim, Flange, Mount, Part
 from bstcad.step_text import part21
 from bstcad.verify import step_checks
+from tests import suite
 from tests.cad.test_trimming import uses, worst_gap
 
 R, INNER = 15.0, 8.0  # mm
@@ -52,7 +53,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", suite.in_turns(CASES, 2))
 def test_the_file_has_the_design_s_control_points_and_a_closed_solid(name, tmp_path):
     lens, path = CASES[name], tmp_path / "dome.step"
     step_writing.write_lens(lens, path, "dome")
@@ -116,7 +117,7 @@ def test_equal_distances_make_a_spherical_shell():
     assert fine == pytest.approx(wanted, rel=5e-4) and (16 * second - first) / 15 == pytest.approx(wanted, rel=1e-6)
 
 
-@pytest.mark.parametrize("name", ["sphere", "conic", "plane", "below the horizon"])
+@pytest.mark.parametrize("name", suite.in_turns(["sphere", "conic", "plane", "below the horizon"], 2))
 def test_the_mesh_is_closed_and_has_the_solid_s_volume(name):
     """The error of a volume falls with the square of the spacing: two meshes give the limit."""
     lens = CASES[name]
@@ -132,7 +133,7 @@ def test_the_mesh_is_closed_and_has_the_solid_s_volume(name):
 
 
 @pytest.mark.bench
-@pytest.mark.parametrize("name", ["sphere", "conic", "plane", "below the horizon"])
+@pytest.mark.parametrize("name", suite.in_turns(["sphere", "conic", "plane", "below the horizon"], 2))
 def test_a_fine_mesh_has_the_solid_s_volume_without_extrapolation(name):
     made = mesh.lens_mesh(CASES[name], 2304)
     assert mesh.volume_and_area(made)[0] == pytest.approx(face_integrals.of_lens(CASES[name]).volume, rel=1e-6)

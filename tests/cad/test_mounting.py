@@ -58,6 +58,7 @@ def test_a_plane_front_and_the_plate_s_lower_face_are_one_face():
     assert lower.Area() == pytest.approx(np.pi * (RADIUS**2 - 0.4**2), rel=1e-9)
 
 
+@suite.in_turn(1, 2)
 @pytest.mark.parametrize("spline", [True, False])
 def test_the_lens_may_be_cut_to_any_wire(spline, tmp_path):
     lens, wire = plate("concave"), stadium(spline)

@@ -19,6 +19,7 @@ from bstcad.optics.surfaces.bspline import knots
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere, sag
 from bstcad.step_text import part21
+from tests import suite
 from tests.cad.test_trimming import occ_volume
 from tests.exact_volume import exact_volume
 from tests.lenses import half_over, lens_of, net
@@ -50,7 +51,7 @@ def outline(request):
     return OUTLINES[request.param]
 
 
-@pytest.fixture(params=[*FRONTS, "net"])
+@pytest.fixture(params=suite.in_turns([*FRONTS, "net"], 2))
 def front(request, outline):
     return given_net(outline) if request.param == "net" else FRONTS[request.param]
 

@@ -220,6 +220,7 @@ def test_a_section_is_the_solid_s(name):
             assert inside == (classified.State() == TopAbs_State.TopAbs_IN), (name, upright, z, along)
 
 
+@suite.in_turn(0, 2)
 def test_the_sheet_is_of_the_part_and_not_of_the_lens_before_it_was_cut():
     """Volume and mass are what OCC integrates over the part; a lens's own are smaller by the flange."""
     made = sheet("a flange")
@@ -296,6 +297,7 @@ def test_each_number_of_a_front_stands_on_the_sheet_and_in_the_prescription():
         assert re.search(rf"^ +{name.rpartition('_')[0].replace('_', ' ')} in {name[-1]} +{value!r}", text, re.M)
 
 
+@suite.in_turn(1, 2)
 def test_the_pdf_is_one_a4_with_its_fonts_and_the_same_twice():
     made = sheet("round, concave")
     pdf = data_sheet.draw(made)

@@ -30,6 +30,7 @@ from bstcad.optics.trace.measure import Effort
 from bstcad.report import record
 from bstcad.scene.picture import Picture, read_picture
 from bstcad.scene.scene import SceneError, load
+from tests import suite
 from tests.conftest import draws_nothing, flat_pictures, verify_with
 from tests.hard_cases import fuzz
 from tests.scenes import DISK, SMALL
@@ -120,7 +121,7 @@ FILES = {  # changes of a file of the folder, and the sentence of the refusal
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("file", FILES)
+@pytest.mark.parametrize("file", suite.in_turns(FILES, 2))
 def test_a_file_that_is_or_claims_or_unfolds_to_gigabytes_is_not_read(quick_folder, refused, file):
     change, sentence = FILES[file]
     change(quick_folder)
@@ -161,7 +162,7 @@ PICTURES = {
 }
 
 
-@pytest.mark.parametrize("picture", PICTURES)
+@pytest.mark.parametrize("picture", suite.in_turns(PICTURES, 2))
 def test_a_picture_that_claims_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, picture, refused):
     make, sentence = PICTURES[picture]
     (tmp_path / "p").write_bytes(make())
@@ -205,7 +206,7 @@ NO_FILES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("kind", "name"), NO_FILES)
+@pytest.mark.parametrize(("kind", "name"), suite.in_turns(NO_FILES, 2))
 def test_what_is_no_file_is_one_sentence_or_left_out(quick_folder, kind, name):
     """A pipe does not end; /dev/zero neither; some of /proc cannot be read, though they say they are files."""
     path = quick_folder / name

@@ -72,6 +72,7 @@ def test_sunlight_parts_over_all_that_is_seen():
     assert 20 < sun.blur_pixels / laser.blur_pixels < 60 and sun.rrmsd_change > 10 * laser.rrmsd_change
 
 
+@suite.in_turn(0, 2)
 def test_lines_that_stand_for_a_lamp_are_told_from_a_continuous_spectrum():
     """A lens that is tailored for two lines far apart has another picture at wavelengths between them, by new rays."""
     lines = {"source.wavelength": [[500.0, 1.0], [650.0, 1.0]], "lens.material": "PMMA", "lens.index": None}

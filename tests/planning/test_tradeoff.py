@@ -15,6 +15,7 @@ from bstcad.planning.results import TRADEOFF_COLUMNS
 from bstcad.planning.tradeoff import SAFETY_FACTOR, knobs, run_order
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.scene.scene import load
+from tests import suite
 from tests.planning.conftest import REFUSED, Synthetic, record
 
 FILES = ("tradeoff.csv", "tradeoff.json", "tradeoff.html", "tradeoff.png")
@@ -86,6 +87,7 @@ class TestKnobs:
 
 
 class TestBudget:
+    @suite.in_turn(0, 2)
     def test_it_is_kept_and_the_runs_that_did_not_fit_are_told(self, tiny, tmp_path):
         found = sweep(tiny, tmp_path / "s", 200.0)
         assert 150 < found.spent_seconds <= 200 and len(found.not_run) > 3
@@ -108,6 +110,7 @@ class TestBudget:
 
 
 class TestResume:
+    @suite.in_turn(1, 2)
     def test_an_interrupted_sweep_goes_on_and_ends_with_the_same_table(self, tiny, tmp_path):
         whole, parts = tmp_path / "whole", tmp_path / "parts"
         sweep(tiny, whole, 400.0)

@@ -16,6 +16,7 @@ from bstcad.report import prescription as order
 from bstcad.report.record import of_json
 from bstcad.report.report import first_figures, html
 from bstcad.scene.scene import load
+from tests import suite
 from tests.exports.test_data_sheet import lens_of, scene_of, sheet
 from tests.report.test_report import CONTENTS
 from tests.scenes import DISK
@@ -160,7 +161,7 @@ FACTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("made", "facts"), FACTS)
+@pytest.mark.parametrize(("made", "facts"), suite.in_turns(FACTS, 2))
 def test_the_facts_of_a_part(made, facts):
     found = order.part(plate(**made))
     assert {name: found[name] for name in facts} == facts

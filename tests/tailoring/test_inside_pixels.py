@@ -20,6 +20,7 @@ from bstcad.optics.receivers.irradiance import CellTarget, picture_error
 from bstcad.optics.trace.measure import Effort, measure_goals
 from bstcad.scene.scene import Scene, load
 from bstcad.tailoring import folds, stage2
+from tests import suite
 
 EVEN = """
 name = "even"
@@ -62,13 +63,14 @@ def lit(scene):
     return made.goals[0], light, {each.cell: each.rrmsd for each in light.by_cell}
 
 
-@pytest.mark.parametrize("receiver", RECEIVERS)
+@pytest.mark.parametrize("receiver", suite.in_turns(RECEIVERS, 2))
 def test_an_even_rectangle_is_even_inside_its_pixels(receiver):
     _, _, by_cell = lit(even(RECEIVERS[receiver]))
     assert by_cell[0.5] < 0.06  # most of it at the soft edges; 0.26 by pixels alone
     assert by_cell[0.25] < 0.12  # 0.44 by pixels alone
 
 
+@suite.in_turn(0, 3)
 def test_letters_are_right_inside_their_pixels_and_would_not_be_by_pixels_alone(monkeypatch):
     scene = load("templates/thu.toml", LETTERS)
     _, _, by_cell = lit(scene)

@@ -9,6 +9,7 @@ from bstcad.designs import folder as folders
 from bstcad.manufacture.measured import made_part
 from bstcad.manufacture.measured.alignment import BackFace, align, identity_pose
 from bstcad.manufacture.measured.form_error import fit_form_error
+from tests import suite
 from tests.conftest import quick_effort
 from tests.manufacture.measured.synthetic import points, with_form_error
 
@@ -35,6 +36,7 @@ def figures(nominal, seeds, noise):
     return np.array(found).T
 
 
+@suite.in_turn(2, 3)
 def test_the_true_light_lies_within_two_uncertainties(nominal):
     """Three of four parts, with 50 nm of noise; 1 µm of noise leaves the light unknown, and the figure says so."""
     true, predicted, uncertainty = figures(nominal, range(4), 5e-5)

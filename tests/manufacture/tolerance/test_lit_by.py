@@ -10,6 +10,7 @@ from bstcad import cli
 from bstcad.manufacture.tolerance.lit_by import LIGHTS, lit_by, scene_lit_by
 from bstcad.optics.trace.measure import Effort, measure
 from bstcad.scene.errors import SceneError
+from tests import suite
 
 PLATE = {
     "name": "plate", "source": {
@@ -37,7 +38,7 @@ def test_the_light_of_the_design_changes_nothing(plate):
     assert found.distance is None and found.facts()["goals"][0]["rrmsd"] == goal.rrmsds[1]
 
 
-@pytest.mark.parametrize("distance", [60.0, 500.0])
+@pytest.mark.parametrize("distance", suite.in_turns([60.0, 500.0], 2))
 def test_another_light_is_that_of_its_rays(plate, distance):
     """The picture of a phone's light by tubes and a blur, against rays from points of the light."""
     found = plate.lit_by("phone", distance=distance)
@@ -72,6 +73,7 @@ def test_a_mirror_is_lit_from_above():
         assert goal.lit.any(), name
 
 
+@suite.in_turn(0, 2)
 def test_a_plan_tells_it_and_draws_it(tmp_path, capsys, monkeypatch):
     from tests.planning.conftest import typical_pilot
 
