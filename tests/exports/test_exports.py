@@ -23,6 +23,7 @@ from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Sphere, sag
 from bstcad.runs import files
 from bstcad.scene.mount import Box, CircleRim, Flange, Mount, Screws
+from tests import suite
 
 RECTANGLE, CIRCLE = Rectangle(8.0, 6.0), Circle(3.0)
 
@@ -107,6 +108,7 @@ def test_normals_point_out_of_the_lens_and_stand_on_the_face(side):
         assert np.abs(along[inner]).max() < 1e-7 * step * 1e3
 
 
+@suite.in_turn(1, 2)
 def test_the_command_and_the_scene_write_every_kind_and_the_design_still_proves(small_design, tmp_path, capsys):
     folder = shutil.copytree(small_design.folder, tmp_path / "copy")  # which other tests look at
     kinds = list(files.EXPORTS)

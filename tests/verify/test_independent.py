@@ -8,6 +8,7 @@ import torch
 
 from bstcad.optics.receivers import goal
 from bstcad.optics.receivers.irradiance import joined_cells
+from tests import suite
 from tests.benchmarks.independent import faces, interpolated, joined, judge, net_of, paired
 from tests.benchmarks.judged_cells import finer_targets, stated_by_cell
 
@@ -20,6 +21,7 @@ def judged(small_design):
     return judge(small_design.folder, points=1 << 18, finer_targets=finer_targets(small_design.folder)[0])
 
 
+@suite.in_turn(1, 2)
 def test_a_design_states_the_rrmsd_of_an_independent_monte_carlo(small_design, judged):
     stated = small_design.report
     error = math.hypot(stated["rrmsd_noise"], judged.error)
