@@ -12,7 +12,7 @@
 #              docs/published.md; ONLY= as above, and SUN_PICTURE= the path of diffinytrace's examples/img1.jpg
 # make effects what each effect costs, into docs/effects.md
 # make stability   the hard cases, those of make bench too, and what they measured, into docs/stability.md
-# make docs    the documentation, into docs/_build/html: its tutorials and gallery run, some five minutes
+# make docs    the documentation, into docs/_build/html: its tutorials and gallery run, eight minutes
 # make wheel   the documentation, and with it the wheel and the source distribution, into dist
 # make lint    ruff and mypy
 #
