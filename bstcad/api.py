@@ -38,6 +38,7 @@ from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.sides import as_pair, simplified, size_text
 from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.optics.trace.measure import Effort, tubes_picture
+from bstcad.planning.net_choice import with_net
 from bstcad.report import record
 from bstcad.report.record import Report, rrmsds
 from bstcad.report.units import number, quantity
@@ -76,7 +77,7 @@ def design(
         warnings.warn(warning, stacklevel=2)
     processes.keep_freed()
     with progresses.for_script(progress) as shown:
-        scene = commands.with_default_net(scene, lambda line: shown("control points", 1, 1, line))
+        scene, _ = with_net(scene, lambda line: shown("control points", 1, 1, line))
         hooks, options = Hooks(progress=shown), pipeline.DesignOptions(merit, compare_later=True)
         return Design(pipeline.design(scene, device=device, hooks=hooks, options=options, began=began))
 
@@ -367,8 +368,7 @@ class Design:
         """
         from bstcad.manufacture.tolerance.as_made import as_made  # loaded late, as in commands.tolerance
 
-        made = self._made
-        return as_made(made.scene, made.lens, made.goals, grade=grade, layer_height=layer_height)
+        return as_made(self._made, grade, layer_height)
 
     def lit_by(self, light: str, *, distance: float | None = None) -> LitBy:
         """Predict the pictures of the lens in another light: "sun", "lamp", "led" or "phone" (the flashlight of one).
@@ -378,7 +378,7 @@ class Design:
         """
         from bstcad.manufacture.tolerance.lit_by import lit_by  # loaded late, as in commands.tolerance
 
-        return lit_by(self._made.scene, self._made.lens, self._made.goals, name=light, distance=distance)
+        return lit_by(self._made, light, distance)
 
     def show(self, png: AnyPath | None = None) -> None:
         """Draw the lens with rays and screen in the file `png` or, if None, in a window; return once it is closed."""
@@ -408,7 +408,7 @@ class Design:
         """Return the folder with the files of this design; SceneError if there is none."""
         if self.folder is None or not self._has_files():
             raise SceneError(f"{self.scene.name}: this design has no files yet; write it to a folder first")
-        if not self._made.is_lens_of(folders.read_nominal(self.folder)[1]):
+        if not self._made.is_lens_of(folders.read_nominal(self.folder)):
             raise SceneError(f"{self.folder}: the folder now contains another design; write this one elsewhere")
         return self.folder
 

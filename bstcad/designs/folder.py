@@ -336,7 +336,7 @@ def _spare_folders(folder: Path) -> Iterator[Path]:
 
 def _contains(folder: Path, design: Made) -> bool:
     try:
-        _, nominal = read_nominal(folder)
+        nominal = read_nominal(folder)
     except Exception:  # zipfile and numpy raise various errors for a damaged file
         return False
     return design.is_lens_of(nominal)
@@ -345,8 +345,8 @@ def _contains(folder: Path, design: Made) -> bool:
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
-def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
-    """Return scene and nominal design of a folder.  SceneError if design.npz or scene.toml is missing or damaged."""
+def read_nominal(folder: Path) -> Nominal:
+    """Return the nominal design of a folder.  SceneError if design.npz or scene.toml is missing or damaged."""
     scene = scenes.load(folder / SCENE)
     shapes: dict[str, tuple[int, ...]] = {"control_points": (*as_pair(scene.lens.back.net), 3), "front_curvature": ()}
     if scene.lens.front.is_tailored:
@@ -370,7 +370,7 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
         lit.append((found.get(numbered("irradiance", k)), float(found.get(numbered(ERROR, k), math.nan))))
         if not stored[k].sum() > 0 or not goals[k].picture.sum() > 0:
             raise SceneError(f"{folder / DESIGN}: the picture of {goal.key} is all black; {REMEDY}")
-    return scene, Nominal(scene, _lens(scene, found), tuple(goals), stored=tuple(stored), lit=tuple(lit))
+    return Nominal(scene, _lens(scene, found), tuple(goals), stored=tuple(stored), lit=tuple(lit))
 
 
 def read_irradiances(folder: Path, scene: scenes.Scene) -> tuple[np.ndarray, ...]:

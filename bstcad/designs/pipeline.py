@@ -26,6 +26,7 @@ from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.surfaces.sides import as_pair
 from bstcad.optics.trace.reach import MAX_EXIT_ANGLE, grazing_of, spread_at, unreached
 from bstcad.runs import processes
+from bstcad.scene.blank import LensBlank
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import effort as efforts
@@ -399,7 +400,7 @@ def _stage1(
             lens = place_back(lens, lens.back.z, task.min_thickness, bounds)
         lens = enforce_bounds(lens, bounds)
         check_thickness(lens, scene)
-        rrmsd = require_bounded_light(scene, task.rrmsd(lens))
+        rrmsd = require_bounded_light(scene.lens, task.rrmsd(lens))
         driver.end(f"{BOUNDS_STAGE}, after stage 1", rrmsd)
     precision = None
     if compare and not driver.reason_to_end:
@@ -534,12 +535,12 @@ def require_light(lens: Lens, rrmsd: float) -> float:
     return rrmsd
 
 
-def require_bounded_light(scene: Scene, rrmsd: float) -> float:
+def require_bounded_light(blank: LensBlank, rrmsd: float) -> float:
     """Return the RRMSD of the first lens within its bounds; SceneError if it sends no light to the target."""
     if math.isfinite(rrmsd):
         return rrmsd
-    keys = scene.lens.bounded_by or ("min_thickness",)
-    bounds = " and ".join(f"lens.{key} = {getattr(scene.lens, key):g}" for key in keys)
+    keys = blank.bounded_by or ("min_thickness",)
+    bounds = " and ".join(f"lens.{key} = {getattr(blank, key):g}" for key in keys)
     raise SceneError(f"{bounds}: no lens within these bounds sends light to the target; relax a bound")
 
 

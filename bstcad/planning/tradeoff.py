@@ -41,6 +41,7 @@ from bstcad.runs.cluster import Answer, Machines
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import PRESETS
 from bstcad.scene.scene import Scene
+from bstcad.scene.target import Target
 from bstcad.tailoring.driver import Progress, no_progress
 
 # --- knobs ------------------------------------------------------------------------------------------------------------
@@ -66,9 +67,9 @@ class Knob:
     combines: bool = False  # True if the knob varies two other knobs together
 
 
-def other_seed(scene: Scene, point: Settings) -> Settings:
-    """Return the settings `point`, but with the seed of the scene plus one."""
-    return sorted_settings({**dict(point), "tailoring.seed": scene.tailoring.seed + 1})
+def other_seed(seed: int, point: Settings) -> Settings:
+    """Return the settings `point`, but with the seed of the scene, `seed`, plus one."""
+    return sorted_settings({**dict(point), "tailoring.seed": seed + 1})
 
 
 def describe(point: Settings) -> str:
@@ -181,7 +182,7 @@ def _joint_points(*varied: tuple[str, Any, Sequence[float]]) -> Points:
 # --- order of the runs ------------------------------------------------------------------------------------------------
 
 
-def run_order(scene: Scene, knobs: Sequence[Knob]) -> list[Settings]:
+def run_order(seed: int, knobs: Sequence[Knob]) -> list[Settings]:
     """Return all runs, the most important first, so that any budget gives the most useful runs.
 
     First come the preset draft, the base and the preset standard, then neighbours of the base, fast runs with another
@@ -195,7 +196,7 @@ def run_order(scene: Scene, knobs: Sequence[Knob]) -> list[Settings]:
     def neighbours(varied: Iterable[Knob], *distances: int) -> list[Settings]:
         return [point for steps in distances for knob in varied for point in _neighbour(knob, steps) if point != paper]
 
-    repeated = [other for _, other in _probes(scene, knobs).values()]
+    repeated = [other for _, other in _probes(seed, knobs).values()]
     order = [presets.get("draft", ()), (), presets.get("standard", ()), *neighbours(single, -1), *repeated]
     order += [*neighbours(joint, -1), *neighbours(single, +1), presets.get("fine", ()), *neighbours(joint, +1)]
     order += [*neighbours(single, -2, -3, -4), *neighbours(knobs[1:], 2, -2, 3, -3, 4, -4), paper]
@@ -212,18 +213,18 @@ def _neighbour(knob: Knob, steps: int) -> list[Settings]:
     return points[start + steps : start + steps + 1] if start + steps >= 0 else []
 
 
-def _probes(scene: Scene, knobs: Sequence[Knob]) -> dict[str, tuple[Settings, Settings]]:
+def _probes(seed: int, knobs: Sequence[Knob]) -> dict[str, tuple[Settings, Settings]]:
     """Return for each method the settings of a fast run, and these settings with another seed."""
     by_key = {knob.key: knob.points for knob in knobs}
     quick = {"least-squares": by_key["quality"].get("draft"), "adam": next(iter(by_key.get("adam", {}).values()), None)}
-    return {method: (point, other_seed(scene, point)) for method, point in quick.items() if point is not None}
+    return {method: (point, other_seed(seed, point)) for method, point in quick.items() if point is not None}
 
 
-def seed_matters(scene: Scene, knobs: Sequence[Knob], runs: Mapping[Settings, ColdRun]) -> dict[str, bool | None]:
+def seed_matters(seed: int, knobs: Sequence[Knob], runs: Mapping[Settings, ColdRun]) -> dict[str, bool | None]:
     """Return for each method True if another seed gives another lens; None: not measured."""
     nets = {
         method: [runs[point].net for point in pair if point in runs and runs[point].done]
-        for method, pair in _probes(scene, knobs).items()
+        for method, pair in _probes(seed, knobs).items()
     }
     return {method: pair[0] != pair[1] if len(pair) == 2 else None for method, pair in nets.items()}
 
@@ -298,7 +299,7 @@ class _Sweep:
     def __init__(self, base: Scene, budget: float, folder: Path, progress: Progress) -> None:
         self._base, self._budget, self._folder, self._progress = base, budget, folder, progress
         self._knobs = knobs(base)
-        self._order, self._work = run_order(base, self._knobs), cache(partial(predicted_work, base))
+        self._order, self._work = run_order(base.tailoring.seed, self._knobs), cache(partial(predicted_work, base))
         self._under_way: dict[Settings, tuple[float, float]] = {}  # (start time, predicted seconds) of current runs
         self._file = folder / "runs" / f"{environment.version()}.json"
         self.runs: dict[Settings, ColdRun] = {}  # runs that have ended
@@ -401,7 +402,7 @@ def predicted_work(scene: Scene, point: Settings) -> tuple[bool, float]:
 
 def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: float = math.inf) -> TradeoffTable:
     """Return the table of a sweep.  runs: ended runs, then runs not done, both in order of importance; budget in s."""
-    own, best = scene.lens.back.net, pareto_front(runs)
+    own, seed, best = scene.lens.back.net, scene.tailoring.seed, pareto_front(runs)
     comparable = {run.settings: run for run in runs if run.comparable}
     selected = comparable or {run.settings: run for run in runs if run.done}
     sample = selected.get(()) or next(iter(selected.values()), None)  # states the machine of all runs
@@ -429,12 +430,12 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
         versions=sample.versions if sample else {},
         reference={
             "rays": sorted({run.rays for run in runs if run.rays}),
-            "what": REFERENCE_TEXT.format(cold_run.REFERENCE_EFFORT.accuracy, _judged_on(scene)),
+            "what": REFERENCE_TEXT.format(cold_run.REFERENCE_EFFORT.accuracy, _judged_on(scene.targets)),
         },
         calibration=Calibration.of(unit),
         runs=tuple(map(described, runs)),
         knobs=tuple(
-            TableKnob(key=knob.key, title=knob.title, places=knob_points(scene, knob, selected, timed=bool(comparable)))
+            TableKnob(key=knob.key, title=knob.title, places=knob_points(seed, knob, selected, timed=bool(comparable)))
             for knob in knobs
         ),
         front=on_front,
@@ -442,24 +443,22 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
         presets=tuple(
             Preset(name=name, seconds=t if comparable else None, rrmsd=e) for name, (t, e) in presets.items()
         ),
-        seeds=seed_matters(scene, knobs, {run.settings: run for run in runs}),
+        seeds=seed_matters(seed, knobs, {run.settings: run for run in runs}),
         history=comparable[()].history if () in comparable else (),
     )
 
 
-def _judged_on(scene: Scene) -> str:
+def _judged_on(targets: Sequence[Target]) -> str:
     """Return, in words, the target pixels on which RRMSDs are measured, such as "64 x 48"."""
-    sizes = " and ".join("{} x {}".format(*target.columns_rows) for target in scene.targets)
-    return f"the target with the largest RRMSD, of {sizes}" if len(scene.targets) > 1 else sizes
+    sizes = " and ".join("{} x {}".format(*target.columns_rows) for target in targets)
+    return f"the target with the largest RRMSD, of {sizes}" if len(targets) > 1 else sizes
 
 
-def knob_points(
-    scene: Scene, knob: Knob, runs: Mapping[Settings, ColdRun], timed: bool = True
-) -> tuple[KnobPoint, ...]:
+def knob_points(seed: int, knob: Knob, runs: Mapping[Settings, ColdRun], timed: bool = True) -> tuple[KnobPoint, ...]:
     """Return the points of a knob that were run, as medians over the seeds; timed: True if times are comparable."""
     averages = []
     for label, point in knob.points.items():
-        if done := [runs[each] for each in (point, other_seed(scene, point)) if each in runs and runs[each].done]:
+        if done := [runs[each] for each in (point, other_seed(seed, point)) if each in runs and runs[each].done]:
             times, errors = zip(*(run.time_and_error for run in done), strict=True)
             seconds = statistics.median(times) if timed else None
             middle: dict[str, Any] = {"seconds": seconds, "rrmsd": statistics.median(errors)}
@@ -480,5 +479,5 @@ def _labels(scene: Scene, knobs: Sequence[Knob]) -> dict[Settings, str]:
         for label, point in knob.points.items():
             name = label if knob.key == "quality" else f"{knob.title}: {label}"
             labels.setdefault(point, name)
-            labels.setdefault(other_seed(scene, point), f"{name}, seed {scene.tailoring.seed + 1}")
+            labels.setdefault(other_seed(scene.tailoring.seed, point), f"{name}, seed {scene.tailoring.seed + 1}")
     return labels

@@ -114,7 +114,7 @@ def tiny():
 def runs():
     """The runs of a sweep: presets, neighbours, and one that was stopped at its limit."""
     scene = tiny()
-    points = tradeoff.run_order(scene, tradeoff.knobs(scene))[:4]
+    points = tradeoff.run_order(scene.tailoring.seed, tradeoff.knobs(scene))[:4]
     found = [run_of(scene, point).model_copy(update={"allowed_seconds": 30.0}) for point in points]
     return tradeoff.RunFile(runs=tuple(found)).model_dump_json(indent=1).encode()
 
@@ -134,7 +134,7 @@ def read_sweep(path):
 def read_rounds(path):
     """The rounds of a design, as the next round and the production page read them."""
     folder = path.parents[2]
-    return rounds._last(folder, folders.read_nominal(folder)[1].lens), production.rounds_in(folder)
+    return rounds._last(folder, folders.read_nominal(folder).lens), production.rounds_in(folder)
 
 
 def round_in(path):

@@ -25,6 +25,7 @@ from bstcad.optics.surfaces.bspline import BSplineSurface, interpolating_net, is
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.optics.surfaces.surfaces import Plane, sag
 from bstcad.scene.blank import INDEX_OFFSETS
+from bstcad.scene.dome_back import RadialBack
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import FIT_SIZES, FileNet, NetFront, fit_net, net_extent
 from bstcad.scene.scene import Scene
@@ -84,10 +85,11 @@ def retailor(made: Made, built: AsBuilt, hooks: Hooks = NO_HOOKS) -> Retailored:
     """Return the design for a blank as built, from an earlier design; SceneError if a value does not suit the scene."""
     scene, shift = as_built(made, built)
     old = replace(made.lens.plain(), index=made.heaviest.index, losses=None)
-    earlier = Earlier(old, _moved(made.lens, scene, shift), made.transport)
+    flat = scene.flat_lens(scene.lens.back.net)
+    earlier = Earlier(old, _moved(made.lens, flat, shift, scene.lens.dome), made.transport)
     options = DesignOptions(compare_later=True, earlier=earlier)
     found = design(scene, device=made.device, hooks=hooks, options=options)
-    before = earlier.parameters.apply_to(scene.flat_lens(scene.lens.back.net))
+    before = earlier.parameters.apply_to(flat)
     states = (made, made.lens), (found, scene.as_mounted(replace(before.plain(), index=scene.index)))
     rays = efforts.FULL.between_stages(made.goals, RAYS)
     rrmsds = (max(light.rrmsd for light in of.lights(lens, of.goals, rays)) for of, lens in states)
@@ -163,9 +165,12 @@ def _sampled(nominal: BSplineSurface, form: Any, outline: Outline, side: int) ->
     return BSplineSurface(0.0, net, (-half_x, half_x), (-half_y, half_y))
 
 
-def _moved(lens: Lens, scene: Scene, shift: float) -> Parameters:
-    """Return the parameters of a lens, its back moved by a shift (mm), for the blank of a scene."""
-    old, flat, dome = Parameters.of(lens), scene.flat_lens(scene.lens.back.net), scene.lens.dome
+def _moved(lens: Lens, flat: Lens, shift: float, dome: RadialBack | None) -> Parameters:
+    """Return the parameters of a lens, its back moved by a shift (mm), for the lens `flat` before tailoring.
+
+    dome: back of the scene if it is a dome.
+    """
+    old = Parameters.of(lens)
     every: tuple[Face, ...] = ("front", "back")
     faces = [face for face in every if lens.is_tailored(face)]
     nets = {face: old.nets[lens.tailored_numbers.index(lens.number_of(face))] for face in faces}
