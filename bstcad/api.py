@@ -27,7 +27,7 @@ from bstcad.commands import OwnCheck, OwnSection, ProofOptions
 from bstcad.designs import folder as folders
 from bstcad.designs import pipeline
 from bstcad.designs.course import BY_HAND, DesignCourse
-from bstcad.designs.made import Made, same_front
+from bstcad.designs.designed_lens import DesignedLens, same_front
 from bstcad.figures.drawing import png
 from bstcad.figures.light_figures import View, irradiance_triptych
 from bstcad.manufacture.measured.compensation import CompensationSettings as CompensationSettings
@@ -101,7 +101,7 @@ class Design:
     `verify` reads the files of the folder to which the design was last written, or from which it was opened.
     """
 
-    def __init__(self, made: Made, report: Report | None = None, folder: Path | None = None) -> None:
+    def __init__(self, made: DesignedLens, report: Report | None = None, folder: Path | None = None) -> None:
         self._made = made
         self.report = report  # report of the last verification; None: not verified yet
         self.folder = folder  # folder of the design's files; None: not written yet
@@ -141,7 +141,7 @@ class Design:
         """
         self.scene.lens.require_heights("with_lens")
         scene, lens = _adapted(lens, self._made.scene, self.lens.front)
-        made = replace(self._made, scene=scene, lens=scene.as_mounted(lens), making=DesignCourse(stopped=BY_HAND))
+        made = replace(self._made, scene=scene, lens=scene.as_mounted(lens), course=DesignCourse(stopped=BY_HAND))
         return Design(replace(made, transport=None, precision_comparison=None))
 
     def with_heights(self, heights: Any) -> Design:
@@ -441,9 +441,9 @@ class Design:
         if self.report is not None:
             where = f", in {self.folder}" if self.folder else ""
             return f"RRMSD {rrmsds(self.report.contents)}, {self.report.verdict}{where}"
-        if self._made.making.stopped == BY_HAND:
+        if self._made.course.stopped == BY_HAND:
             return "changed by hand; not verified yet"
-        values = [stage.rrmsd for stage in self._made.making.stages if stage.rrmsd is not None]
+        values = [stage.rrmsd for stage in self._made.course.stages if stage.rrmsd is not None]
         return f"RRMSD {number(values[-1])} as tailored; not verified yet" if values else "not verified yet"
 
     def _irradiance(self, number: int = 0) -> np.ndarray:

@@ -28,7 +28,7 @@ from bstcad.cad.tiling import Tiling
 from bstcad.designs import folder as folders
 from bstcad.designs.as_designed import scene_text
 from bstcad.designs.course import StageRecord
-from bstcad.designs.made import Made
+from bstcad.designs.designed_lens import DesignedLens
 from bstcad.designs.pipeline import DesignState, design, purpose
 from bstcad.exports import data_sheet, exports
 from bstcad.exports.data_sheet import DataSheet
@@ -138,8 +138,8 @@ def generate(
                 found = design(scene, device=device, hooks=hooks, began=began, start=state)
         with _checkpoint_on_error(keeper):
             options = replace(options, limit=scene.tailoring.max_time)
-            report = write(found, output_folder(folder, found.making.stopped or ""), options, hooks.progress)
-        if found.making.stopped == "interrupt":
+            report = write(found, output_folder(folder, found.course.stopped or ""), options, hooks.progress)
+        if found.course.stopped == "interrupt":
             keeper.flush()
         else:
             keeper.remove()
@@ -153,13 +153,15 @@ def output_folder(folder: Path, stopped: str) -> Path:
     """
     if stopped != "interrupt" or not (folder / "report.json").exists():
         return folder
-    if record.making(folder / "report.json").stopped == "interrupt":
+    if record.read_course(folder / "report.json").stopped == "interrupt":
         return folder
     folder = folder.resolve()
     return folder.with_name(f"{folder.name}-unfinished")
 
 
-def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), progress: Progress = no_progress) -> Report:
+def write(
+    made: DesignedLens, folder: Path, options: ProofOptions = ProofOptions(), progress: Progress = no_progress
+) -> Report:
     """Write a design to `folder`, replacing an earlier design, and verify the written files.
 
     If it cannot be written or verified, a note on the error names another folder with its design.npz and scene.
@@ -183,7 +185,7 @@ def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), prog
         progress("report", 0, 1, "")
         estimates = _left_out(made, proof)  # while the second process draws the pictures
         drawn.result()
-        made = replace(made, making=made.making.with_stages(StageRecord("report", time.perf_counter() - proven)))
+        made = replace(made, course=made.course.with_stages(StageRecord("report", time.perf_counter() - proven)))
         contents = replace(record.with_failures(_contents(made, proof, estimates), exported.failures), order=order)
         drawn.begin(draw_convergence, contents)
         _write_report(made, proof.lens, contents, building, drawn=drawn, options=options)
@@ -192,7 +194,7 @@ def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), prog
     return Report(contents, irradiances, notes=tuple(exported.notes))
 
 
-def prove(made: Made, options: ProofOptions = ProofOptions(), progress: Progress = no_progress) -> Report:
+def prove(made: DesignedLens, options: ProofOptions = ProofOptions(), progress: Progress = no_progress) -> Report:
     """Write a design to a temporary folder, verify these files, and return the report."""
     processes.begin()
     with tempfile.TemporaryDirectory(prefix="bstcad-") as folder, _second_process_ended():
@@ -203,8 +205,8 @@ def prove(made: Made, options: ProofOptions = ProofOptions(), progress: Progress
 
 
 def _write_and_prove(
-    made: Made, folder: Path, drawn: Pictures, options: ProofOptions, progress: Progress
-) -> tuple[Made, Proof]:
+    made: DesignedLens, folder: Path, drawn: Pictures, options: ProofOptions, progress: Progress
+) -> tuple[DesignedLens, Proof]:
     """Write the geometry to `folder` and verify it; return (design with the times of both stages, its proof)."""
     made = replace(made.with_report_data(), stored=None, lit=())  # design.npz is written again
     processes.return_freed()  # the second process needs the memory for the solid
@@ -219,7 +221,7 @@ def _write_and_prove(
         progress("write", 1, 1, "")
         written = time.perf_counter()
         if options.limit is not None:
-            left = options.limit - REPORT_TIME - made.making.seconds_total - (written - began)
+            left = options.limit - REPORT_TIME - made.course.seconds_total - (written - began)
             effort = options.effort or FULL
             options = replace(options, effort=replace(effort, seconds=min(effort.seconds, max(left, MIN_RAY_TIME))))
         proof = _prove_files(made, folder, drawn, options, progress=progress)
@@ -231,10 +233,10 @@ def _write_and_prove(
         StageRecord("write", written - began),
         StageRecord("verify", verified - written, max(light.rrmsd for light in proof.lights)),
     )
-    return replace(made, making=made.making.with_stages(*last)), proof
+    return replace(made, course=made.course.with_stages(*last)), proof
 
 
-def _prove_files(made: Made, folder: Path, drawn: Pictures, options: ProofOptions, progress: Progress) -> Proof:
+def _prove_files(made: DesignedLens, folder: Path, drawn: Pictures, options: ProofOptions, progress: Progress) -> Proof:
     """Verify the files in a folder and start drawing the pictures of the light; return the proof."""
     progress("verify", 0, 1, "from the written files")
 
@@ -404,11 +406,11 @@ def examine(path: Path) -> Examined:
     return Examined(path.stem, str(path), words, passed, checks=found.checks, part=rows, placement=placement)
 
 
-def read(folder: Path) -> Made:
+def read(folder: Path) -> DesignedLens:
     """Read the design in a folder, with the stages and history of its making from report.json."""
     found = folders.read_nominal(folder)
-    making, sent = record.making(folder / "report.json"), folders.read_transport(folder, found.scene)
-    return Made(found.scene, found.lens, found.goals, making, transport=sent, stored=found.stored, lit=found.lit)
+    course, sent = record.read_course(folder / "report.json"), folders.read_transport(folder, found.scene)
+    return DesignedLens(**vars(found), course=course, transport=sent)
 
 
 def _name_of(cloud: Cloud, folder: Path) -> str:
@@ -427,22 +429,22 @@ def _name_of(cloud: Cloud, folder: Path) -> str:
 # --- the report -------------------------------------------------------------------------------------------------------
 
 
-def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Contents:
+def _contents(made: DesignedLens, proof: Proof, estimates: tuple[LeftOut, ...]) -> Contents:
     """Return the contents of report.json.  estimates: estimates of the neglected effects."""
     scene = made.scene
     alone, goal = scene.single_target_scenes()[proof.worst], made.goals[proof.worst]
-    diagnosed, facts = diagnosis(alone, made.making, proof, goal.picture), circumstances(made.device)
+    diagnosed, facts = diagnosis(alone, made.course, proof, goal.picture), circumstances(made.device)
     return contents_of(
-        made, proof, making=made.making, circumstances=facts, simulated=[name for name, _ in simulated(scene)],
+        made, proof, course=made.course, circumstances=facts, simulated=[name for name, _ in simulated(scene)],
         estimates=estimates, diagnosis=diagnosed,
     )  # fmt: skip
 
 
-def _left_out(made: Made, proof: Proof) -> tuple[LeftOut, ...]:
+def _left_out(made: DesignedLens, proof: Proof) -> tuple[LeftOut, ...]:
     return left_out(made.scene.single_target_scenes()[proof.worst], proof.lens, proof.light.picture)
 
 
-def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
+def _order(made: DesignedLens, shape: Mapping[str, Any], folder: Path) -> Order:
     """Return the data for ordering the lens of a design in a folder.  shape: shape of the lens as in report.json."""
     scene, mount, path = made.scene, made.scene.mount, (folder / folders.PART).absolute()
     try:
@@ -455,7 +457,7 @@ def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
 
 
 def _sheet(
-    made: Made, proof: Proof | Contents, figures: Sequence[GoalFigures], irradiance: np.ndarray, *, order: Order
+    made: DesignedLens, proof: Proof | Contents, figures: Sequence[GoalFigures], irradiance: np.ndarray, *, order: Order
 ) -> DataSheet:
     """Return the data sheet of a design from its proof or report; irradiance: light on the first target."""
     light: dict[str, Any] = {"target": made.goals[0].picture, "irradiance": irradiance, "figures": figures}
@@ -470,8 +472,9 @@ def _sheet(
 
 
 def _write_report(
-    made: Made, lens: Lens, contents: Contents, folder: Path, drawn: Pictures, options: ProofOptions, studied: str = ""
-) -> None:
+    made: DesignedLens, lens: Lens, contents: Contents, folder: Path, *, drawn: Pictures, options: ProofOptions,
+    studied: str = "",
+) -> None:  # fmt: skip
     """Write the report as JSON, HTML and JUnit XML, with prescription.txt and figures/.
 
     lens: lens as read from lens.step.  studied: HTML of the report's section on tolerances.
@@ -598,7 +601,7 @@ def _cutting(settings: Mapping[str, Any]) -> Cutting:
     return Cutting(**settings)
 
 
-def _export_of_scene(made: Made, folder: Path) -> Exported:
+def _export_of_scene(made: DesignedLens, folder: Path) -> Exported:
     """Write the files of output.export that are possible for this lens; a remark of the report states the others."""
     return _export(made, made.scene.output.export, folder, strict=False)
 
@@ -623,7 +626,7 @@ def _cutting_of(scene: Scene, kinds: Sequence[str], cutting: Cutting = DEFAULTS)
 
 
 def _export(
-    made: Made, kinds: Sequence[str], folder: Path, *, points: int | None = None, cutting: Cutting = DEFAULTS,
+    made: DesignedLens, kinds: Sequence[str], folder: Path, *, points: int | None = None, cutting: Cutting = DEFAULTS,
     tiling: Tiling = exports.DEFAULT_TILING, strict: bool = True,
 ) -> Exported:  # fmt: skip
     scene, lens, cutting = made.scene, made.lens, _cutting_of(made.scene, kinds, cutting)
@@ -635,7 +638,7 @@ def _export(
     )  # fmt: skip
 
 
-def _sheet_again(made: Made, folder: Path) -> DataSheet:
+def _sheet_again(made: DesignedLens, folder: Path) -> DataSheet:
     with scene_errors():
         known = record.read(folder / "report.json")
     if known.shape is None or not (folder / "lens.step").is_file():

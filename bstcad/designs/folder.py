@@ -27,7 +27,7 @@ import numpy as np
 from bstcad.cad import mesh as meshes
 from bstcad.cad.mesh import MIRROR_RGBA, Label
 from bstcad.designs.as_designed import scene_text
-from bstcad.designs.made import Made
+from bstcad.designs.designed_lens import DesignedLens
 from bstcad.optics.lens import face_integrals
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface, is_net, knots
@@ -224,7 +224,7 @@ def hash_of(contents: Mapping[str, bytes]) -> str:
     return digest.hexdigest()
 
 
-def write_geometry(design: Made, folder: Path, submit: Submit = run_here) -> Callable[[], None]:
+def write_geometry(design: DesignedLens, folder: Path, submit: Submit = run_here) -> Callable[[], None]:
     """Write lens.step, lens.stl, part.step if there is a mount, and the scene with the files that it names.
 
     Return the function that writes lens.3mf.  The verification does not read lens.3mf, so a thread can write it later.
@@ -256,14 +256,14 @@ def label(scene: scenes.Scene) -> Label:
     return Label(scene.name, scene.title, scene.lens.material or "glass")
 
 
-def _write_scene(design: Made, folder: Path) -> None:
+def _write_scene(design: DesignedLens, folder: Path) -> None:
     """Write scene.toml, with the designed parameters of the front, and the files that scene.toml names."""
     contents = scene_files(design.scene) | {SCENE: scene_text(design.scene, design.lens).encode()}
     for name, data in contents.items():
         (folder / name).write_bytes(data)
 
 
-def write_design(design: Made, lights: Sequence[Light], folder: Path) -> None:
+def write_design(design: DesignedLens, lights: Sequence[Light], folder: Path) -> None:
     """Write design.npz: the optimised surfaces, the pictures, and the scene's text.
 
     The arrays are those of ARRAYS.  lights: traced light on each target; () if not traced.  The last tailored face is
@@ -294,7 +294,7 @@ def write_design(design: Made, lights: Sequence[Light], folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def kept_if_unwritten(design: Made, folder: Path) -> Iterator[None]:
+def kept_if_unwritten(design: DesignedLens, folder: Path) -> Iterator[None]:
     """Keep a design that cannot be written to `folder` in a folder beside it, or else in the system's temporary folder.
 
     The scene and design.npz are kept, without irradiance.  A note on the error names the folder.
@@ -311,7 +311,7 @@ def kept_if_unwritten(design: Made, folder: Path) -> Iterator[None]:
             shutil.rmtree(path, ignore_errors=True)
 
 
-def _keep(design: Made, folder: Path) -> Path:
+def _keep(design: DesignedLens, folder: Path) -> Path:
     """Write a design to a folder beside `folder`, or else in the system's temporary folder; return its path."""
 
     def write_to(path: Path) -> Path:
@@ -334,7 +334,7 @@ def _spare_folders(folder: Path) -> Iterator[Path]:
         yield folder.with_name(f"{folder.name}-unwritten{'' if k == 1 else f'-{k}'}")
 
 
-def _contains(folder: Path, design: Made) -> bool:
+def _contains(folder: Path, design: DesignedLens) -> bool:
     try:
         nominal = read_nominal(folder)
     except Exception:  # zipfile and numpy raise various errors for a damaged file

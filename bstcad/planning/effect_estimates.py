@@ -241,16 +241,16 @@ def _entry(kind: str, change: Change | None, detail: str = "", simulate_by: str 
 # --- the diagnosis of a finished design -------------------------------------------------------------------------------
 
 
-def diagnosis(scene: Scene, making: DesignCourse, proof: Proof, target: np.ndarray) -> dict[str, Any]:
+def diagnosis(scene: Scene, course: DesignCourse, proof: Proof, target: np.ndarray) -> dict[str, Any]:
     """Return the entries convergence, remaining_error and bounds of report.json (record.Contents).
 
     scene: scene with only the target of the largest RRMSD in the proof.  target: its picture (rows, columns).
     """
-    sizes = [k for k, stage in enumerate(making.stages) if stage.is_round and stage.stage == "stage 3"]
+    sizes = [k for k, stage in enumerate(course.stages) if stage.is_round and stage.stage == "stage 3"]
     curve = ending(
-        [(point.seconds, point.rrmsd) for point in making.history],
-        [(stage.seconds, stage.rrmsd) for stage in making.stages],
-        since=math.fsum(stage.seconds for stage in making.stages[: max(sizes[2:], default=0)]),  # last round
+        [(point.seconds, point.rrmsd) for point in course.history],
+        [(stage.seconds, stage.rrmsd) for stage in course.stages],
+        since=math.fsum(stage.seconds for stage in course.stages[: max(sizes[2:], default=0)]),  # last round
     )
     reached = {key: at for key, at in (proof.at_bounds or {}).items() if key in scene.lens.bounded_by}
     bounds: dict[str, Any] = {

@@ -18,7 +18,7 @@ import torch
 from bstcad.analysis.light import Blur, blur
 from bstcad.analysis.shape import describe
 from bstcad.designs import pipeline
-from bstcad.designs.made import Made
+from bstcad.designs.designed_lens import DesignedLens
 from bstcad.manufacture.tolerance.as_made import AsMade, as_made
 from bstcad.manufacture.tolerance.lit_by import LitBy, lit_by
 from bstcad.optics.lens.lens import Lens
@@ -142,7 +142,7 @@ def reduced_scene(scene: Scene, size: PreviewSize) -> Scene:
     return scene.changed(changes)
 
 
-def _evaluate(scene: Scene, made: Made) -> Preview:
+def _evaluate(scene: Scene, made: DesignedLens) -> Preview:
     """Return the preview of a lens: figures, and its light by flux tubes that its design did not use."""
     pictures, channels, lens = [], scene.channels(), made.lens
     for goal in made.goals:

@@ -209,7 +209,7 @@ class Contents:
         return self.goals[worst(goal.rrmsd for goal in self.goals)]
 
     @property
-    def making(self) -> DesignCourse:
+    def course(self) -> DesignCourse:
         """Course of the design."""
         return DesignCourse(**{entry.name: getattr(self, entry.name) for entry in fields(DesignCourse)})
 
@@ -261,7 +261,7 @@ def contents_of(
     design: Nominal,
     proof: Proof,
     *,
-    making: DesignCourse,
+    course: DesignCourse,
     circumstances: Mapping[str, Any],
     simulated: Sequence[str],
     estimates: tuple[LeftOut, ...],
@@ -269,12 +269,12 @@ def contents_of(
 ) -> Contents:
     """Return the contents of report.json.
 
-    circumstances: present version, machine and versions of libraries; those known in `making` have priority.
+    circumstances: present version, machine and versions of libraries; those known in `course` have priority.
     simulated: names of the simulated effects.  estimates: effects that are not simulated.  diagnosis: convergence,
     remaining_error and bounds.
     """
     scene, goals, source = design.scene, design.goals, design.scene.source
-    known = {key: value for key, value in vars(making).items() if value is not None}
+    known = {key: value for key, value in vars(course).items() if value is not None}
     goal, light, figures = goals[proof.worst], proof.light, figures_of(goals, proof.lights)
     stated = figures[proof.worst]
     contents = Contents(
@@ -427,10 +427,10 @@ def read(path: Path) -> Contents:
     return read_as(Contents, path, "run bstcad verify to write it again")
 
 
-def making(path: Path) -> DesignCourse:
+def read_course(path: Path) -> DesignCourse:
     """Read the course of the design from a report.json; an empty record if the file is missing or damaged."""
     try:
-        return read(path).making
+        return read(path).course
     except ValueError:
         return DesignCourse()
 

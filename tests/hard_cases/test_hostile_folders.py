@@ -185,12 +185,12 @@ def test_an_earlier_report_that_does_not_fit_is_not_believed(quick_folder, holds
     path = quick_folder / "report.json"
     for text in REPORTS.values():
         path.write_text(text())
-        assert record.making(path) == DesignCourse()
+        assert record.read_course(path) == DesignCourse()
         with pytest.raises(ValueError, match="report.json: cannot be read .*; run bstcad verify"):
             record.read(path)
     path.write_text(REPORTS["huge"]())
     with spending("a huge report.json", 300.0, holds):
-        record.making(path)
+        record.read_course(path)
     path.write_text(REPORTS["passed"]())
     found, kept = commands.verify(quick_folder).facts, [field.name for field in dataclasses.fields(DesignCourse)]
     assert {name for name in kept if found.get(name)} == {"machine", "versions"}

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bstcad.designs.made import Made
+from bstcad.designs.designed_lens import DesignedLens
 from bstcad.designs.pipeline import DesignOptions, Earlier, design
 from bstcad.manufacture.measured.cloud import load as load_cloud
 from bstcad.manufacture.measured.compensation import measured_form
@@ -69,7 +69,7 @@ class AsBuilt:
 class Retailored:
     """A back that was tailored anew."""
 
-    made: Made
+    made: DesignedLens
     design: float  # RRMSD of the earlier design
     before: float  # RRMSD of the earlier back on the blank as built
 
@@ -81,7 +81,7 @@ class Retailored:
         )
 
 
-def retailor(made: Made, built: AsBuilt, hooks: Hooks = NO_HOOKS) -> Retailored:
+def retailor(made: DesignedLens, built: AsBuilt, hooks: Hooks = NO_HOOKS) -> Retailored:
     """Return the design for a blank as built, from an earlier design; SceneError if a value does not suit the scene."""
     scene, shift = as_built(made, built)
     old = replace(made.lens.plain(), index=made.heaviest.index, losses=None)
@@ -96,7 +96,7 @@ def retailor(made: Made, built: AsBuilt, hooks: Hooks = NO_HOOKS) -> Retailored:
     return Retailored(found, *rrmsds)
 
 
-def as_built(made: Made, built: AsBuilt) -> tuple[Scene, float]:
+def as_built(made: DesignedLens, built: AsBuilt) -> tuple[Scene, float]:
     """Return (scene of the blank as built, shift (mm) of the back's vertex relative to the earlier design)."""
     scene, lens = made.scene, made.lens
     changes: dict[str, Any] = {}
@@ -123,7 +123,7 @@ def as_built(made: Made, built: AsBuilt) -> tuple[Scene, float]:
         raise SceneError(f"{OPTION}: {error}") from None
 
 
-def _front(made: Made, given: float | Path) -> dict[str, Any]:
+def _front(made: DesignedLens, given: float | Path) -> dict[str, Any]:
     """Return the change of the scene for a front of a curvature (1/mm), or as measured points show it."""
     front = made.scene.lens.front
     if isinstance(given, Path):
@@ -134,7 +134,7 @@ def _front(made: Made, given: float | Path) -> dict[str, Any]:
     return {"lens.front.curvature": given}
 
 
-def _measured_front(made: Made, path: Path) -> NetFront:
+def _measured_front(made: DesignedLens, path: Path) -> NetFront:
     """Return the front as a net: the nominal front plus the form error in a cloud of its points.
 
     The rigid motion of the cloud is removed, since the position of the front in the part defines the part's axes.
