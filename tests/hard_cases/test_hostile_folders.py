@@ -282,7 +282,7 @@ def test_no_name_leads_out_of_the_folder(tmp_path, monkeypatch, holds):
             scene = load(DISK, changes)
         place = tmp_path / f"out{number}"
         with folders.replacing(place / scene.name) as building:
-            folders.write_geometry(folders.Made(scene, scene.flat_lens(9), scene.goals), building)()
+            folders.write_geometry(folders.DesignedLens(scene, scene.flat_lens(9), scene.goals), building)()
         made = {path.relative_to(place) for path in place.rglob("*") if path.is_file()}
         assert {path.parts[0] for path in made} == {scene.name} and all(len(path.parts) == 2 for path in made)
         copied = {path.name for path in made} - {"lens.step", "lens.stl", "lens.3mf", "scene.toml"}
