@@ -194,13 +194,13 @@ def order_of(
     the scene, with defaults from the lens (`Part.of`).  mount: of the scene.  found: measures of part.step; None: there
     is no part.step.
     """
-    rim, unbuilt = as_cut(lens, mount), mount is not None and not found
+    cut, unbuilt = as_cut(lens, mount), mount is not None and not found
     mount = mount if found else None
     low, high, volume = found or (*_corners(lens, None), shape["volume"])
     path, front = folder / (PART if mount else LENS), lens.front_vertex
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    radii = filter(None, (shape["radius_min_concave"], _front_radius(rim)))
+    radii = filter(None, (shape["radius_min_concave"], _front_radius(cut)))
     return Order(
         file=path.name,
         sha256=digest,

@@ -159,7 +159,8 @@ class SceneLight:
     @classmethod
     def of(cls, design: Nominal) -> SceneLight:
         """Return the light of a design's scene; images of the source by the designed lens blur the pictures."""
-        scene, goals, sampler = design.scene, design.goals, design.scene.sampler  # None: no points to sample
+        scene, goals = design.scene, design.goals
+        sampler = scene.sampler  # None: a point source or a parallel beam
         if scene.source.extent is None or sampler is None:
             return cls(scene.channels(), goals, ())
         source = ExtendedSource(design.emitter, scene.with_source_scaled(0.0).channels(), sampler)
