@@ -1,8 +1,6 @@
 """Mutants: change one operator, constant or condition of the package, and run the tests that import its module.
 
-    python -m tests.mutants --count 150 --seed 1          # by the daily tests
-    python -m tests.mutants --count 150 --seed 1 --all    # by the thorough ones, too
-    python -m tests.mutants --count 150 --seed 1 --only 3 17
+    python -m tests.mutants --count 150 --seed 1 --only 3 17    # by the daily tests; --all: by the thorough ones, too
 
 A mutant is killed if a test fails, or if the tests take longer than TIMEOUT.  A mutant that survives is equivalent, or
 asks for a test.  `<` becomes `>=`, not `<=`, which differs only for equal numbers.
@@ -23,11 +21,9 @@ ROOT = Path(__file__).resolve().parent.parent
 ROOMS = "optics", "transport", "tailoring", "cad", "verify", "step_text"
 TIMEOUT = 900  # seconds for the tests of one mutant; a kernel is compiled again
 COPIED = "bstcad", "tests", "templates", "docs", "generate_lens.py", "pyproject.toml", "README.md", "Makefile"
-PAIRS = (
-    (ast.Lt, ast.GtE), (ast.Gt, ast.LtE), (ast.Eq, ast.NotEq), (ast.Is, ast.IsNot), (ast.In, ast.NotIn),
-    (ast.Add, ast.Sub), (ast.Mult, ast.Div), (ast.And, ast.Or),
-)  # fmt: skip
-OTHER = {one: two for pair in PAIRS for one, two in (pair, pair[::-1])} | {ast.Pow: ast.Mult, ast.FloorDiv: ast.Mult}
+PAIRS = "Lt GtE", "Gt LtE", "Eq NotEq", "Is IsNot", "In NotIn", "Add Sub", "Mult Div", "And Or"
+OTHER = {getattr(ast, a): getattr(ast, b) for a, b in (pair.split()[::way] for pair in PAIRS for way in (1, -1))}
+OTHER |= {ast.Pow: ast.Mult, ast.FloorDiv: ast.Mult}
 
 
 def changed(node):
@@ -42,10 +38,8 @@ def changed(node):
             return new.operand
         case ast.Constant(value=bool(value)):
             new.value = not value
-        case ast.Constant(value=int(value)):
-            new.value = value + 1
-        case ast.Constant(value=float(value)):
-            new.value = 1.1 * value or 1.0
+        case ast.Constant(value=int(value) | float(value)):
+            new.value = value + 1 if isinstance(value, int) else 1.1 * value or 1.0
         case ast.IfExp():
             new.test = ast.UnaryOp(ast.Not(), new.test)
         case _:
@@ -58,12 +52,8 @@ def without_effect(tree):
     for node in ast.walk(tree):
         if isinstance(node, ast.keyword) and node.arg == "strict":
             yield node.value
-        parts = [
-            getattr(node, "annotation", None),
-            getattr(node, "returns", None),
-            *getattr(node, "decorator_list", ()),
-        ]
-        for part in filter(None, parts):
+        types = [getattr(node, "annotation", None), getattr(node, "returns", None)]
+        for part in filter(None, [*types, *getattr(node, "decorator_list", ())]):
             yield from ast.walk(part)
 
 
@@ -82,8 +72,7 @@ def mutants_of(file):
 
 def tests_of(file):
     """Return the test files that import the module of a file, and those of its name; else all tests of its room."""
-    module = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-    package, _, name = module.rpartition(".")
+    package, _, name = (module := file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")).rpartition(".")
     found, room = [], ROOT / "tests" / Path(*package.split(".")[1:])
     for path in sorted((ROOT / "tests").rglob("test_*.py")):
         nodes = [node for node in ast.walk(ast.parse(path.read_bytes())) if isinstance(node, ast.ImportFrom)]
@@ -97,9 +86,9 @@ def is_killed(file, text, tree, marks):
     """Return True if a test of the file's module fails in the copy `tree` with this text."""
     (tree / file).write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *marks, *tests_of(file)]
-    known = {**os.environ, "PYTHONPATH": str(tree)}
     try:
-        return subprocess.run(command, cwd=tree, env=known, capture_output=True, timeout=TIMEOUT).returncode == 1
+        env = {**os.environ, "PYTHONPATH": str(tree)}
+        return subprocess.run(command, cwd=tree, env=env, capture_output=True, timeout=TIMEOUT).returncode == 1
     except subprocess.TimeoutExpired:
         return True
     finally:
@@ -116,15 +105,14 @@ def main():
     paths = [path for room in ROOMS for path in sorted((ROOT / "bstcad" / room).rglob("*.py"))]
     every = [mutant for path in paths for mutant in mutants_of(path.relative_to(ROOT).as_posix())]
     drawn, killed = random.Random(given.seed).sample(every, given.count), 0
-    numbers = range(len(drawn)) if given.only is None else given.only
+    numbers, marks = given.only or range(len(drawn)), ["-m", "not slow and not bench"] if given.all else []
     with tempfile.TemporaryDirectory() as folder:
-        for name in COPIED:
-            (shutil.copytree if (ROOT / name).is_dir() else shutil.copy)(ROOT / name, Path(folder, name))
+        for path in map(ROOT.joinpath, COPIED):
+            (shutil.copytree if path.is_dir() else shutil.copy)(path, Path(folder, path.name))
         for number in numbers:
             file, change, text = drawn[number]
-            died = is_killed(file, text, Path(folder), ["-m", "not slow and not bench"] if given.all else [])
-            killed, word = killed + died, "killed  " if died else "SURVIVED"
-            print(f"{number:4} {word} {change}", flush=True)
+            killed += (died := is_killed(file, text, Path(folder), marks))
+            print(f"{number:4} {'killed  ' if died else 'SURVIVED'} {change}", flush=True)
     print(f"{killed} of {len(numbers)} mutants killed ({len(every)} possible)")
 
 

@@ -192,3 +192,10 @@ def test_faces_may_cross_outside_of_the_outline():
     beyond = torch.hypot(x[:, None], y) > 1.5 + 3 * lens.back.pitch[0]
     lens = lens.with_back(replace(lens.back, heights=lens.back.heights - 20.0 * beyond))
     assert excess(lens, Bounds(thinnest=0.5)).worst == -PENALTY_MARGIN
+
+
+def test_the_unit_of_the_excess_is_never_zero():
+    """A blank whose faces have one height, without a bound, is measured in millimetres."""
+    lens = rough(Rectangle(20.0, 20.0))
+    assert unit(lens, Bounds(thinnest=0.2)) == max(0.2, PENALTY_MARGIN * (lens.back.z - lens.front.z))
+    assert unit(lens.with_back(lens.back.moved(lens.front.z)), Bounds(thinnest=0.0)) == 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,7 +12,8 @@ from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere
 from bstcad.scene.fronts import as_front
-from bstcad.tailoring.stage1 import best_front
+from bstcad.tailoring.settings import CONIC_CONSTANTS
+from bstcad.tailoring.stage1 import _conic_constants, best_front
 from tests.lenses import SQUARE, net
 
 RIM = math.hypot(10.0, 10.0)
@@ -88,3 +90,17 @@ def test_a_merit_that_is_best_where_it_starts_changes_nothing():
         lambda front: float((front.curvature, front.conic_constant) != (0.005, -0.5)),
     )  # fmt: skip
     assert found == Conic(15.0, 0.005, -0.5)
+
+
+@pytest.mark.parametrize("towards", [1, -1])
+@pytest.mark.parametrize("rim_sags", [(-math.inf, math.inf), (-1.5, 1.2)])
+@pytest.mark.parametrize("curvature", [0.02, 0.03, -0.005, -0.02])
+def test_the_conic_constant_goes_as_far_as_the_blank_allows(curvature, rim_sags, towards):
+    """A front that is a little further is steeper than 30°, too deep, outside of the sags, or no possible conic."""
+    front = Conic(15.0, curvature, 0.0)
+    limits = _conic_constants(lens_with(front), rim_sags)
+    further = replace(front, conic_constant=limits[towards > 0] + towards * 1e-3 * (limits[1] - limits[0]))
+    sag, slope = sag_and_slope(further)
+    bent = (1 + further.conic_constant) * (curvature * RIM) ** 2
+    beyond = not (-6.0 <= bent <= 0.8 and CONIC_CONSTANTS[0] <= further.conic_constant <= CONIC_CONSTANTS[1])
+    assert slope > 30.0 or sag > 5.0 or not rim_sags[0] <= sag <= rim_sags[1] or beyond

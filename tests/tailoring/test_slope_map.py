@@ -13,9 +13,20 @@ from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen, efficiency
 from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
+from bstcad.optics.trace.reach import wanted_slopes
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit
-from bstcad.tailoring.slope_map import face_grid, fit_to_map, lit_corners, lit_window, slope_map, square_grid
+from bstcad.tailoring.slope_map import (
+    bending,
+    face_grid,
+    fit_to_map,
+    lit_corners,
+    lit_window,
+    pixel_corners,
+    rays_at,
+    slope_map,
+    square_grid,
+)
 from bstcad.transport.mapping import Solver
 from tests.lenses import SQUARE, N, net
 from tests.tracing import simulated
@@ -100,3 +111,36 @@ def test_thecorners_of_what_is_lit():
     picture = np.zeros((4, 4))
     picture[0, 2] = 1.0
     assert np.argwhere(lit_corners(picture)).tolist() == [[2, 3], [2, 4], [3, 3], [3, 4]]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_bending_is_that_of_the_slopes_needed(name):
+    """Second derivatives of g fit those of the slopes at the pairs of points, and its end spans are dark."""
+    source, _, screen = CASES[name]
+    lens = known_lens(name)
+    grid = square_grid(source, lens, lit_window(source, lens), 16)
+    corners, width = pixel_corners(screen), grid.window.width
+    (left, right), (low, high) = screen.x, screen.y
+    middle = (left + right) / 2, (low + high) / 2
+    points = tuple((c - m) / (right - left) * width * 0.98 for c, m in zip(corners, middle, strict=True))
+    lit = np.ones(corners[0].shape, bool)
+    g = bending(grid, lens, screen.receiver, corners, points=points, lit=lit)
+    span = (g.x[1] - g.x[0]) / (g.heights.shape[0] - 1)
+    assert g.x[1] - 2 * span == pytest.approx(width / 2) and g.x[0] == -g.x[1] and g.y == g.x
+    some = slice(4, -4, 8)
+    x, y = (p[some, some].ravel() for p in points)
+    aim, step, law = torch.from_numpy(np.stack([c[some, some].ravel() for c in corners])), 1e-3, lens.last_tailored.law
+
+    def needed(dx, dy):
+        return wanted_slopes(rays_at(grid, (x + dx, y + dy)), aim, screen.receiver, law)
+
+    def found(dx, dy):
+        return g.relative_sag_and_slope(*(torch.from_numpy(p) for p in (x + dx, y + dy)))[1:]
+
+    def bent(slopes):
+        ends = [(slopes(i, j), slopes(-i, -j)) for i, j in ((step, 0.0), (0.0, step))]
+        (xx, yx), (xy, yy) = ([(a - b) / (2 * step) for a, b in zip(*pair, strict=True)] for pair in ends)
+        return torch.stack([xx, (xy + yx) / 2, yy])
+
+    error = (bent(found) - bent(needed)).norm() / bent(needed).norm()
+    assert float(error) < 0.15  # the slopes for all pairs are not the gradient of one surface
