@@ -19,8 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import toeplitz
-from scipy.special import ndtr
-from scipy.stats import poisson
+from scipy.special import gammaln, ndtr, pdtrc, xlogy
 
 from bstcad.optics.lens.interfaces import Refract
 from bstcad.optics.lens.lens import Lens
@@ -64,8 +63,10 @@ class Scatter:
         if self.strength > MAX_SERIES:
             yield self.fraction, self.angle**2
             return
-        for m in range(1, int(poisson.isf(MIN_TERM, self.strength)) + 2):
-            weight = float(poisson.pmf(m, self.strength))
+        m = 0
+        while float(pdtrc(m, self.strength)) > MIN_TERM:  # share of the light that is scattered more than m times
+            m += 1
+            weight = float(np.exp(xlogy(m, self.strength) - gammaln(m + 1) - self.strength))  # Poisson's
             if weight > MIN_TERM:
                 yield weight, m * self.first_angle**2
 

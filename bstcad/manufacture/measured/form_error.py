@@ -12,6 +12,7 @@ this pose therefore belongs to the posterior: it adds to the precision of a moti
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -22,8 +23,7 @@ import torch
 from scipy.linalg import hadamard
 from scipy.optimize import linprog
 from scipy.sparse.linalg import LinearOperator, cg
-from scipy.special import eval_jacobi
-from scipy.stats import norm
+from scipy.special import eval_jacobi, log_ndtr
 
 from bstcad.analysis.shape import least_squares
 from bstcad.manufacture.measured.alignment import (
@@ -278,7 +278,8 @@ def _possible_variances(energy: np.ndarray, modes: np.ndarray, noise: np.ndarray
     if len(detected) >= EXTRAPOLATION_BANDS:
         return variance
     excess = (energy - 1) / deviation
-    possible = noise * deviation * (excess + np.exp(norm.logpdf(excess) - norm.logcdf(excess)))
+    log_density = -(excess**2) / 2 - math.log(math.sqrt(2 * math.pi))  # of the normal distribution
+    possible = noise * deviation * (excess + np.exp(log_density - log_ndtr(excess)))
     possible[detected] = variance[detected]
     last = detected[-1] if len(detected) else 0
     octaves = np.maximum(np.arange(len(energy)) - last, 0) / BANDS_PER_OCTAVE

@@ -18,7 +18,6 @@ from typing import IO, Any
 from xml.parsers import expat
 
 import numpy as np
-import sdfio
 import x3pio
 
 from bstcad.manufacture.measured.hdf5_structure import check_structure
@@ -172,6 +171,8 @@ def _check_xml(file: IO[bytes]) -> None:
 
 def _read_sdf(data: bytes) -> MeasuredPoints:
     """Read a surface; x and y are multiples of the pitches in the header."""
+    import sdfio  # takes 0.1 s to load
+
     file = sdfio.SdfFile.loads(data)  # compares the declared number of points with the data first
     _check_count(file.data.shape)
     return _map_points(METRE * file.data, METRE * file.header.x_scale, METRE * file.header.y_scale)

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from scipy import fft
 from scipy.ndimage import fourier_gaussian
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 from bstcad.optics.lens.interfaces import Interface
 from bstcad.optics.lens.lens import Lens
@@ -140,7 +140,8 @@ class Perturbation:
         normal: standard deviation s before truncation at the limit L = a s, a = CUTOFF_SIGMAS; after it,
         σ² = s² (1 - 2 a φ(a) / (2 Φ(a) - 1)).  field: one mode of a random field, normal and not truncated.
         """
-        cut = 1 - 2 * CUTOFF_SIGMAS * norm.pdf(CUTOFF_SIGMAS) / (2 * norm.cdf(CUTOFF_SIGMAS) - 1)
+        density = math.exp(-(CUTOFF_SIGMAS**2) / 2) / math.sqrt(2 * math.pi)
+        cut = 1 - 2 * CUTOFF_SIGMAS * density / (2 * ndtr(CUTOFF_SIGMAS) - 1)
         ratios = {"uniform": 1 / math.sqrt(3), "field": 1.0, "normal": math.sqrt(cut) / CUTOFF_SIGMAS}
         return self.limit * ratios[self.distribution]
 
@@ -149,9 +150,9 @@ class Perturbation:
         if self.distribution == "uniform":
             return self.limit * (2 * uniform - 1)
         if self.distribution == "field":
-            return self.limit * norm.ppf(np.clip(uniform, 1e-12, None))
-        low = norm.cdf(-CUTOFF_SIGMAS)
-        return self.limit * (norm.ppf(low + uniform * (1 - 2 * low)) / CUTOFF_SIGMAS)
+            return self.limit * ndtri(np.clip(uniform, 1e-12, None))
+        low = ndtr(-CUTOFF_SIGMAS)
+        return self.limit * (ndtri(low + uniform * (1 - 2 * low)) / CUTOFF_SIGMAS)
 
 
 def trials(perturbations: Sequence[Perturbation], seed: int, numbers: Iterable[int]) -> np.ndarray:

@@ -32,7 +32,6 @@ import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq, minimize
-from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
 from bstcad.manufacture.tolerance.grades import DEFAULT_GRADE, GRADES, grade_limit
@@ -48,6 +47,7 @@ Progress = Callable[[str, int, int, str], None]  # called with stage, units done
 # Executor: calls work(shared, item) for each item, in this process or others, and yields the results in order.
 Spread = Callable[[Callable[[Any, Any], Any], Any, Sequence[Any]], Iterator[Any]]
 
+NORMAL_95 = 1.959963984540054  # quantile of the normal distribution for a two-sided interval of 95 %
 WAVEFRONT_RAYS = 192  # rays per side of the grid for a wavefront error
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
@@ -314,9 +314,14 @@ class Study:
 
 
 def estimate_yield(good: np.ndarray) -> Yield:
-    """Return (low, estimate, high) of the fraction of trials (trials,) that are True; low, high: 95 % interval."""
-    interval = binomtest(int(good.sum()), len(good)).proportion_ci(method="wilson")
-    return float(interval.low), int(good.sum()) / len(good), float(interval.high)
+    """Return (low, estimate, high) of the fraction of trials (trials,) that are True; low, high: 95 % interval.
+
+    The interval (Wilson 1927) is (p + z² / 2n ± z sqrt(p (1 - p) / n + z² / 4n²)) / (1 + z² / n).
+    """
+    n, p = len(good), int(good.sum()) / len(good)
+    middle, half = p + NORMAL_95**2 / (2 * n), NORMAL_95 * math.sqrt(p * (1 - p) / n + NORMAL_95**2 / (4 * n**2))
+    low, high = ((middle + sign * half) / (1 + NORMAL_95**2 / n) for sign in (-1, 1))
+    return max(low, 0.0) if p > 0 else 0.0, p, min(high, 1.0) if p < 1 else 1.0
 
 
 def worst_of(studies: Sequence[Study]) -> Study:
