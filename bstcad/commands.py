@@ -29,7 +29,7 @@ from bstcad.designs import folder as folders
 from bstcad.designs.as_designed import scene_text
 from bstcad.designs.course import StageRecord
 from bstcad.designs.designed_lens import DesignedLens
-from bstcad.designs.pipeline import DesignState, design, purpose
+from bstcad.designs.pipeline import DesignOptions, DesignState, design, purpose
 from bstcad.exports import data_sheet, exports
 from bstcad.exports.data_sheet import DataSheet
 from bstcad.exports.exports import Exported
@@ -56,6 +56,7 @@ from bstcad.optics.lens.lens import Lens
 from bstcad.optics.trace.measure import FULL, Effort, Light, SpectralLine
 from bstcad.planning.effect_estimates import diagnosis, left_out, simulated
 from bstcad.planning.net_choice import with_net
+from bstcad.planning.reduction import REFINED, Reduction
 from bstcad.report import prescription, record, report
 from bstcad.report.goal_figures import GoalFigures, figures_of, photometry
 from bstcad.report.prescription import SHEET, Order
@@ -69,6 +70,7 @@ from bstcad.scene.mount import as_cut
 from bstcad.scene.scene import Scene
 from bstcad.scene.target import numbered
 from bstcad.step_text import beginning
+from bstcad.tailoring import effort as efforts
 from bstcad.tailoring.driver import NO_HOOKS, Hooks, Progress, no_progress
 from bstcad.toolpath.cutting import CHOICES, DEFAULTS, Cutting
 from bstcad.verify import checks
@@ -95,13 +97,14 @@ OwnSection = Callable[[Contents], tuple[str, str]]
 
 @dataclass(frozen=True)
 class ProofOptions:
-    """Options of a verification and of its report."""
+    """Options of a verification and of its report, and the effort of a design before it."""
 
     effort: Effort | None = None  # effort of the verification; None: measure.FULL
     drawing: Drawing | None = None  # class that draws the figures of the report; None: Pictures
     checks: Sequence[OwnCheck] = ()  # additional checks
     sections: Sequence[OwnSection] = ()  # additional sections of report.html
     limit: float | None = None  # largest time (s) from start of design to end of report; None: no limit, as in `verify`
+    tailoring: efforts.TailoringEffort = efforts.FULL  # effort of the design, in `generate` and `retailor`
 
 
 # --- generate ---------------------------------------------------------------------------------------------------------
@@ -135,7 +138,8 @@ def generate(
         with _checkpoint_on_error(keeper, refused=(SceneError,)), signals.stop_on_interrupt() as wished:
             hooks = replace(hooks, save=keeper, interrupted=wished)
             with processes.kept_awake():
-                found = design(scene, device=device, hooks=hooks, began=began, start=state)
+                own = DesignOptions(effort=options.tailoring)
+                found = design(scene, device=device, hooks=hooks, options=own, began=began, start=state)
         with _checkpoint_on_error(keeper):
             options = replace(options, limit=scene.tailoring.max_time)
             report = write(found, output_folder(folder, found.course.stopped or ""), options, hooks.progress)
@@ -387,7 +391,7 @@ def retailor(
     folder.parent.mkdir(parents=True, exist_ok=True)
     with files.exclusive(folder), scene_errors():
         with signals.stop_on_interrupt() as wished:
-            found = as_built.retailor(made, built, replace(hooks, interrupted=wished))
+            found = as_built.retailor(made, built, replace(hooks, interrupted=wished), options.tailoring)
         report = write(found.made, folder, options, hooks.progress)
     return folder, report, found
 
@@ -525,32 +529,35 @@ def tolerance(
 
 
 def predict_as_made(
-    scene: Scene, grade: str | None = None, layer_height: float | None = None, png: Path | None = None
-) -> AsMade:
+    scene: Scene, grade: str | None = None, layer_height: float | None = None, png: Path | None = None,
+    size: Reduction = REFINED,
+) -> AsMade:  # fmt: skip
     """Predict the pictures of a scene's lens as made by a grade of manufacture, from a reduced design.
 
     layer_height: height of the layers of a print (mm); None: that of the grade.  png: file of the pictures to write,
-    one per target (FILE, FILE_2, …).
+    one per target (FILE, FILE_2, …).  size: of the reduced design.
     """
-    from bstcad.planning.preview import REFINED, preview  # loaded late, since the other commands do not need it
+    from bstcad.planning.preview import preview  # loaded late, since the other commands do not need it
 
-    found = preview(scene, REFINED)
+    found = preview(scene, size)
     made = found.as_made(grade, layer_height)
     if png is not None:
         _draw_changed(png, found.scene, [(goal.target, goal.designed, goal.made) for goal in made.goals], "As made")
     return made
 
 
-def predict_lit_by(scene: Scene, light: str, distance: float | None = None, png: Path | None = None) -> LitBy:
+def predict_lit_by(
+    scene: Scene, light: str, distance: float | None = None, png: Path | None = None, size: Reduction = REFINED
+) -> LitBy:
     """Predict the pictures of a scene's lens in another light (tolerance.lit_by), from a reduced design.
 
-    distance: from the light to the lens (mm); None: that of the light.  png: as for `predict_as_made`.
+    distance: from the light to the lens (mm); None: that of the light.  png, size: as for `predict_as_made`.
     """
     from bstcad.manufacture.tolerance.lit_by import scene_lit_by
-    from bstcad.planning.preview import REFINED, preview  # loaded late, as in predict_as_made
+    from bstcad.planning.preview import preview  # loaded late, as in predict_as_made
 
     scene_lit_by(scene, light, distance)  # an unknown light is refused before the preview
-    found = preview(scene, REFINED)
+    found = preview(scene, size)
     lit = found.lit_by(light, distance)
     if png is not None:
         _draw_changed(png, found.scene, [(goal.target, goal.designed, goal.lit) for goal in lit.goals], "In this light")

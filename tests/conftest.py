@@ -75,7 +75,19 @@ def quick_effort():
     """Return an effort of few points, with the tubes and rays that resolve the small design."""
     from bstcad.optics.trace.measure import Effort
 
-    return Effort(512, places=129, points=4096)
+    return Effort(512, places=129, points=4096, tubes=129)
+
+
+def quickly(patch):
+    """The command line generates by little effort, verifies by `quick_effort` and draws nothing."""
+    from functools import partial
+
+    from bstcad import commands
+    from bstcad.figures.figure_jobs import NoPictures
+    from tests.efforts import LITTLE
+
+    options = commands.ProofOptions(quick_effort(), NoPictures, tailoring=LITTLE)
+    patch.setattr(commands, "generate", partial(commands.generate, options=options))
 
 
 def proofs(patch):

@@ -18,6 +18,7 @@ import random
 import re
 from collections import defaultdict
 from dataclasses import replace
+from functools import partial
 
 import numba
 import numpy as np
@@ -45,15 +46,15 @@ from bstcad.photometry.intensity import Luminaire
 from bstcad.photometry.ray_set import RaySet
 from bstcad.planning.plan import plan
 from bstcad.planning.prediction import run_pilot
-from bstcad.planning.preview import PreviewSize, preview
+from bstcad.planning.preview import preview
+from bstcad.planning.reduction import Reduction
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import as_front, net_extent
 from bstcad.scene.lamp import IntensityFile, RayFile
-from bstcad.tailoring import effort as efforts
-from bstcad.tailoring.effort import TailoringEffort
 from bstcad.tailoring.stage2 import PrecisionComparison
 from tests import suite
 from tests.conftest import verify_with
+from tests.efforts import LITTLE
 from tests.planning.conftest import typical_pilot
 
 # --- the choices ------------------------------------------------------------------------------------------------------
@@ -430,17 +431,18 @@ PAIRS = covering(to_cover(2))
 PREVIEWED = holding_each_value(PAIRS)  # numbers of the scenes that are previewed
 PLANNED = holding_each_value(PAIRS, len(PAIRS) // 3)  # numbers of the scenes that are planned
 RETAILORED = holding_each_value(PAIRS, 2 * len(PAIRS) // 3)  # numbers of the scenes with a blank as built
-DAILY = holding_each_value(PAIRS, suite.turn(len(PAIRS)))  # numbers of the scenes of the daily suite
+EACH_VALUE = holding_each_value(PAIRS, suite.turn(len(PAIRS)))  # numbers of few scenes, others at each commit
+DAILY = EACH_VALUE[suite.turn(2) :: 2]  # numbers of the scenes of the daily suite: every other one of them
 TRIPLES = "light", "rim", "front"
 
 
 # --- a scene from its plan to its files and back ----------------------------------------------------------------------
 
-EFFORT = Effort(64, places=33, points=64)
-MORE_RAYS = Effort(256, places=33, points=64)  # effort that tells the noise of few rays from a fault
+EFFORT = Effort(64, places=33, points=64, tubes=48, source_points=(2, 4))
+MORE_RAYS = replace(EFFORT, rays=256)  # effort that tells the noise of few rays from a fault
 POINTS, TUBES = 16, 192  # points of a source, and flux tubes per side, for the RRMSD that the proof is compared with
 MAX_DIFFERENCE, MAX_RELATIVE_DIFFERENCE = 0.02, 0.1  # largest difference of these RRMSDs, besides the noise of rays
-HASTY = PreviewSize(pixels=16, net=17, tubes=32, rounds=1, evaluations=1, blurred=1)
+HASTY = Reduction(pixels=16, net=17, cells=16, tubes=32, rounds=1, evaluations=1, blurred=1)
 MAY_FAIL = (  # checks by the beginning of their names, the choices under which they may fail, and why that is true
     ("wavefront", {}, "one net has no two goals"),
     (
@@ -464,55 +466,8 @@ MAY_REFUSE = (  # sentences of designs, and the choices that cannot be had toget
         {"back": "dome", "wall": "tilted", "picture": "profile", "front": "conic"},
     ),
 )
-COARSE = {  # module: its numbers of points, rays, pixels and rounds, by which figures are found
-    "optics.trace.measure": {"SETS": 4, "MIN_TUBES": 48, "MIN_SOURCE_POINTS": 2, "MAX_SOURCE_POINTS": 4},
-    "scene.scene": {"VERIFICATION_POINTS": 4},
-    "tailoring.effort": {
-        "FULL": TailoringEffort(
-            stage=Effort(96, accuracy=0, witness=False),
-            stage_pixels=48,
-            fine=Effort(48, accuracy=0.0, witness=False),
-            flux=Effort(32, accuracy=1.0, witness=False),
-            wavefront_tubes=48,
-            coarsest_grid=16,
-            trial_cells=24,
-            trial_pixels=32,
-            trial_iterations=20,
-            compared_tubes=16,
-            compared_evaluations=2,
-        )
-    },
-    "tailoring.slope_map.lit_window": {"__defaults__": (32,)},
-    "tailoring.source_image": {
-        "ERROR_RAYS": 32,
-        "ERROR_POINTS": 4,
-        "IMAGE_GRID": 8,
-        "IMAGE_NODES": 3,
-        "IMAGE_PAIRS": 32,
-    },
-    "tailoring.machinability": {"THICKNESS_POINTS": 65, "QUARTER_RIM_POINTS": 129, "REPAIR_EVALUATIONS": 20},
-    "analysis.light": {"MOUNT_RAYS": 48, "MIN_MOUNT_RAYS": 16, "NEEDED_RAYS": 17},
-    "analysis.light.blur": {"__defaults__": (12,)},
-    "analysis.neglected_effects": {"FACE_POINTS": 24, "GHOST_RAYS_PER_SIDE": 16},
-    "analysis.shape": {"GRID_POINTS": 129},
-    "planning.preview": {"IMAGE_POINTS": 6, "TRANSPORT_CELLS": 16, "LEDGER_RAYS": 16, "SHAPE_POINTS": 33},
-    "planning.effect_estimates": {
-        "COARSE_POINTS": 17,
-        "COARSE_CELLS": 16,
-        "COARSE_PIXELS": 24,
-        "FRONT_NET": 9,
-        "COARSE_STEPS": 5,
-    },
-    "planning.net_choice": {"DENSITY_TUBES": 32},
-    "planning.prediction": {
-        "PILOT_CELLS": (16, 16),
-        "PILOT_LIMITS": (24, 17, 48),
-        "PILOT_EFFORT": Effort(96, accuracy=1.0, witness=False),
-        "PILOT_QUALITIES": ("draft",),
-    },
-    "verify.checks": {"LINE_TUBES": 48},
-    "planning.plan": {"PILOT_QUALITIES": ("draft",)},
-}
+PILOT = Reduction(pixels=24, net=17, cells=16, tubes=48, fewest_points=65, effort=LITTLE)
+PILOT_RAYS = Effort(96, accuracy=1.0, witness=False, source_points=(2, 4))
 
 
 class Words(NoPictures):
@@ -528,10 +483,13 @@ NO_DIFFERENCE = PrecisionComparison(
 FLOWN = 2  # number of planned scenes of which one has a real pilot; each has the small scene that a pilot designs
 
 
-def piloted():
-    """`run_pilot` for some scenes: a pilot is one more design, of the same choices."""
-    scenes = itertools.count()
-    return lambda *given: (run_pilot if next(scenes) % FLOWN == 0 else typical_pilot)(*given)
+def pilots():
+    """Yield functions that give the pilots of a scene: a real one is one more design, of the same choices."""
+    real = partial(run_pilot, size=PILOT, rays=PILOT_RAYS)
+    return itertools.cycle([real, *(FLOWN - 1) * [typical_pilot]])
+
+
+PILOTS = pilots()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -539,11 +497,7 @@ def quick():
     """Few rays and tubes, and no figures."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bstcad.commands.Pictures", Words)
-        patch.setattr("bstcad.planning.plan.run_pilot", piloted())
         verify_with(patch, EFFORT)
-        for where, figures in COARSE.items():
-            for name, figure in figures.items():
-                patch.setattr(f"bstcad.{where}.{name}", figure)
         threads = torch.get_num_threads(), numba.get_num_threads()
         torch.set_num_threads(1)  # on so few points more threads cost more than they save
         numba.set_num_threads(1)
@@ -569,9 +523,9 @@ def _faults(chosen, folder, *, previewed, planned, retailored):
     scene = scene_of(chosen)
     try:
         seen = preview(scene, HASTY) if previewed else None
-        report = commands.generate(scene, folder, device="cpu", options=ProofOptions(EFFORT))
+        report = commands.generate(scene, folder, device="cpu", options=ProofOptions(EFFORT, tailoring=LITTLE))
         again = bstcad.open(folder)  # its scene states the net, if that was to be chosen
-        told, predicted = plan(again.scene) if planned else ({}, {})
+        told, predicted = plan(again.scene, pilot=next(PILOTS)) if planned else ({}, {})
     except SceneError as refusal:
         return [] if any(_holds(*each, str(refusal), chosen) for each in MAY_REFUSE) else [f"refused: {refusal}"]
     assert not previewed or all(np.isfinite(picture).all() for pictures in seen.pictures for picture in pictures)
@@ -606,8 +560,8 @@ def _as_built(design):
     made = design._made
     thickness = made.lens.back_net.vertex_z - made.lens.front.z + 0.02
     index = made.scene.index + 2e-3 if made.scene.lens.passes.enters else None
-    found = as_built.retailor(made, AsBuilt(thickness=thickness, index=index))
-    again, effort = found.made, efforts.FULL.between_stages(made.goals, as_built.RAYS)
+    found = as_built.retailor(made, AsBuilt(thickness=thickness, index=index), effort=LITTLE)
+    again, effort = found.made, LITTLE.between_stages(made.goals, as_built.RAYS)
     after = max(light.rrmsd for light in again.lights(again.lens, again.goals, effort))
     if not after < 1.1 * max(found.design, found.before) + MAX_DIFFERENCE:
         yield f"as built: RRMSD {found.design:.3f} designed, {found.before:.3f} before, {after:.3f} after"
@@ -660,9 +614,9 @@ def test_a_refusal_names_both_keys(together, tmp_path, capsys):
     assert all(named.get(value, NAMED[choice]) in str(refusal.value) for choice, value in together)
 
 
-def test_each_value_is_previewed_planned_and_tailored_to_a_blank_and_is_daily():
+def test_each_value_is_previewed_planned_and_tailored_to_a_blank():
     all_values = {value for scene in PAIRS for value in scene.items()}
-    for numbers in (PREVIEWED, PLANNED, RETAILORED, DAILY):
+    for numbers in (PREVIEWED, PLANNED, RETAILORED, EACH_VALUE):
         assert {value for k in numbers for value in PAIRS[k].items()} == all_values
         assert len(set(numbers)) == len(numbers) < len(PAIRS) / 4
 
@@ -689,7 +643,7 @@ MAX_HALF_RATIO_OF_ALL, MAX_HALF_OF_ALL = 2.5, 0.1  # both for every pair, after 
 def test_each_light_is_right_inside_the_pixels(light, wall, picture):
     """Without cells in the merit, even light deviates by 0.05 on half pixels, and letters by 0.2."""
     scene = scene_of(PLAIN | {"light": light, "wall": wall, "picture": picture}).changed(DENSE)
-    made = pipeline.design(scene, options=pipeline.DesignOptions(compare_later=True))
+    made = pipeline.design(scene, options=pipeline.DesignOptions(compare_later=True, effort=LITTLE))
     effort = Effort(512, accuracy=0.0, witness=False, cells=2)
     [found] = measure_goals(made.lens.plain(), scene.channels(), made.goals, effort, ghost=None, sampler=scene.sampler)
     noise = 3 * math.hypot(found.half.standard_error, MAX_HALF_RATIO * found.standard_error)

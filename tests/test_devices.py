@@ -12,14 +12,14 @@ import pytest
 import torch
 
 from bstcad.designs import pipeline
-from bstcad.designs.pipeline import design
+from bstcad.designs.pipeline import DesignOptions, design
 from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.surfaces import bspline
 from bstcad.optics.trace import tubes
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
-from bstcad.tailoring import effort as efforts
 from bstcad.tailoring.driver import Hooks
+from bstcad.tailoring.effort import FULL
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.stage2 import Problem
 from tests import suite
@@ -48,12 +48,8 @@ SAME = {"draft": 1e-6, "paper": 1e-4}
 QUICK = ("beam_shaper", "draft")
 
 
-@pytest.fixture(autouse=True)
-def _briefly_compared(monkeypatch):
-    """Each design looks at float32 beside float64: by one evaluation here, which takes the way of all."""
-    monkeypatch.setattr(efforts, "FULL", replace(efforts.FULL, compared_evaluations=1))
-
-
+# Each design compares float32 with float64: by one evaluation here, which takes the way of all.
+OPTIONS = DesignOptions(effort=replace(FULL, compared_evaluations=1))
 BOUNDED = ("machinable_letters", "paper")  # the paper's procedure knows no bounds on the back
 
 
@@ -89,7 +85,7 @@ def test_so_does_one_for_a_tilted_target_that_loses_light_on_the_way():
 
 def held_to_the_cpu(wanted, quality):
     with SecondDevice() as second:
-        found = design(wanted, device="cuda")
+        found = design(wanted, device="cuda", options=OPTIONS)
     assert second.marked > 1000
     assert not second.mixed
     assert found.device == "cuda"
@@ -97,7 +93,7 @@ def held_to_the_cpu(wanted, quality):
     assert found.lens.front.is_net or isinstance(getattr(found.lens.front, "curvature", 0.0), float)
     searched = quality == "paper" and wanted.source.extent  # by stage 3, in single precision; see the test below
     if quality in SAME and not searched:  # the plain form there, compiled kernels here
-        for net, plain in zip(design(wanted, device="cpu").lens.nets, found.lens.nets, strict=True):
+        for net, plain in zip(design(wanted, device="cpu", options=OPTIONS).lens.nets, found.lens.nets, strict=True):
             off, relief = float((plain.heights - net.heights).abs().max()), float(np.ptp(net.heights.numpy()))
             assert off <= SAME[quality] * relief
 
@@ -150,10 +146,15 @@ def test_resume_brings_everything_back_to_the_device(quality, tmp_path):
         checkpoint.write(kept[-1], {}, state)
 
     with SecondDevice():
-        whole = design(wanted, device="cuda", hooks=Hooks(save=save))
+        whole = design(wanted, device="cuda", options=OPTIONS, hooks=Hooks(save=save))
     for place in sorted({len(kept) // 3, len(kept) - 1}):
         with SecondDevice() as second:
-            again = design(wanted, device="cuda", start=checkpoint.read(kept[place], pipeline.DesignState, "cuda")[1])
+            again = design(
+                wanted,
+                device="cuda",
+                options=OPTIONS,
+                start=checkpoint.read(kept[place], pipeline.DesignState, "cuda")[1],
+            )
         assert second.marked > 0 and not second.mixed
         assert torch.equal(again.lens.back.heights, whole.lens.back.heights)
 
@@ -163,7 +164,7 @@ def test_auto_is_the_cpu_also_where_there_is_a_gpu(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     wanted = scene(TEMPLATES[0], "draft")
     with SecondDevice() as second:
-        found = design(wanted, device="auto")
+        found = design(wanted, device="auto", options=OPTIONS)
     assert found.device == "cpu" and second.marked == 0
     assert pipeline.purpose(wanted, "auto")["device"] == "cpu" and pipeline.purpose(wanted, "cuda")["device"] == "cuda"
 

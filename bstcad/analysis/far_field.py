@@ -13,10 +13,8 @@ from bstcad.optics.light.channels import Channel, SourceSampler
 from bstcad.optics.receivers.directions import Directions
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.trace.measure import (
+    FULL,
     GHOST_DIVISOR,
-    MAX_SOURCE_POINTS,
-    MIN_SOURCE_POINTS,
-    RAYS_PER_POINT,
     SETS,
     GhostTracer,
     side_factor,
@@ -104,9 +102,7 @@ class FarField:
         if self.sampler is None:
             return self.channels
         if self.sampler.largest_side is None:
-            return tuple(
-                self.sampler(min(max(rays // RAYS_PER_POINT, MIN_SOURCE_POINTS), MAX_SOURCE_POINTS), self.seed)
-            )
+            return tuple(self.sampler(FULL.points_for(rays), self.seed))
         parts = (self.sampler(1, part) for part in range(SETS))
         return tuple(replace(channel, weight=channel.weight / SETS) for part in parts for channel in part)
 

@@ -22,7 +22,7 @@ from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.bspline import require_net
 from bstcad.optics.surfaces.outlines import Circle, Outline, Rectangle
 from bstcad.optics.surfaces.rays import Rays
-from bstcad.optics.trace.measure import tubes_of, tubes_picture
+from bstcad.optics.trace.measure import FULL, tubes_of, tubes_picture
 from bstcad.optics.trace.source_images import IMAGE_POINTS_PER_SIDE, detail_width, images
 from bstcad.optics.trace.trace import across, clear_window, launch_strips, to_first_net, trace, window
 from bstcad.optics.trace.unfolding import image_from_lens, per_radian
@@ -133,25 +133,25 @@ def _aperture(hits: Tensor, aperture: Outline) -> Outline | None:
 
 
 @torch.no_grad()
-def rrmsd_of_ripple(channel: Channel, lens: Lens, screen: Screen, face: str) -> float:
+def rrmsd_of_ripple(channel: Channel, lens: Lens, screen: Screen, face: str, *, tubes: int = FULL.tubes) -> float:
     """Return the RRMSD between the pictures of a lens with and without the ripple of a face; 0 without a ripple.
 
-    channel: light of one point of the source.  The ripple that is removed (`Ripple.heights`) fades towards the rim.
-    The RRMSD, which is proportional to the height of a small ripple, is therefore divided by `Ripple.fading`.
+    channel: light of one point of the source.  tubes: minimum flux tubes per side.
+    The ripple that is removed (`Ripple.heights`) fades towards the rim.  The RRMSD, which is proportional to the height
+    of a small ripple, is therefore divided by `Ripple.fading`.
     """
     net = require_net(lens.face(face).surface)
     waves = ripple(net)
     if waves.slope == 0:
         return 0.0
     smooth = lens.with_surface(face, replace(net, heights=net.heights - torch.from_numpy(waves.heights)))
-    n = tubes_of(lens, max(screen.shape))
+    n = tubes_of(lens, max(screen.shape), tubes)
     before, after = (tubes_picture(each, [channel], screen, n).cpu().numpy() for each in (smooth, lens))
     return difference(after, before) / waves.fading
 
 
 # --- light blocked by a mount -----------------------------------------------------------------------------------------
 
-MOUNT_RAYS = 512  # rays per side for `mount_losses`; each of c channels gets MOUNT_RAYS / √c
 MIN_MOUNT_RAYS = 48  # smallest number of rays per side for one channel
 
 
@@ -164,10 +164,16 @@ class MountLosses:
 
 
 @torch.no_grad()
-def mount_losses(lens: Lens, channels: Sequence[Channel], flange: tuple[float, float] | None = None) -> MountLosses:
-    """Return the losses of a lens at its mount; flange: z (mm) of the two ends of its opening; None: no flange."""
+def mount_losses(
+    lens: Lens, channels: Sequence[Channel], flange: tuple[float, float] | None = None, side: int = 512
+) -> MountLosses:
+    """Return the losses of a lens at its mount.
+
+    flange: z (mm) of the two ends of its opening; None: no flange.  side: rays per side; each of c channels gets
+    side / √c.
+    """
     uncut = passing = blocked = 0.0
-    n = max(MIN_MOUNT_RAYS, math.ceil(MOUNT_RAYS / math.sqrt(len(channels))))
+    n = max(MIN_MOUNT_RAYS, math.ceil(side / math.sqrt(len(channels))))
     rim = lens.back.opening(lens.apertures[1])
     for channel in channels:
         own = replace(channel.through(lens), losses=None)

@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from bstcad.planning.net_choice import with_net
-from bstcad.planning.plan import plan
-from bstcad.planning.preview import QUICK, REFINED, Outdated, Preview, preview
+from bstcad.planning.plan import PilotRun, plan
+from bstcad.planning.preview import Outdated, Preview, preview
+from bstcad.planning.reduction import QUICK, REFINED, Reduction
 from bstcad.runs import processes
 from bstcad.scene.new_scene import Plate
 from bstcad.scene.scene import Scene, of_text
@@ -57,7 +58,9 @@ class PreviewRequest:
 class PreviewDesk:
     """Queue of the pages' requests, answered by one thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, sizes: tuple[Reduction, Reduction] = (QUICK, REFINED), pilot: PilotRun | None = None) -> None:
+        """sizes: of the first and of the finer preview.  pilot: of predictions, see `plan`."""
+        self._sizes, self._pilot = sizes, pilot
         self._news = threading.Condition()
         self._requests: dict[str, PreviewRequest] = {}  # latest request, by page
         self._ended = False
@@ -115,7 +118,7 @@ class PreviewDesk:
 
     def _work(self) -> None:
         with contextlib.suppress(Exception):  # load libraries and compile kernels before the first request
-            preview(first_scene(), outdated=lambda: self._ended or bool(self._requests))
+            preview(first_scene(), self._sizes[0], outdated=lambda: self._ended or bool(self._requests))
         while True:
             with self._news:
                 while not self._ended and self._next() is None:
@@ -167,7 +170,7 @@ class PreviewDesk:
                 raise Outdated
 
         if stage in ("preview", "settled"):
-            return preview(request.scene, QUICK if stage == "preview" else REFINED, outdated)
+            return preview(request.scene, self._sizes[stage == "settled"], outdated)
         if stage == "made":
             if request.grade is None and request.light is None:
                 return None
@@ -181,7 +184,7 @@ class PreviewDesk:
             tick()
             scene, choice = with_net(request.scene)
             tick()
-            request.plan = plan(scene, request.text, tick=tick)
+            request.plan = plan(scene, request.text, tick=tick, pilot=self._pilot)
             effects = next(request.plan) | {"net": None if choice is None else choice.line}
         return effects if stage == "effects" else next(request.plan)
 

@@ -79,8 +79,8 @@ CLOUD_ENDINGS = (  # (offset of the first bytes of a file of measured points, th
 class Workbench:
     """Web application of the server, with the previews and runs that the server has started."""
 
-    def __init__(self, workspace: Workspace) -> None:
-        self.workspace, self.desk = workspace, PreviewDesk()
+    def __init__(self, workspace: Workspace, desk: PreviewDesk | None = None) -> None:
+        self.workspace, self.desk = workspace, desk or PreviewDesk()
         self.started: list[Run] = []  # runs that this server has started
         self._valid_texts: dict[str, str] = {}  # latest valid text, by scene; see `take_change`
         scene, design = "/api/scene/{name}", "/api/design/{name}"
@@ -643,12 +643,21 @@ def _flat_values(table: Mapping[str, Any], at: str = "") -> dict[str, str]:
     return found
 
 
-def serve(given: Path | None, port: int, say: Callable[[str], None], show: Callable[[str], Any]) -> None:
-    """Serve the workbench until Ctrl-C.  given: see `Workspace.of`.  say: prints a sentence; show: opens an address."""
+def serve(
+    given: Path | None,
+    port: int,
+    say: Callable[[str], None],
+    show: Callable[[str], Any],
+    desk: PreviewDesk | None = None,
+) -> None:
+    """Serve the workbench until Ctrl-C.
+
+    given: see `Workspace.of`.  say: prints a sentence; show: opens an address.  desk: of previews; None: a new one.
+    """
     workspace, page = Workspace.of(given)
     with bound(port) as own:
         number, token = own.getsockname()[1], secrets.token_urlsafe(24)
-        workbench = Workbench(workspace)
+        workbench = Workbench(workspace, desk)
         guarded = Guard(workbench.app, number, token, larger=(LARGE_BODY_PATHS, LARGEST_UPLOAD))
         address = f"http://127.0.0.1:{number}{page}?token={token}"
         say(f"Workbench: {address}")

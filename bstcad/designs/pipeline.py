@@ -30,7 +30,6 @@ from bstcad.runs import processes
 from bstcad.scene.blank import LensBlank
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
-from bstcad.tailoring import effort as efforts
 from bstcad.tailoring import slope_map, stage1, stage2, two_faces
 from bstcad.tailoring.baselines import integration, paper
 from bstcad.tailoring.driver import (
@@ -49,6 +48,7 @@ from bstcad.tailoring.driver import (
     Steps,
     Task,
 )
+from bstcad.tailoring.effort import FULL, FrontSearch, TailoringEffort
 from bstcad.tailoring.feasibility import find_demand, is_infeasible
 from bstcad.tailoring.grazing import without_reflection
 from bstcad.tailoring.machinability import BOUNDS_STAGE, active_bounds, enforce_bounds, place_back
@@ -112,7 +112,7 @@ class DesignOptions:
 
     merit: PictureError | None = None  # function of a picture and the target that stages 2 and 3 minimise; None: RRMSD²
     compare_later: bool = False  # compare float32 with float64 only when a report needs it (`with_report_data`)
-    effort: efforts.TailoringEffort | None = None  # effort beside the scene's settings; None: FULL
+    effort: TailoringEffort = FULL  # effort beside the scene's settings
     earlier: Earlier | None = None  # earlier lens that stage 2 or 3 refines; None: stage 1 makes a lens
 
 
@@ -150,7 +150,7 @@ def design(
     settings = scene.tailoring.resolved(scene.lens.back.net)
     later = options.compare_later and settings.max_time is None
     task = task_of(scene, goals, settings, edge)
-    task = replace(task, progress=hooks.progress, merit=merit, effort=options.effort or efforts.FULL)
+    task = replace(task, progress=hooks.progress, merit=merit, effort=options.effort)
     if options.earlier is not None:
         if PROCEDURES[settings.method][2] is not stage2.steps:
             raise SceneError(f"tailoring.method: {settings.method!r} refines no earlier lens; remove this key")
@@ -271,7 +271,7 @@ def reachable_part(scene: Scene, goal: Goal) -> tuple[np.ndarray | None, Edge | 
         return found.part, None  # no part of the light is held from total internal reflection yet
     part = found.part
     if part is not None and scene.lens.front.free:  # another front may send light further
-        free, effort = scene.lens.front.free, efforts.FrontSearch(repeats=1)
+        free, effort = scene.lens.front.free, FrontSearch(repeats=1)
         shaped = stage1.shaped_front(light.source, lens, goal, free, rim_sags=scene.rim_sags, effort=effort)
         part = reach_of(light.source, lens.with_front(shaped.front), goal, grazing=grazing).part
     if part is None:

@@ -29,6 +29,7 @@ from bstcad.optics.light.profiles import pair_of
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.surfaces.sides import as_pair
 from bstcad.optics.trace.measure import tubes_picture
+from bstcad.planning.reduction import COARSE, Reduction
 from bstcad.report.record import LEFT_OUT, LeftOut, extent
 from bstcad.report.units import Rows, tables
 from bstcad.scene.effects import Absorption, Effect, Fresnel, Ghost, find_effect, losses
@@ -36,7 +37,6 @@ from bstcad.scene.real_source import DEFAULT_DIAMETER as DEFAULT_DIAMETER
 from bstcad.scene.real_source import DEFAULT_DIVERGENCE as DEFAULT_DIVERGENCE
 from bstcad.scene.real_source import real_size
 from bstcad.scene.scene import Scene
-from bstcad.tailoring.effort import FrontSearch
 from bstcad.tailoring.machinability import place_back
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import Solver, face_grid, fit_to_map, lit_window, slope_map, square_grid
@@ -44,32 +44,30 @@ from bstcad.verify.checks import Proof
 
 # --- a coarse lens ----------------------------------------------------------------------------------------------------
 
-COARSE_POINTS, COARSE_CELLS, COARSE_PIXELS = 33, 32, 64  # control points, transport cells and target pixels per side
-FRONT_NET = 17  # control points per side of the back while a front with free parameters is optimised
-TRANSPORT_ROUNDS, COARSE_STEPS = 2, 40  # rounds of transport and slope fit, and iterations of each transport
-
 
 @torch.no_grad()
-def coarse_lens(scene: Scene) -> Lens:
+def coarse_lens(scene: Scene, size: Reduction = COARSE) -> Lens:
     """Return a lens with nearly the ray angles and path lengths of the finished lens, but with a coarse picture."""
+    front_net, search = size.effort.front_net, size.effort.front_search
+    assert front_net is not None and search is not None, "a coarse lens has a short search for its front"
     channel = _central_channel(scene)
-    lens = channel.through(scene.flat_lens(COARSE_POINTS))
-    picture = _downsample(scene.target.irradiance(), COARSE_PIXELS)
+    lens = channel.through(scene.flat_lens(size.net))
+    picture = _downsample(scene.target.irradiance(), size.pixels)
     rows, columns = picture.shape
     goal = Goal("target", replace(scene.target.screen, pixels=(columns, rows)), picture)
     if scene.lens.front.free:
         from bstcad.tailoring import stage1  # with scipy.optimize, a tenth of a second to load
 
-        start = lens.with_back(scene.flat_lens(FRONT_NET).back)
-        free, effort = scene.lens.front.free, FrontSearch(COARSE_CELLS, COARSE_STEPS, repeats=1)
-        found = stage1.shaped_front(channel.source, start, goal, free, rim_sags=scene.rim_sags, effort=effort)
+        start = lens.with_back(scene.flat_lens(front_net).back)
+        free = scene.lens.front.free
+        found = stage1.shaped_front(channel.source, start, goal, free, rim_sags=scene.rim_sags, effort=search)
         lens = lens.with_front(found.front)
     slopes, z = None, lens.back.z
-    for _ in range(TRANSPORT_ROUNDS):
+    for _ in range(size.rounds):
         window = lit_window(channel.source, lens)
-        grid = square_grid(channel.source, lens, window, COARSE_CELLS)
-        slopes = slope_map(lens, grid, goal, slopes, solver=Solver(COARSE_STEPS))
-        grid = face_grid(channel.source, lens, window, 2 * COARSE_POINTS)
+        grid = square_grid(channel.source, lens, window, size.cells)
+        slopes = slope_map(lens, grid, goal, slopes, solver=Solver(search.iterations))
+        grid = face_grid(channel.source, lens, window, 2 * size.net)
         lens = fit_to_map(lens, slopes, grid, Fit(bending=1e-2, steps=20, degree=3))
         lens = place_back(lens, z, scene.lens.min_thickness)
     return lens

@@ -5,7 +5,7 @@ The sentence of a plan, its table and the page of the workbench state the same p
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -21,7 +21,8 @@ from bstcad.optics.trace.reach import unreached
 from bstcad.planning.cold_run import round_numbers
 from bstcad.planning.effect_estimates import coarse_lens, left_out, simulated
 from bstcad.planning.net_choice import rrmsd_ratio
-from bstcad.planning.prediction import PILOT_QUALITIES, QUALITIES, REMAINING_BLUR, predict, replace_net, run_pilot
+from bstcad.planning.prediction import PILOT_QUALITIES, QUALITIES, REMAINING_BLUR, Pilot, predict, run_pilot
+from bstcad.planning.reduction import replace_net
 from bstcad.report.record import too_steep
 from bstcad.report.units import paragraphs
 from bstcad.runs.processes import Tick
@@ -31,10 +32,18 @@ from bstcad.scene.scene import Scene
 from bstcad.scene.schema import MAX_CONTROL_POINTS
 from bstcad.verify.nominal import DEFAULT_RRMSD_LIMIT
 
+PilotRun = Callable[[Scene, str, Tick], Pilot]  # designs a pilot of a scene in a quality
+
 CAVEAT = "Estimates assume one target and one tailored face; with several, the lens deflects light differently."
 
 
-def plan(scene: Scene, text: str = "", keys: Sequence[str] = (), tick: Tick = lambda: None) -> Iterator[dict[str, Any]]:
+def plan(
+    scene: Scene,
+    text: str = "",
+    keys: Sequence[str] = (),
+    tick: Tick = lambda: None,
+    pilot: PilotRun | None = None,
+) -> Iterator[dict[str, Any]]:
     """Yield the entries of `plan --json`: first the effects, then the predictions (see `predict_qualities`).
 
     simulated: effects that are simulated.  goals: for each target its key, left_out (neglected effects, ordered by
@@ -53,6 +62,7 @@ def plan(scene: Scene, text: str = "", keys: Sequence[str] = (), tick: Tick = la
     verdict: {kind, sentence}, see `verdict`; yielded with the predictions, and with effects that determine the verdict.
 
     text: text of the scene file, for line numbers.  keys: keys that --set sets.  tick: called regularly, may raise.
+    pilot: function that designs a small version of the scene; None: `run_pilot`.
     """
     at, scenes = toml_positions(text), scene.single_target_scenes()
     requested = [{"what": what, "key": key, **_request_of(key, at, keys)} for what, key in simulated(scene)]
@@ -66,7 +76,7 @@ def plan(scene: Scene, text: str = "", keys: Sequence[str] = (), tick: Tick = la
     if early := verdict(scene, entries):
         entries["verdict"] = early
     yield entries
-    prediction = round_numbers(predict_qualities(scene, lenses, tick), 3)
+    prediction = round_numbers(predict_qualities(scene, lenses, tick, pilot), 3)
     yield prediction | {"verdict": verdict(scene, entries | prediction)}
 
 
@@ -162,15 +172,21 @@ def _request_of(key: str, at: Mapping[str, int], keys: Sequence[str]) -> dict[st
 # --- predictions ------------------------------------------------------------------------------------------------------
 
 
-def predict_qualities(scene: Scene, lenses: Sequence[Lens], tick: Tick = lambda: None) -> dict[str, Any]:
+def predict_qualities(
+    scene: Scene,
+    lenses: Sequence[Lens],
+    tick: Tick = lambda: None,
+    pilot: PilotRun | None = None,
+) -> dict[str, Any]:
     """Return {predicted, not_predicted, finer, notes}: predictions for each quality, or the reason why there are none.
 
     notes: remarks on steepness and on limits that end a design early.  finer: {control_points, predicted} for a net
     with twice the spans per side; None: net too large, or no predictions.  lenses: a coarse lens per target.
+    pilot: as in `plan`.
     """
     entries: dict[str, Any] = {"predicted": None, "not_predicted": None, "finer": None, "notes": []}
     try:
-        pilots = {quality: run_pilot(scene, quality, tick) for quality in PILOT_QUALITIES}
+        pilots = {quality: (pilot or run_pilot)(scene, quality, tick) for quality in PILOT_QUALITIES}
     except SceneError as refusal:
         return entries | {"not_predicted": f"a small version of this scene was refused: {refusal}"}
     predicted, steep = predict(scene, pilots), pilots[PILOT_QUALITIES[-1]].steep

@@ -1,7 +1,6 @@
 """Predict time, RRMSD and memory of a design from a pilot: a small version of the same design, run on this machine.
 
-Net, pixels, flux tubes and transport cells of a pilot are those of the scene divided by one factor.  A pixel therefore
-has as many control cells and tubes as in the scene, and the search makes as many evaluations.  The pilot includes all
+The sizes of a pilot are those of the scene divided by one factor (reduction.py).  The pilot includes all
 faces, goals, losses, wavelengths and bounds of the scene.  How the time of each stage scales with its sizes is known
 from the method.  A pilot has no detail finer than its pixels; the error of this detail is estimated from the picture.
 The constants ending in _SECONDS (s) and _GB (GB) are for the sizes UNIT_…, on two cores of pace 1 (`pace`).
@@ -24,9 +23,10 @@ from bstcad.analysis.light import blur
 from bstcad.analysis.steepness import Steepness
 from bstcad.designs import pipeline
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.surfaces.sides import Sides, as_pair, coarser
+from bstcad.optics.surfaces.sides import as_pair
 from bstcad.optics.trace.measure import Effort, measure_goals
 from bstcad.planning.cold_run import KERNEL_REPEATS, calibration_kernel, measure_seconds
+from bstcad.planning.reduction import PILOT, Reduction, pilot_scene, with_quality
 from bstcad.runs.processes import Tick
 from bstcad.scene.scene import Scene
 from bstcad.tailoring.driver import RRMSD_SECONDS, Hooks, Task
@@ -42,10 +42,6 @@ INTERVAL_FACTORS = {"seconds": 1.5, "rrmsd": 1.5, "rrmsd_half": 1.5, "memory_gb"
 
 # --- the pilot --------------------------------------------------------------------------------------------------------
 
-PILOT_LIMITS = 128, 193, 512  # maximum pixels (unless MIN_PILOT_POINTS needs more), control points, tubes per side
-MIN_PILOT_POINTS = 65  # minimum control points per side of a pilot, unless its scene has fewer
-MIN_PILOT_TUBES = 16  # minimum tubes per side of a pilot
-PILOT_CELLS = (16, 256)  # minimum and maximum cells per side of the transport of a pilot
 PILOT_EFFORT = Effort(rays=2048, accuracy=0.02, witness=False, cells=2)  # effort of the measurement of a pilot's RRMSDs
 SEARCH_STAGES = ("stage 2", "stage 3")  # stages that use the minimiser
 
@@ -78,18 +74,24 @@ class Pilot:
     steep: Steepness  # steepness that the map requires of the back
 
 
-def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
-    """Design a small version of a scene in a quality (QUALITIES); raise SceneError if the design is refused."""
-    small, factor = pilot_scene(with_quality(scene, quality))
+def run_pilot(
+    scene: Scene, quality: str, tick: Tick = lambda: None, *, size: Reduction = PILOT, rays: Effort = PILOT_EFFORT
+) -> Pilot:
+    """Design a small version of a scene in a quality (QUALITIES); raise SceneError if the design is refused.
+
+    rays: of the measurement of its RRMSDs.
+    """
+    small, factor = pilot_scene(with_quality(scene, quality), size)
     compilations = RecordingListener()
-    hooks, options = Hooks(progress=lambda *event: tick()), pipeline.DesignOptions(compare_later=True)
+    options = pipeline.DesignOptions(compare_later=True, effort=size.effort)
+    hooks = Hooks(progress=lambda *event: tick())
     make_design = partial(pipeline.design, small, hooks=hooks, options=options)
     with install_listener("numba:compile", compilations):
         finished = make_design()
     if compilations.buffer:  # the first design after an installation waits for the compiler; time another one
         finished = make_design()
     light, finer = small.channels(), factor > 1
-    lights = measure_goals(finished.lens, light, finished.goals, PILOT_EFFORT, ghost=None, sampler=small.sampler)
+    lights = measure_goals(finished.lens, light, finished.goals, rays, ghost=None, sampler=small.sampler)
     rrmsd = max(each.rrmsd for each in lights)
     ratios = [each.half.rrmsd / each.rrmsd for each in lights if each.half is not None and each.rrmsd > 0]
     sides = [max(goal.screen.shape) for goal in finished.goals]
@@ -105,34 +107,6 @@ def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
     lacks = {"detail": lost, "blur": max(0.0, *blurs)}
     errors = {"rrmsd": rrmsd, "half_ratio": max(ratios, default=1.0)}
     return Pilot(small, Seconds(**times), **errors, factor=factor, **lacks, steep=steep)
-
-
-def with_quality(scene: Scene, quality: str) -> Scene:
-    """Return the scene in another quality, without limits that end a design early; all other settings remain."""
-    return scene.changed({"tailoring.quality": quality, "tailoring.accuracy": None, "tailoring.max_time": None})
-
-
-def pilot_scene(scene: Scene) -> tuple[Scene, float]:
-    """Return the scene of a pilot, and the ratio of the pixels per side of the full scene to those of the pilot."""
-    net, (pixels, points, tubes) = scene.lens.back.net, PILOT_LIMITS
-    settings, spans = scene.tailoring.resolved(net), max(as_pair(net)) - 1
-    widest = max(max(target.columns_rows) for target in scene.targets)
-    factor = max(min(max(widest / pixels, spans / (points - 1)), spans / (MIN_PILOT_POINTS - 1)), 1.0)
-    changes: dict[str, Any] = {
-        "tailoring.rays": max(min(round(settings.rays / factor), tubes), MIN_PILOT_TUBES),
-        "tailoring.transport_grid": int(np.clip(round(settings.transport_grid / factor), *PILOT_CELLS)),
-    }
-    for key, target in zip(scene.target_keys, scene.targets, strict=True):
-        changes[f"{key}.pixels"] = target.fewer_pixels(factor)
-    return replace_net(scene, coarser(net, round(spans / factor) + 1), changes), factor
-
-
-def replace_net(scene: Scene, net: Sides, changes: Mapping[str, object] = {}) -> Scene:
-    """Return the scene with another net of the back, a freeform front's net in proportion, and `changes` by key."""
-    nets = {"lens.back.control_points": net, "tailoring.levels": None}
-    if scene.lens.front.is_tailored and scene.lens.front.control_points is not None:
-        nets["lens.front.control_points"] = scene.lens.front_net(net)
-    return scene.changed({**nets, **changes})
 
 
 def detail(picture: np.ndarray, pixels: int) -> float:

@@ -9,6 +9,7 @@ from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.trace.measure import Effort
 from bstcad.tailoring.settings import COARSEST_GRID
 from bstcad.tailoring.slope_fit import Fit
+from bstcad.tailoring.source_image import ErrorRays
 
 
 @dataclass(frozen=True)
@@ -54,12 +55,13 @@ class TailoringEffort:
     trial_cells: int = 64  # cells per side of the transport map in the trial for two faces (feasibility.py)
     trial_pixels: int = 128  # pixels on the longer side of the pictures in this trial
     trial_iterations: int = 100  # largest number of iterations of its map
+    blur: ErrorRays | None = ErrorRays()  # rays that measure the error of the blur by images; None: it is not measured
     compared_net: int = 65  # largest number of control points per side in the comparison of float32 with float64
     compared_tubes: int = 128  # tubes per side in this comparison
     compared_evaluations: int = 6  # evaluations in each precision
     rates_lenses: bool = True  # rate lenses by rays after stages and rounds, keep the best, try costly alternatives
     divides_rounds: bool = True  # divide stages 2 and 3 into rounds
-    refines_merit: bool = True  # rate light inside the pixels, hold it from folding, correct the blur by rays
+    refines_merit: bool = True  # rate light inside the pixels, and hold it from folding
 
     def between_stages(self, goals: Sequence[Goal], factor: float = 1.0) -> Effort:
         """Return `stage`, scaled to the number of pixels of the goals; factor: of the rays per side."""
@@ -73,6 +75,7 @@ PREVIEW = TailoringEffort(
     front_net=17,
     front_search=FrontSearch(cells=32, iterations=40, repeats=1),
     gathering=Gathering(32, Fit(steps=0, degree=5)),  # five times faster
+    blur=None,
     rates_lenses=False,
     divides_rounds=False,
     refines_merit=False,

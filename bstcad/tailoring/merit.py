@@ -71,7 +71,15 @@ from bstcad.optics.trace.tubes import Tubes, arriving_flux, rays_to
 from bstcad.optics.trace.unfolding import image_from_last_net
 from bstcad.optics.trace.wavefront_error import path_from_reference
 from bstcad.tailoring.folds import Folds
-from bstcad.tailoring.source_image import BlurOperator, ExtendedSource, blur_error, blurred, blurs, with_border
+from bstcad.tailoring.source_image import (
+    BlurOperator,
+    ErrorRays,
+    ExtendedSource,
+    blur_error,
+    blurred,
+    blurs,
+    with_border,
+)
 
 LAPLACIAN_POWER = 0.5  # power of the Laplacian in `SobolevVariable`
 FOUR_POINTS = 2.0  # eigenvalue of the Laplacian for waves of four control points along one axis, 2 - 2 cos(π / 2)
@@ -126,19 +134,19 @@ class Merit:
         light = RayTubes.launched(_from_source(lens, wave), channels, n)
         return cls(light, tuple(goals), overshoot, wave=wave)
 
-    def with_blur(self, source: ExtendedSource, lens: Lens, seed: int | None = None) -> Merit:
+    def with_blur(self, source: ExtendedSource, lens: Lens, rays: ErrorRays | None = None, seed: int = 0) -> Merit:
         """Return the merit for a source of finite size; the channels of this merit are the light of its centre.
 
-        seed: seed of the rays that measure the error of the blur, in almost a second per goal; None: no measurement.
+        rays, seed: of the measurement of the error of the blur, in almost a second per goal; None: no measurement.
         """
         exact = lens.plain()
         merit = replace(self, blurs=tuple(blurs(source, exact, goal.screen) for goal in self.goals))
-        if seed is None:
+        if rays is None:
             return merit
         with torch.no_grad():
             images = [merit.picture(k, landed)[0] for k, landed in enumerate(merit.landing(lens).on_goals)]
         errors = (
-            blur_error(image, source.sampler, exact, goal.screen, border=blur.border, seed=seed)
+            blur_error(image, source.sampler, exact, goal.screen, border=blur.border, seed=seed, effort=rays)
             for image, goal, (blur, *_) in zip(images, merit.goals, merit.blurs, strict=True)
         )
         return replace(merit, blur_errors=tuple(errors))

@@ -44,8 +44,6 @@ IMAGE_GRID = 32  # cells per side of the back through which the images of the so
 POINT_DISTANCE = 0.7  # spacing of the 3 x 3 points of the source along each axis, in half widths of the source
 IMAGE_PAIRS = 256  # pairs of source points that represent an image
 PIXEL_PARTS = 5  # parts of a pixel per axis in the images; odd
-ERROR_RAYS = 1448  # square root of the rays per spectral line in each of the two sets for the error of the blur
-ERROR_POINTS = 256  # source points in each of the two sets of rays that measure the error of the blur
 ERROR_SMOOTHING = 0.15  # standard deviation of the smoothing of the blur error / reach of the images (border - 2)
 MAX_TRANSFORM_BYTES, VALUE_BYTES = 2 << 30, 8  # largest size of the transforms of all images, size of one value (bytes)
 MIN_BORDER = 16  # border (pixels) that is always allowed, whatever MAX_TRANSFORM_BYTES and the size of the screen
@@ -53,6 +51,14 @@ ERROR_SEED_OFFSET = 500_009  # offset of the seed of the rays that measure the b
 
 
 @dataclass(frozen=True)
+class ErrorRays:
+    """Numbers of rays in each of the two sets that measure the error of the blur."""
+
+    rays: int = 1448  # square root of the rays per spectral line
+    points: int = 256  # source points
+
+
+@dataclass(frozen=True, eq=False)
 class ExtendedSource:
     """Source of finite size, with the light of its centre."""
 
@@ -213,7 +219,14 @@ def _hats(side: int, border: int) -> np.ndarray:
 
 @torch.no_grad()
 def blur_error(
-    by_images: Tensor, sampler: SourceSampler, lens: Lens, screen: Screen, *, border: int, seed: int
+    by_images: Tensor,
+    sampler: SourceSampler,
+    lens: Lens,
+    screen: Screen,
+    *,
+    border: int,
+    seed: int,
+    effort: ErrorRays = ErrorRays(),
 ) -> Tensor:
     """Return the error E_rays - B E_0 of a picture, (rows, columns), by two sets of rays; 0 if noise hides it.
 
@@ -224,8 +237,8 @@ def blur_error(
     """
     picture, errors = by_images.cpu(), []
     for k in range(2):
-        points = sampler(ERROR_POINTS, seed + ERROR_SEED_OFFSET + k)
-        n = max(1, round(side_factor(points) * ERROR_RAYS))
+        points = sampler(effort.points, seed + ERROR_SEED_OFFSET + k)
+        n = max(1, round(side_factor(points) * effort.rays))
         seed_of_set = seed + ERROR_SEED_OFFSET + k
         [rays] = simulated(lens, points, [screen], n=n, seed=seed_of_set, splits_missed=False)
         left = sum(rays.flux[line] for line in ("on target", "off target", "total internal reflection"))

@@ -169,7 +169,7 @@ class TubeRound:
             merit = replace(merit, folds=tuple(folds))
         if self.source is None:
             return merit
-        return merit.with_blur(self.source, lens, seed=task.settings.seed if task.effort.refines_merit else None)
+        return merit.with_blur(self.source, lens, task.effort.blur, task.settings.seed)
 
     def run(
         self, problem: Problem, variables: NetVariables, position: SearchPosition, total: int,

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -55,7 +56,6 @@ VERIFY_SEED = 1_000_003  # offset of the seed, for rays that tailoring has not u
 # RMS difference relative to its RMS, for the rounding of another processor.
 STORED_NOISE, STORED_TOLERANCE = 3.0, 2e-3
 TARGET_TOLERANCE = 1e-3  # largest change of the target since design.npz / brightest pixel: picture libraries change
-LINE_TUBES = 1031  # smallest number of tubes per side for the picture of one line of a spectrum
 CLEAR_APERTURE_TOLERANCE = 1e-3  # largest distance (mm) between the rims of measured and designed apertures
 MIN_MOUNT_LOSS = 1e-3  # smallest fraction of light cut away by a mount that a failed check states as its reason
 MAX_FLANGE_LIGHT = 1e-3  # largest fraction of the light through the clear apertures that may meet the flange
@@ -135,7 +135,8 @@ def verify(
     return_freed()  # memory of the texts
     lens = _with_design_facts(_result(read, path), nominal.lens)
     whole = face_integrals.of_lens(lens)  # computed, not as stated in the file
-    made_lens, of_aperture, why = (lens, [], "") if read_part is None else _mounted_lens(read_part, lens, nominal, path)
+    mounted = partial(_mounted_lens, side=effort.places // 2)
+    made_lens, of_aperture, why = (lens, [], "") if read_part is None else mounted(read_part, lens, nominal, path)
     on_lens(made_lens)
     lights, lines = zip(*_measure_targets(made_lens, nominal, effort, on_light), strict=True)
     values = light_values(nominal.scene.accept, nominal.goals, lights, lens=made_lens, far=nominal.far_field)
@@ -146,7 +147,7 @@ def verify(
     lights = tuple(replace(light, sets=()) for light in lights)  # frees their memory
     wavefront, of_wavefront = _wavefront_checks(made_lens, nominal)
     cut = as_cut(lens, mount)
-    shape = describe(cut, effort.places) | {"volume": whole.volume} | _ripple_rrmsd(made_lens, nominal)
+    shape = describe(cut, effort.places) | {"volume": whole.volume} | _ripple_rrmsd(made_lens, nominal, effort.tubes)
     stability, of_stability = _stability(made_lens, nominal, lights, shape, rays=effort.places // 2)
     of_shape, at_bounds = bound_checks(cut, nominal.scene.lens, shape)
     optic, accept = lens.passes.optic, nominal.scene.accept
@@ -207,7 +208,8 @@ def _measure_targets(lens: Lens, nominal: Nominal, effort: Effort, on_light: OnL
                 raise SceneError(f"source.rays: {few}; give a file with more rays, or widen lens or target")
             name = "lens.step" if nominal.scene.mount is None else "part.step"
             raise ValueError(f"{name}: none of its light falls on {goal.words}; write it again, or check scene.toml")
-        found.append((light, spectral_lines(lens, nominal.channels, goal, n=max(LINE_TUBES, tubes_of(lens)))))
+        n = tubes_of(lens, fewest=2 * effort.tubes + 5)  # the picture of a line has no rays
+        found.append((light, spectral_lines(lens, nominal.channels, goal, n=n)))
         light, lines = found[-1]
         on_light(replace(light, sets=()), lines, number)  # pictures are drawn in another process
     return found
@@ -219,10 +221,13 @@ def _with_design_facts(lens: Lens, designed: Lens) -> Lens:
     return replace(lens, before=designed.before, behind=designed.behind, tailored=shaped)
 
 
-def _mounted_lens(read: Future[Lens], bare: Lens, nominal: Nominal, path: Path) -> tuple[Lens, list[Check], str]:
+def _mounted_lens(
+    read: Future[Lens], bare: Lens, nominal: Nominal, path: Path, *, side: int
+) -> tuple[Lens, list[Check], str]:
     """Return the lens of part.step, checks of its clear apertures and lost light, and the loss in words, "" if small.
 
     bare: lens of lens.step, returned with the designed apertures if the part cannot be read, which a check reports.
+    side: rays per side for the lost light.
     """
     designed, mount = nominal.lens, nominal.scene.mount
     flange = None if mount is None else mount.flange
@@ -236,7 +241,8 @@ def _mounted_lens(read: Future[Lens], bare: Lens, nominal: Nominal, path: Path) 
         lens = bare.with_clear(designed.clear)
         name = "part.step: clear apertures can be measured"
         checks = [Check.true(name, False, str(error), id="clear-aperture-measured")]
-    losses = mount_losses(lens, nominal.channels, None if flange is None else (flange.z, flange.z + flange.thickness))
+    opening = None if flange is None else (flange.z, flange.z + flange.thickness)
+    losses = mount_losses(lens, nominal.channels, opening, side)
     name = "part.step: light that the mount cuts away, as a fraction of the light through the uncut lens"
     checks.append(Check.at_most(name, losses.cut, None, id="mount-cut"))
     if flange is not None:
@@ -315,12 +321,16 @@ def _ripple_checks(lens: Lens, shape: Mapping[str, float | None]) -> list[Check]
     return [Check.at_most(name, slope, None, "rad", id="ripple") for name, slope in named.items() if slope is not None]
 
 
-def _ripple_rrmsd(lens: Lens, nominal: Nominal) -> dict[str, float]:
-    """Return the RRMSD due to the ripple of the back alone, and of a tailored front alone, by keys of Proof.shape."""
+def _ripple_rrmsd(lens: Lens, nominal: Nominal, tubes: int) -> dict[str, float]:
+    """Return the RRMSD due to the ripple of the back alone, and of a tailored front alone, by keys of Proof.shape.
+
+    tubes: minimum flux tubes per side.
+    """
     light = nominal.heaviest
     channel = replace(light, source=light.source.central, weight=1.0)
     screen, faces = nominal.goals[0].screen, lens.described_faces
-    return {f"{face.prefix}ripple_rrmsd": rrmsd_of_ripple(channel, lens, screen, face.name) for face in faces}
+    rrmsd = partial(rrmsd_of_ripple, channel, lens, screen, tubes=tubes)
+    return {f"{face.prefix}ripple_rrmsd": rrmsd(face=face.name) for face in faces}
 
 
 def bound_checks(

@@ -51,14 +51,15 @@ rays = 160
 # The command line in a process: previews of small nets and few tubes, and predictions without pilots.
 QUICK_PREVIEWS = """
 from dataclasses import replace
-from bstcad.app import preview_desk
+from functools import partial
+from bstcad.app import server
+from bstcad.app.preview_desk import PreviewDesk
 from bstcad.cli import main
-from bstcad.planning import plan, preview
+from bstcad.planning.reduction import QUICK
 from tests.planning.conftest import typical_pilot
-preview_desk.QUICK = replace(preview.QUICK, net=33, tubes=64, rounds=1, evaluations=3, blurred=2)
-preview_desk.REFINED = replace(preview.QUICK, net=49, tubes=96, rounds=1, evaluations=4, blurred=2)
-preview.preview.__defaults__ = preview_desk.QUICK, *preview.preview.__defaults__[1:]  # that of the first scene, too
-plan.run_pilot = typical_pilot
+few = replace(QUICK, net=33, tubes=64, rounds=1, evaluations=3, blurred=2)
+more = replace(QUICK, net=49, tubes=96, rounds=1, evaluations=4, blurred=2)
+server.serve = partial(server.serve, desk=PreviewDesk((few, more), typical_pilot))
 main()
 """
 

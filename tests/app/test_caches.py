@@ -12,7 +12,8 @@ import torch
 
 import bstcad
 from bstcad.photometry import ies
-from bstcad.planning.preview import QUICK, preview
+from bstcad.planning.preview import preview
+from bstcad.planning.reduction import QUICK
 from bstcad.scene.scene import load
 from bstcad.scene.schema import _SHARED
 from tests.benchmarks.cold import TEMPLATES

@@ -13,7 +13,7 @@ from PIL import Image
 import bstcad
 from bstcad.manufacture.tolerance.grades import GRADES
 from bstcad.optics.surfaces.surfaces import sag
-from bstcad.planning.preview import QUICK, REFINED
+from bstcad.planning.reduction import QUICK, REFINED
 from tests.app.conftest import begin
 
 TUTORIALS = Path(__file__).parents[2] / "docs" / "tutorials"

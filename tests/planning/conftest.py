@@ -8,7 +8,8 @@ import pytest
 from bstcad.analysis.steepness import Steepness
 from bstcad.planning import tradeoff
 from bstcad.planning.cold_run import DONE, FAILED, ColdRun, run_and_judge
-from bstcad.planning.prediction import Pilot, pilot_scene, typical_seconds, with_quality
+from bstcad.planning.prediction import Pilot, typical_seconds
+from bstcad.planning.reduction import pilot_scene, with_quality
 from bstcad.runs.cluster import THIS_MACHINE, Answer
 from bstcad.scene.scene import load
 from tests.scenes import DISK, TINY

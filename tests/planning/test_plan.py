@@ -2,18 +2,22 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from bstcad import cli
+from bstcad.optics.trace.measure import Effort
 from bstcad.planning import plan as plans
 from bstcad.planning.effect_estimates import simulated
 from bstcad.planning.plan import plan, predict_qualities
 from bstcad.planning.prediction import PILOT_QUALITIES, QUALITIES, run_pilot
+from bstcad.planning.reduction import PILOT
 from bstcad.scene.errors import toml_positions
 from bstcad.scene.scene import load
 from tests import suite
+from tests.efforts import LITTLE
 
 ROOT = Path(__file__).parent.parent.parent
 TEMPLATES = ROOT / "templates"
@@ -30,7 +34,8 @@ def portrait(net):
 @pytest.fixture(scope="module")
 def flown():
     """The pilots of one scene, by quality."""
-    return {quality: run_pilot(portrait(65), quality) for quality in PILOT_QUALITIES}
+    size, rays = replace(PILOT, effort=LITTLE), Effort(512, accuracy=0.02, witness=False, cells=2)
+    return {quality: run_pilot(portrait(65), quality, size=size, rays=rays) for quality in PILOT_QUALITIES}
 
 
 @pytest.fixture
@@ -232,7 +237,7 @@ class TestCommand:
     def test_effects_are_shown_before_anything_is_predicted(self, capsys, monkeypatch):
         shown = []
 
-        def predict_qualities(scene, lenses, tick):
+        def predict_qualities(*given):
             shown.extend(capsys.readouterr())
             return ENDS
 

@@ -7,35 +7,32 @@ import pytest
 from numba.core.event import Event, EventStatus, broadcast
 
 from bstcad.optics.surfaces.sides import as_pair
-from bstcad.optics.trace.measure import Effort
 from bstcad.planning import prediction
 from bstcad.planning.prediction import (
     Pilot,
     Seconds,
     detail,
     memory_gb,
-    pilot_scene,
     predict,
     predicted_seconds,
     run_pilot,
     typical_seconds,
 )
+from bstcad.planning.reduction import Reduction, pilot_scene
 from bstcad.scene.scene import load
 from bstcad.scene.target import MIN_PIXELS
-from bstcad.tailoring import effort as efforts
 from tests import suite
+from tests.efforts import LITTLE
 
 NET, PIXELS = "lens.back.control_points", "target.pixels"
 THU = load("templates/thu.toml")
-TINY = {"PILOT_LIMITS": (32, 33, 64), "MIN_PILOT_POINTS": 17, "PILOT_CELLS": (16, 32), "pace": lambda: 1.0}
+TINY = Reduction(pixels=32, net=33, cells=32, tubes=64, fewest_points=17, effort=LITTLE)
 
 
 @pytest.fixture
-def tiny(monkeypatch):
-    """Pilots that take a second or so."""
-    for name, value in TINY.items():
-        monkeypatch.setattr(prediction, name, value)
-    monkeypatch.setattr(efforts, "FULL", replace(efforts.FULL, fine=Effort(128, accuracy=0.0, witness=False)))
+def same_pace(monkeypatch):
+    """This machine has the pace of the one to which the constants apply."""
+    monkeypatch.setattr(prediction, "pace", lambda: 1.0)
 
 
 def pilot(scene, *, slower=1.0, factor=4.0):
@@ -61,8 +58,7 @@ def test_the_pilot_of_a_narrow_target_has_pixels_enough():
     assert factor > 1 and min(small.target.columns_rows) >= MIN_PIXELS
 
 
-def test_a_pilot_as_large_as_its_scene_predicts_itself(monkeypatch):
-    monkeypatch.setattr(prediction, "pace", lambda: 1.0)
+def test_a_pilot_as_large_as_its_scene_predicts_itself(same_pace):
     disk = load("templates/disk.toml", {"tailoring.rays": 256})
     known = {quality: pilot(disk, slower=3.0, factor=1.0) for quality in prediction.PILOT_QUALITIES}
     found = predict(disk, known)["standard"]
@@ -73,9 +69,8 @@ def test_a_pilot_as_large_as_its_scene_predicts_itself(monkeypatch):
     assert all(low < likely < high for low, likely, high in found.values())
 
 
-def test_tailoring_takes_as_many_times_longer_as_the_pilot_took_longer(monkeypatch):
+def test_tailoring_takes_as_many_times_longer_as_the_pilot_took_longer(same_pace):
     """A machine of half the pace, or a scene of twice the work: the rest goes by the machine alone."""
-    monkeypatch.setattr(prediction, "pace", lambda: 1.0)
     once, twice = (predicted_seconds(THU, pilot(THU, slower=times)) for times in (1.0, 2.0))
     assert twice - once == pytest.approx(typical_seconds(THU).first + typical_seconds(THU).search)
 
@@ -111,7 +106,7 @@ SCENES = {
 }
 
 
-def test_a_pilot_that_waited_for_the_compiler_is_designed_again(tiny, monkeypatch):
+def test_a_pilot_that_waited_for_the_compiler_is_designed_again(same_pace, monkeypatch):
     """The first design after an installation waits for the compiler: 52 s were predicted where 17 s were found."""
     calls, waits, designed = [], [True, False, False], []
 
@@ -124,17 +119,17 @@ def test_a_pilot_that_waited_for_the_compiler_is_designed_again(tiny, monkeypatc
 
     design = prediction.pipeline.design
     monkeypatch.setattr(prediction.pipeline, "design", compiling)
-    run_pilot(THU, "draft")
+    run_pilot(THU, "draft", size=TINY)
     assert len(calls) == 2
-    run_pilot(THU, "draft")
+    run_pilot(THU, "draft", size=TINY)
     assert len(calls) == 3
 
 
 @pytest.mark.parametrize("name", suite.in_turns(SCENES, 3))
-def test_every_scene_is_predicted(name, tiny):
+def test_every_scene_is_predicted(name, same_pace):
     template, changes = SCENES[name]
     scene = load(f"templates/{template}.toml", {"tailoring.quality": "draft"} | changes)
-    flown = run_pilot(scene, "draft")
+    flown = run_pilot(scene, "draft", size=TINY)
     assert flown.seconds.first > 0 and 0 < flown.rrmsd < 1.5
     found = predict(scene, dict.fromkeys(prediction.PILOT_QUALITIES, flown))["draft"]
     assert all(0 < low < likely < high < np.inf for low, likely, high in found.values())

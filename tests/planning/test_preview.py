@@ -14,7 +14,8 @@ from bstcad.app.preview_desk import STAGES, PreviewDesk, PreviewRequest
 from bstcad.app.preview_json import DARK_SHAPE_ERROR, MIN_LIT_FRACTION, SHAPE_ERROR, figures
 from bstcad.designs import pipeline
 from bstcad.optics.trace.measure import tubes_picture
-from bstcad.planning.preview import Outdated, PreviewSize, preview
+from bstcad.planning.preview import Outdated, preview
+from bstcad.planning.reduction import Reduction
 from bstcad.report.units import quantity
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
@@ -23,7 +24,7 @@ from tests.planning.conftest import typical_pilot
 
 SMALL = {"tailoring.quality": "draft", "lens.back.control_points": 129, "target.pixels": 64}
 NEAR = 0.05  # RRMSD between two pictures
-FEW = PreviewSize(pixels=32, net=33, tubes=64, rounds=1, evaluations=3, blurred=2)
+FEW = Reduction(pixels=32, net=33, cells=48, tubes=64, rounds=1, evaluations=3, blurred=2)
 MORE = replace(FEW, pixels=48, tubes=96)
 
 
@@ -100,12 +101,9 @@ def test_a_scene_that_a_design_would_refuse_is_refused():
 
 
 @suite.in_turn(0, 2)
-def test_the_desk_answers_the_newest_request_of_each_page_in_order(monkeypatch):
+def test_the_desk_answers_the_newest_request_of_each_page_in_order():
     """Previews are small, and predictions have no pilots."""
-    monkeypatch.setattr("bstcad.app.preview_desk.QUICK", FEW)
-    monkeypatch.setattr("bstcad.app.preview_desk.REFINED", MORE)
-    monkeypatch.setattr("bstcad.planning.plan.run_pilot", typical_pilot)
-    desk = PreviewDesk()
+    desk = PreviewDesk((FEW, MORE), typical_pilot)
     scene = load("templates/disk.toml", {"lens.back.control_points": 33, "target.pixels": 16})
     try:
         first = PreviewRequest("one", 1, scene)

@@ -17,7 +17,8 @@ from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.photometry import eulumdat, ies, tm25
 from bstcad.photometry.intensity import Luminaire, checked
 from bstcad.photometry.ray_set import RaySet
-from bstcad.planning.preview import PreviewSize, preview
+from bstcad.planning.preview import preview
+from bstcad.planning.reduction import Reduction
 from bstcad.scene import lamp
 from bstcad.scene.errors import SceneError
 
@@ -172,7 +173,7 @@ def test_a_lamp_whose_rays_start_at_a_point_has_a_preview(ray_scene, tmp_path):
     (tmp_path / "point.tm25ray").write_bytes(tm25.write(rays, Luminaire()))
     scene = ray_scene.changed({"source.rays": str(tmp_path / "point.tm25ray")})
     assert scene.source.extent is None and scene.sampler is not None
-    seen = preview(scene, PreviewSize(pixels=24, net=17, tubes=36, rounds=1, evaluations=2, blurred=1))
+    seen = preview(scene, Reduction(pixels=24, net=17, cells=48, tubes=36, rounds=1, evaluations=2, blurred=1))
     assert all(np.isfinite(picture).all() for pictures in seen.pictures for picture in pictures)
 
 

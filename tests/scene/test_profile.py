@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 from scipy.integrate import dblquad
 from scipy.special import gamma
 
-from bstcad.planning.preview import QUICK, reduced_scene
+from bstcad.planning.reduction import QUICK, reduced_scene
 from bstcad.scene.errors import SceneError
 from bstcad.scene.profile import Profile, corner_area
 from bstcad.scene.scene import load

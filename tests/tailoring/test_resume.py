@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import torch
 
-from bstcad.designs.pipeline import DesignState, design
-from bstcad.optics.trace.measure import Effort
+from bstcad.designs.pipeline import DesignOptions, DesignState, design
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
-from bstcad.tailoring import effort as efforts
 from bstcad.tailoring.driver import Hooks
 from bstcad.tailoring.minimise import AdamState, Best, LbfgsState, adam, lbfgs, minimise
 from tests import suite, two_faces
+from tests.efforts import FEW_RAYS
 from tests.scenes import DISK, DOME, SMALL
 
 TINY = SMALL | {"tailoring.rays": 64, "target.pixels": 32, "tailoring.transport_grid": 32, "tailoring.rounds": 3}
@@ -42,12 +41,8 @@ SCENES = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _few_rays(monkeypatch):
-    """Scenes with bounds are rated by few rays; the law is one of bits, whatever the rays."""
-    monkeypatch.setattr(efforts, "FULL", replace(efforts.FULL, fine=Effort(128, accuracy=0.0, witness=False)))
-
-
+# Scenes with bounds are rated by few rays; the law is one of bits, whatever the rays.
+OPTIONS = DesignOptions(effort=FEW_RAYS)
 QUICK = (
     "dome",
     "least squares, within bounds",
@@ -118,11 +113,11 @@ def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
         checkpoint.write(tmp_path / f"{len(kept)}", {}, state)
         kept.append((1 + (state.followed is not None) + (state.lens is not None), tmp_path / f"{len(kept)}"))
 
-    whole = design(scene, device="cpu", hooks=Hooks(save=save))
+    whole = design(scene, device="cpu", options=OPTIONS, hooks=Hooks(save=save))
     assert {stage for stage, _ in kept} == {1, 2, 3}
     chosen = [[path for s, path in kept if s == stage] for stage in (1, 2, 3)]
     for path in (*(paths[len(paths) // 2] for paths in chosen), kept[-1][1]):
-        again = design(scene, device="cpu", start=checkpoint.read(path, DesignState)[1])
+        again = design(scene, device="cpu", options=OPTIONS, start=checkpoint.read(path, DesignState)[1])
         assert all(map(torch.equal, heights_of(again), heights_of(whole))), path
         assert again.lens.front.is_net or again.lens.front == whole.lens.front
         assert [point.rrmsd for point in again.course.history] == [point.rrmsd for point in whole.course.history]
@@ -138,13 +133,13 @@ def test_an_interrupt_anywhere_gives_a_lens_and_loses_nothing():
     """Asked at every look: before the first round there is no lens; later the best so far, and the way on."""
     scene = load(DISK, SCENES["paper"])
     looks = []
-    whole = design(scene, device="cpu", hooks=Hooks(interrupted=lambda: bool(looks.append(1))))
+    whole = design(scene, device="cpu", options=OPTIONS, hooks=Hooks(interrupted=lambda: bool(looks.append(1))))
     early, lenses = 0, 0
     for after in range(1, len(looks), max(1, len(looks) // 4)):
         count, kept = itertools.count(), []
         try:
             hooks = Hooks(save=kept.append, interrupted=lambda: next(count) >= after)  # noqa: B023
-            found = design(scene, device="cpu", hooks=hooks)
+            found = design(scene, device="cpu", options=OPTIONS, hooks=hooks)
         except KeyboardInterrupt:
             early += 1
             assert not kept
@@ -152,7 +147,7 @@ def test_an_interrupt_anywhere_gives_a_lens_and_loses_nothing():
         lenses += 1
         assert found.course.stopped == "interrupt" and bool(torch.isfinite(found.lens.back.heights).all())
         assert found.lens.back.m == whole.lens.back.m
-        again = design(scene, device="cpu", start=kept[-1] if kept else None)
+        again = design(scene, device="cpu", options=OPTIONS, start=kept[-1] if kept else None)
         assert torch.equal(again.lens.back.heights, whole.lens.back.heights)
         assert again.course.stopped == whole.course.stopped
     assert lenses > 2 and early < 3

@@ -22,7 +22,15 @@ from bstcad.optics.trace.measure import RayTubes, simulated, squared_distance
 from bstcad.scene.quality import Tailoring
 from bstcad.tailoring.driver import Task
 from bstcad.tailoring.merit import Merit
-from bstcad.tailoring.source_image import ExtendedSource, LocalImages, _biquadratic, blur_error, blurs, with_border
+from bstcad.tailoring.source_image import (
+    ErrorRays,
+    ExtendedSource,
+    LocalImages,
+    _biquadratic,
+    blur_error,
+    blurs,
+    with_border,
+)
 from bstcad.tailoring.stage2 import Problem, _overshoot_weight
 from tests.lenses import net
 
@@ -52,9 +60,9 @@ def extended(source):
 GOALS = (Goal("target", SCREEN, np.random.default_rng(0).uniform(0.5, 1.5, SCREEN.shape)),)
 
 
-def merit(source, n=60, goals=GOALS, overshoot=0.03, seed=None):
+def merit(source, n=60, goals=GOALS, overshoot=0.03, rays=None):
     light = extended(source)
-    return Merit.of(light.centre, lens(), n, goals, overshoot).with_blur(light, lens(), seed)
+    return Merit.of(light.centre, lens(), n, goals, overshoot).with_blur(light, lens(), rays)
 
 
 def shown(merit):
@@ -131,7 +139,7 @@ def test_each_of_several_goals_is_blurred_by_images_of_its_own():
 
 @pytest.mark.parametrize("goals", [GOALS, TWO], ids=["one goal", "two"])
 def test_the_gradient_is_that_of_differences(goals):
-    problem, heights = Problem(lens(), merit(SOURCES["disc"], n=50, goals=goals, seed=1)), lens().back.heights
+    problem, heights = Problem(lens(), merit(SOURCES["disc"], n=50, goals=goals, rays=ErrorRays())), lens().back.heights
     _, [gradient], _ = problem([heights])
     way = 1e-6 * torch.from_numpy(np.random.default_rng(2).normal(size=heights.shape))
     ahead, behind = (problem([heights + sign * way])[0] for sign in (1, -1))

@@ -29,8 +29,8 @@ from bstcad.scene.dome_back import RadialBack
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import FIT_SIZES, FileNet, NetFront, fit_net, net_extent
 from bstcad.scene.scene import Scene
-from bstcad.tailoring import effort as efforts
 from bstcad.tailoring.driver import NO_HOOKS, Hooks, NetParameters, Parameters
+from bstcad.tailoring.effort import FULL, TailoringEffort
 
 KEYS = FRONT, "thickness", "index"
 OPTION = "--as-built"
@@ -81,17 +81,17 @@ class Retailored:
         )
 
 
-def retailor(made: DesignedLens, built: AsBuilt, hooks: Hooks = NO_HOOKS) -> Retailored:
+def retailor(made: DesignedLens, built: AsBuilt, hooks: Hooks = NO_HOOKS, effort: TailoringEffort = FULL) -> Retailored:
     """Return the design for a blank as built, from an earlier design; SceneError if a value does not suit the scene."""
     scene, shift = as_built(made, built)
     old = replace(made.lens.plain(), index=made.heaviest.index, losses=None)
     flat = scene.flat_lens(scene.lens.back.net)
     earlier = Earlier(old, _moved(made.lens, flat, shift, scene.lens.dome), made.transport)
-    options = DesignOptions(compare_later=True, earlier=earlier)
+    options = DesignOptions(compare_later=True, effort=effort, earlier=earlier)
     found = design(scene, device=made.device, hooks=hooks, options=options)
     before = earlier.parameters.apply_to(flat)
     states = (made, made.lens), (found, scene.as_mounted(replace(before.plain(), index=scene.index)))
-    rays = efforts.FULL.between_stages(made.goals, RAYS)
+    rays = effort.between_stages(made.goals, RAYS)
     rrmsds = (max(light.rrmsd for light in of.lights(lens, of.goals, rays)) for of, lens in states)
     return Retailored(found, *rrmsds)
 

@@ -60,12 +60,10 @@ SMOOTHING_WIDTHS = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # standard de
 # Exponent: k points of an extended source divide tubes and rays per side by k^SIDE_EXPONENT; the total is constant.
 SIDE_EXPONENT = 0.5
 RAYS_PER_POINT = 1 << 13  # number of rays of each set per point of an extended source
-MIN_SOURCE_POINTS, MAX_SOURCE_POINTS = 8, 1024  # limits of the number of source points of each set
 # Sizes of the cells, in pixels, on which a verification measures the RRMSD; the smallest is 1 / FINEST_CELLS.
 COARSER_CELLS, FINEST_CELLS = (4, 2), 4
 MAX_CELLS = 1 << 22  # largest number of cells of a picture, for the memory: 34 MB for each of SETS pictures and of sums
 BLUR_MARGIN = 4.0  # dark margin around a picture that is blurred, in standard deviations of the blur
-MIN_TUBES = 513  # minimum tubes per side (`tubes_of`): fewer do not resolve pixels
 COARSE_SHEET = 64  # tubes per side of the grid from which finer ones are interpolated, with 1e-6 of the light misplaced
 PASS_SEEDS = 1 << 20  # difference between the seeds of successive passes of rays from an extended source
 GHOST_DIVISOR = 4  # rays per side divided by those of the ghost, which is about a thousandth of the light
@@ -83,6 +81,13 @@ class Effort:
     seconds: float = math.inf  # time limit (s): no sets of rays are started that would end later
     witness: bool = True  # True: flux tubes give a second picture, except in the cases of `Light.witness`
     cells: int = FINEST_CELLS  # cells along each side of a pixel to which the RRMSD is measured; 1: pixels alone
+    tubes: int = 513  # minimum flux tubes per side (`tubes_of`): fewer do not resolve pixels
+    source_points: tuple[int, int] = (8, 1024)  # smallest and largest number of source points of each set of rays
+
+    def points_for(self, rays: int) -> int:
+        """Return the number of source points of a set of `rays` rays per spectral line."""
+        fewest, most = self.source_points
+        return min(max(rays // RAYS_PER_POINT, fewest), most)
 
 
 FULL = Effort()
@@ -214,11 +219,12 @@ def measure_goals(
     rays = sample(setups, effort, PICTURE_NOISE * effort.accuracy / FULL.accuracy)
     given = zip(setups, goals, rays, strict=True)
     witness = effort.witness and sampler is None
-    return [_light(setup, goal, channels, found, witness=witness) for setup, goal, found in given]
+    tubes = effort.tubes if witness else None
+    return [_light(setup, goal, channels, found, tubes=tubes) for setup, goal, found in given]
 
 
-def _light(setup: _Setup, goal: Goal, channels: Sequence[Channel], rays: _Rays, *, witness: bool) -> Light:
-    """Return the light on one receiver; witness: if possible, compare it with a picture by tubes."""
+def _light(setup: _Setup, goal: Goal, channels: Sequence[Channel], rays: _Rays, *, tubes: int | None) -> Light:
+    """Return the light on one receiver; tubes: minimum tubes per side of the witness; None: there is no witness."""
     lens, screen, target, ghost_image = setup.lens, setup.screen, setup.target, setup.ghost
     if not rays.boxes:
         return Light(np.zeros(screen.shape), math.nan, math.inf, rays=rays.count, flux=rays.flux)
@@ -232,7 +238,7 @@ def _light(setup: _Setup, goal: Goal, channels: Sequence[Channel], rays: _Rays, 
     return Light(
         smoothed.numpy(), value, error, rays=rays.count, flux=rays.flux, tent=tent,
         picture_error=error_of_smoothed,
-        witness=_witness(setup, channels, rays) if witness and simple else None,
+        witness=_witness(setup, channels, rays, tubes) if tubes and simple else None,
         ghost=None if ghost_image is None else (ghost_image.picture.cpu() * (total(target) / rays.on_screen)).numpy(),
         leak=leak((sum(rays.boxes, torch.zeros_like(target)) / SETS).numpy(), goal.picture),
         rrmsd_whole=None if goal.whole is None else _value(rays.boxes, torch.from_numpy(goal.whole))[0],
@@ -342,17 +348,17 @@ def _setups(
     return [_Setup(lens, sampler, goal.screen, torch.from_numpy(goal.picture), cells=cells) for goal in goals]
 
 
-def _trace(setups: Sequence[_Setup], side: int, seed: int, counts_cells: bool = True) -> list[_Rays]:
+def _trace(setups: Sequence[_Setup], side: int, effort: Effort, counts_cells: bool = True) -> list[_Rays]:
     """Trace SETS sets, each of about side x side rays per spectral line, to the screens of all `setups` of one lens.
 
     counts_cells: False: the light is counted in pixels alone.
     """
     sets, screens, cells = [], [setup.screen for setup in setups], setups[0].cells if counts_cells else 1
-    count = min(max(side**2 // RAYS_PER_POINT, MIN_SOURCE_POINTS), MAX_SOURCE_POINTS)
+    count = effort.points_for(side**2)
     for i in range(SETS):
-        channels = setups[0].sampler(count, seed + i)
+        channels = setups[0].sampler(count, effort.seed + i)
         n = max(1, round(side_factor(channels) * side))
-        sets.append(simulated(setups[0].lens, channels, screens, n, seed=seed + i, cells=cells))
+        sets.append(simulated(setups[0].lens, channels, screens, n, seed=effort.seed + i, cells=cells))
     return [setup.rays(parts, side) for setup, parts in zip(setups, zip(*sets, strict=True), strict=True)]
 
 
@@ -533,7 +539,7 @@ def _sample(setups: Sequence[_Setup], effort: Effort, max_noise: float = math.in
 
     while True:
         start = time.perf_counter()
-        more = _trace(setups, side, effort.seed, counts_cells=rays is not None or side >= most)  # not the few first
+        more = _trace(setups, side, effort, counts_cells=rays is not None or side >= most)  # not the few first
         if not all(each.boxes for each in more):
             return more
         rays = _joined(rays, more)
@@ -573,8 +579,9 @@ def _sample_source(setups: Sequence[_Setup], effort: Effort, max_noise: float) -
 
     while True:
         start = time.perf_counter()
-        seed = effort.seed + number * PASS_SEEDS  # passes with equal numbers of rays must not repeat them
-        more = _trace(setups, side, seed, counts_cells=rays is not None or side >= most)
+        # passes with equal numbers of rays must not repeat them
+        fresh = replace(effort, seed=effort.seed + number * PASS_SEEDS)
+        more = _trace(setups, side, fresh, counts_cells=rays is not None or side >= most)
         if not all(each.boxes for each in more):
             return more
         rays = _joined(rays, [replace(each, weight=float(side) ** 2) for each in more])
@@ -591,7 +598,7 @@ def _sample_source(setups: Sequence[_Setup], effort: Effort, max_noise: float) -
         side, number = math.ceil(finer), number + 1
 
 
-def _witness(setup: _Setup, channels: Sequence[Channel], rays: _Rays) -> Witness:
+def _witness(setup: _Setup, channels: Sequence[Channel], rays: _Rays, tubes: int) -> Witness:
     """Compare the pictures by rays and by tubes (`_compare`), starting with `tubes_of` tubes per side."""
     lens, screen, target = setup.lens, setup.screen, setup.target
 
@@ -600,7 +607,7 @@ def _witness(setup: _Setup, channels: Sequence[Channel], rays: _Rays) -> Witness
         return flux * (total(target) / total(flux)) if total(flux) > 0 else None
 
     value = math.sqrt(max(squared_distance(rays.boxes, target)[0], 0.0))
-    return _compare(rays.boxes, by_tubes, target, rrmsd_by_rays=value, first=tubes_of(lens, max(screen.shape)))
+    return _compare(rays.boxes, by_tubes, target, rrmsd_by_rays=value, first=tubes_of(lens, max(screen.shape), tubes))
 
 
 def _compare(
@@ -634,15 +641,15 @@ def _compare(
         change = change_from(flux, coarse)
 
 
-def tubes_of(lens: Lens, pixels: int = 0) -> int:
-    """Return the tubes per side for a lens: two per control point, at least MIN_TUBES; pixels: screen pixels per side.
+def tubes_of(lens: Lens, pixels: int = 0, fewest: int = FULL.tubes) -> int:
+    """Return the tubes per side for a lens: two per control point, at least `fewest`; pixels: screen pixels per side.
 
     A lens with two nets gets twice as many, since light deflected by the first net varies within the cells of the
     second.  If a cell of the net lights several pixels, two tubes per pixel are used, at most four per cell.  Five more
     are added, so that lines of the net and corners of tubes do not coincide.
     """
     each = 2 * len(lens.nets)
-    return max(*(each * max(net.side, min(pixels, 2 * net.side)) + 5 for net in lens.nets), MIN_TUBES)
+    return max(*(each * max(net.side, min(pixels, 2 * net.side)) + 5 for net in lens.nets), fewest)
 
 
 @dataclass(frozen=True)

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 import bstcad
-from bstcad import cli
+from bstcad import cli, commands
 from bstcad.manufacture.tolerance.as_made import FORM_ERROR, LAYERS, MARKS, ROUGHNESS, as_made, contrast
 from bstcad.manufacture.tolerance.grades import GRADES, finish_of, graded_table, perturbations
 from bstcad.optics.trace.finish import Finish
-from bstcad.planning.preview import PreviewSize, preview
+from bstcad.planning.preview import preview
+from bstcad.planning.reduction import Reduction
 from bstcad.scene.quality import GRADE_NAMES, Tolerance, tolerance_complaints
 from bstcad.scene.scene import load
 from tests import suite
 from tests.planning.conftest import typical_pilot
 
-FEW = PreviewSize(pixels=40, net=65, tubes=96, rounds=1, evaluations=4, blurred=4)
+FEW = Reduction(pixels=40, net=65, cells=48, tubes=96, rounds=1, evaluations=4, blurred=4)
 SUN = "templates/sun_caustic.toml"
 
 
@@ -102,7 +104,7 @@ def test_finer_layers_make_a_better_picture(plate):
 
 @suite.in_turn(0, 2)
 def test_plan_predicts_the_part_as_made(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("bstcad.planning.preview.REFINED", FEW)
+    monkeypatch.setattr(commands, "predict_as_made", partial(commands.predict_as_made, size=FEW))
     monkeypatch.setattr("bstcad.planning.plan.run_pilot", typical_pilot)
     png = tmp_path / "made.png"
     given = ["plan", SUN, "--made", "resin-printed", "--layer", "0.1", "--made-png", str(png)]
