@@ -100,6 +100,13 @@ def pytest_addoption(parser):
     )
 
 
+def pytest_ignore_collect(collection_path, config):
+    """Modules that are for `make bench` alone are not imported by the other suites: two seconds of each process."""
+    if collection_path.suffix == ".py" and "not bench" in config.getoption("markexpr"):
+        return "\npytestmark = pytest.mark.bench\n" in collection_path.read_text(encoding="utf-8") or None
+    return None
+
+
 @pytest.hookimpl(trylast=True)  # after -m and -k
 def pytest_collection_modifyitems(config, items):
     """Several processes take the longest files first (xdist keeps this order with --no-loadscope-reorder)."""

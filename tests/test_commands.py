@@ -44,7 +44,7 @@ JUDGED = (
 )  # fmt: skip
 DESIGN_TIME = ("seconds_total", "stages", "history", "machine", "versions", "transport", "skipped_steps", "stopped")
 PICTURE = b"\x89PNG\r\n\x1a\n"
-POOR = Effort(64, places=65, points=4096)
+POOR = Effort(64, places=65, points=4096, tubes=97)
 HASTY = {  # settings by which anything is designed at once
     "tailoring.rays": 32, "tailoring.rounds": 1, "tailoring.stage2_iterations": 1, "target.pixels": 16,
 }  # fmt: skip
@@ -324,7 +324,7 @@ class TestVerify:
         ),
     }
 
-    @pytest.mark.parametrize("damage", DAMAGES)
+    @pytest.mark.parametrize("damage", suite.in_turns(DAMAGES, 2))
     def test_what_cannot_be_read_is_one_sentence_and_changes_nothing(self, poor, capsys, damage):
         harm, sentence = self.DAMAGES[damage]
         harm(poor)

@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from bstcad.designs.pipeline import DesignOptions, design
 from bstcad.optics.trace.measure import Effort, measure
 from bstcad.optics.trace.wavefront_error import wavefront_error
 from bstcad.scene.scene import load
 from tests import suite
+from tests.efforts import designed_quickly
 
 PAGE = Path(__file__).parent.parent / "docs" / "how-to" / "two-faces.md"
 
@@ -193,7 +193,7 @@ def is_met(scene, lens):
 def test_a_system_of_the_table_is_designed(name, loaded):
     scene = loaded(DESIGNED[name])
     assert scene.warnings() == ()
-    met, found = is_met(scene, design(scene, options=DesignOptions(compare_later=True)).lens)
+    met, found = is_met(scene, designed_quickly(scene).lens)
     assert met, found
     met, found = is_met(scene, scene.flat_lens(17))
     assert not met, found  # so the bounds tell a failure

@@ -19,7 +19,7 @@ import tomli_w
 import typer
 
 import bstcad
-from bstcad import cli, commands
+from bstcad import cli
 from bstcad.manufacture.tolerance import tolerancing
 from bstcad.optics.surfaces.surfaces import sag
 from bstcad.planning import batch
@@ -27,7 +27,7 @@ from bstcad.planning import tradeoff as sweeping
 from bstcad.runs.processes import ExitStatus
 from bstcad.scene.scene import load
 from tests import suite
-from tests.conftest import draws_nothing, quick_effort, verify_with
+from tests.conftest import draws_nothing, quick_effort, quickly, verify_with
 from tests.planning.conftest import Synthetic, typical_pilot
 from tests.scenes import designed
 
@@ -114,8 +114,8 @@ def workplace(prepared, tmp_path, monkeypatch, request):
     monkeypatch.chdir(place)
     draws_nothing(monkeypatch)
     monkeypatch.setattr("bstcad.figures.rendering.draw", lambda path, picture: bool(picture.write_bytes(b"drawn")))
+    quickly(monkeypatch)
     verify_with(monkeypatch, quick_effort())
-    monkeypatch.setattr(commands, "FULL", quick_effort())  # of a scene with a limit of time
     sweep = sweeping.tradeoff
     monkeypatch.setattr(
         sweeping, "tradeoff",

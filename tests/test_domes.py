@@ -20,6 +20,7 @@ from bstcad.optics.trace.measure import Effort
 from bstcad.scene.errors import SceneError
 from tests import suite
 from tests.conftest import draws_nothing, verify_with
+from tests.efforts import LITTLE
 
 SCENE = """
 name = "dome"
@@ -80,7 +81,7 @@ def designed(tmp_path_factory):
     (path / "dome.toml").write_text(SCENE + MOUNT)
     scene = bstcad.load(path / "dome.toml")
     assert scene.lens.front.outline.radius == pytest.approx(np.sqrt(8.0**2 - 1.0))  # it ends in the flange's lower face
-    options = ProofOptions(Effort(128, places=33, points=64))
+    options = ProofOptions(Effort(128, places=33, points=64, tubes=97), tailoring=LITTLE)
     return commands.generate(scene, path / "out", device="cpu", options=options), path / "out"
 
 
@@ -249,7 +250,7 @@ def _with_pole_moved(path):
 def test_a_damaged_folder_of_a_dome_ends_in_one_sentence(designed, tmp_path, monkeypatch, damage):
     monkeypatch.setattr(commands.processes, "submit", commands.processes.run_here)
     draws_nothing(monkeypatch)
-    verify_with(monkeypatch, Effort(64, places=17, points=33))
+    verify_with(monkeypatch, Effort(64, places=17, points=33, tubes=97))
     folder, (change, sentence) = Path(shutil.copytree(designed[1], tmp_path / "out")), DAMAGES[damage]
     change(folder)
     with pytest.raises((SceneError, ValueError), match=sentence) as refusal:

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import bstcad
+from bstcad.api import Design
 from bstcad.cad import mesh, patches
 from bstcad.designs import pipeline
 from bstcad.exports.data_sheet import DataSheet
@@ -29,6 +30,7 @@ from bstcad.verify.judges import faces, mitsuba
 from bstcad.verify.nominal import Nominal
 from tests import suite
 from tests.conftest import draws_nothing, quick_effort
+from tests.efforts import designed_quickly
 
 OUTLINE = Rectangle(16.0, 16.0)
 
@@ -66,7 +68,7 @@ def design(scene, tmp_path_factory):
     """Return the design of the scene, written."""
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
-        design = bstcad.design(scene, progress=False)
+        design = Design(designed_quickly(scene))
         design.write(tmp_path_factory.mktemp("own") / "disk", progress=False, effort=quick_effort())
     return design
 
@@ -202,7 +204,7 @@ def test_light_over_directions_is_stated_in_degrees(scene, tmp_path, monkeypatch
                            "target.outline": None, "target.pixels": [24, 48], "accept.rrmsd": 0.1,
                            "tailoring.rays": 96})  # fmt: skip
     far = asked.model_copy(update={"targets": (OverDirections(**dict(asked.target)),)})
-    design = bstcad.design(far, progress=False)
+    design = Design(designed_quickly(far))
     report = design.write(tmp_path / "far", progress=False, effort=few)
     assert report.passed and report.rrmsd < 0.05, report
     lit = bstcad.measure(design.lens, far.channels(), far.target.screen, design.target, few)
@@ -283,7 +285,7 @@ def test_light_of_an_emitter_of_its_own_is_spread_evenly(scene, tmp_path, monkey
     draws_nothing(monkeypatch)
     asked = scene.changed({"target.x": [-20.0, 20.0], "target.y": [-20.0, 20.0], "target.outline": None})
     oval = asked.model_copy(update={"source": Oval(5.0, 8.0)})
-    design = bstcad.design(oval, progress=False)
+    design = Design(designed_quickly(oval))
     report = design.write(tmp_path / "oval", progress=False, effort=quick_effort())
     assert report.passed and report.rrmsd < 0.1, report
     assert sum(report.flux.values()) == pytest.approx(1, abs=1e-12)
@@ -407,7 +409,7 @@ def test_an_aspheric_front_of_order_six_becomes_an_exact_face_and_an_effect_is_p
     draws_nothing(monkeypatch)
     front = Asphere(15.0, -0.0005, 2e-7, -1e-10)
     scene = with_effects(scene.changed({"lens.front": front}), bstcad.effect("dust", Dust))
-    design = bstcad.design(scene, progress=False)
+    design = Design(designed_quickly(scene))
     x, y = np.meshgrid(np.linspace(-8, 8, 400), np.linspace(-8, 8, 400))
     assert np.abs(sag(design.lens.front, x, y) - sag(front, x, y)).max() <= 1e-6  # mm
     report = design.write(tmp_path / "own", progress=False, effort=quick_effort())

@@ -10,6 +10,7 @@ import torch
 import bstcad
 from bstcad import commands
 from bstcad.analysis.shape import _grid, survey
+from bstcad.api import Design
 from bstcad.commands import ProofOptions
 from bstcad.optics.kernels import spline
 from bstcad.optics.lens.lens import Lens
@@ -35,6 +36,7 @@ from bstcad.step_text import part21
 from bstcad.tailoring.merit import SobolevVariable, Spectrum
 from tests import lenses
 from tests.conftest import draws_nothing, quick_effort
+from tests.efforts import designed_quickly
 from tests.tracing import from_first_net_plain, stratified
 
 M, N = 33, 9
@@ -173,7 +175,7 @@ def made(tmp_path_factory):
     scene = bstcad.load("templates/caustic_portrait.toml").changed(PLATE)
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
-        design = bstcad.design(scene, progress=False)
+        design = Design(designed_quickly(scene))
         commands.write(design._made, folder, ProofOptions(quick_effort()))
     return folder, design
 

@@ -12,10 +12,12 @@ import torch
 
 import bstcad
 import bstcad.cad.plugin
+from bstcad.api import Design
 from bstcad.optics.trace.measure import Effort
 from tests import suite
 from tests.cad.test_trimming import occ_volume
 from tests.conftest import draws_nothing, verify_with
+from tests.efforts import designed_quickly
 from tests.exact_volume import exact_volume
 
 TEMPLATES = Path(__file__).parent.parent / "templates"
@@ -106,7 +108,9 @@ def other(request, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
         scene = bstcad.load(TEMPLATES / f"{template}.toml").changed({"name": request.param, **changes, **FEW})
-        bstcad.design(scene).write(folder, progress=False, effort=Effort(64, places=65, points=1024))
+        Design(designed_quickly(scene)).write(
+            folder, progress=False, effort=Effort(64, places=65, points=1024, tubes=97)
+        )
     return request.param, folder
 
 
@@ -166,7 +170,7 @@ def quick_scene(design, folder):
 @pytest.fixture
 def quick(monkeypatch):
     draws_nothing(monkeypatch)
-    verify_with(monkeypatch, Effort(64, places=65, points=1024))
+    verify_with(monkeypatch, Effort(64, places=65, points=1024, tubes=97))
 
 
 @suite.in_turn(0, 2)

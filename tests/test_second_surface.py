@@ -11,6 +11,7 @@ from bstcad.scene.effects import Fresnel
 from bstcad.verify.judges.comparison import compare
 from tests import suite
 from tests.conftest import quick_effort
+from tests.efforts import designed_quickly
 from tests.scenes import designed
 from tests.test_seen import letter
 
@@ -58,7 +59,7 @@ def test_batoid_sees_the_same_picture(folder):
 def test_stage_1_aims_through_the_flat_back():
     """The reflecting face alone is shaped: the wall shows the letter upright before stage 2."""
     scene = scene_of(**{"lens.back.optimise": False, "tailoring.levels": [17, 33], "tailoring.stage2_iterations": 1})
-    design = bstcad.design(scene, progress=False)
+    design = designed_quickly(scene)
     assert not design.lens.back.heights.any() and design.lens.back.shape == (33, 33)
     light = bstcad.measure(design.lens, scene.channels(), scene.target.screen, scene.target.irradiance(), EFFORT)
     assert np.corrcoef(light.picture.ravel(), scene.target.irradiance().ravel())[0, 1] > 0.9

@@ -11,11 +11,11 @@ import pytest
 import torch
 from PIL import Image
 
-import bstcad
 from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces.rays import Status
 from bstcad.optics.trace.trace import trace
 from bstcad.scene.scene import load
+from tests.efforts import designed_quickly
 
 SIDE = 24  # number of pixels a side that the person makes out
 RAYS = 500  # each way
@@ -69,7 +69,7 @@ def scenes(tmp_path_factory):
 
 def test_the_person_meant_reads_an_f_and_the_other_one_its_mirror_image(scenes):
     scene = scenes["lens"]
-    lens = bstcad.design(scene, progress=False).lens
+    lens = designed_quickly(scene).lens
     line = (torch.arange(RAYS, dtype=torch.float64) + 0.5) * 20.0 / RAYS - 10.0
     x, y = torch.meshgrid(line, line, indexing="ij")
     landed = trace(scene.source.rays_through(x, y, lens.front.z, 1.0), lens, LevelPlane(320.0))

@@ -10,6 +10,7 @@ import pytest
 
 import bstcad
 from bstcad.analysis.far_field import SEED, FarField, default_grid, grid_of
+from bstcad.api import Design
 from bstcad.optics.lens.losses import FresnelLoss, Losses
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.collimated import CollimatedSource
@@ -23,6 +24,8 @@ from bstcad.optics.trace.trace import ghost_light
 from bstcad.photometry import intensity_files, ray_files
 from bstcad.photometry.intensity import Intensity
 from tests import suite
+from tests.conftest import pictures, quick_effort
+from tests.efforts import designed_quickly
 from tests.lenses import lens_of, net
 from tests.photometry.other_readers import assert_is_an_l, read_by_others
 
@@ -105,6 +108,8 @@ def design(tmp_path_factory):
         "tailoring.stage2_iterations": 3, "effects": [{"kind": "fresnel"}],
         "target": {"kind": "intensity", "x": [-24.0, 24.0], "y": [-24.0, 24.0], "pixels": 48, "text": "L"},
     })  # fmt: skip
-    made = bstcad.design(scene, progress=False)
-    made.write(tmp_path_factory.mktemp("far") / "design", progress=False)
+    made = Design(designed_quickly(scene))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("bstcad.commands.Pictures", pictures("lens"))
+        made.write(tmp_path_factory.mktemp("far") / "design", progress=False, effort=quick_effort())
     return made

@@ -18,6 +18,7 @@ from bstcad.app import design_process, scene_text, server
 from bstcad.app.design_process import State
 from bstcad.app.design_runs import Run
 from bstcad.app.workspace import Workspace
+from tests import suite
 from tests.app.asking import MB, bench, made, png, routes, tree
 from tests.app.conftest import SMALL
 
@@ -145,7 +146,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize("what", FAULTS)
+@pytest.mark.parametrize("what", suite.in_turns(FAULTS, 2))
 def test_no_answer_about_a_faulty_scene_tells_where_the_folders_are(own, monkeypatch, what):
     monkeypatch.setattr(server, "ANSWER_TIMEOUT", 0.01)
     (own.folder / "faulty.toml").write_text(FAULTS[what])
@@ -236,7 +237,7 @@ WRONG = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("asked", WRONG, ids=lambda asked: ascii(asked)[:40])
+@pytest.mark.parametrize("asked", suite.in_turns(WRONG, 4), ids=lambda asked: ascii(asked)[:40])
 def test_no_table_of_json_breaks_the_server_or_the_scene(own, monkeypatch, asked):
     """Any table is refused in a sentence or accepted; then the page opens, and the change can be dropped."""
     monkeypatch.setattr(server, "ANSWER_TIMEOUT", 0.01)

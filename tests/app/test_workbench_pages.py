@@ -21,6 +21,7 @@ from bstcad.app.design_process import JOB, PROGRESS, State
 from bstcad.app.design_runs import Run
 from bstcad.designs import folder as folders
 from bstcad.scene.scene import load
+from tests import suite
 from tests.app.conftest import PATIENCE, SEEN, SMALL, open_scene
 
 
@@ -251,35 +252,42 @@ def test_a_design_goes_on_without_its_page(open_page, shared, tmp_path):
     assert "made" in report.value.title() or "made" in report.value.inner_text("body")
 
 
-def test_two_designs_are_compared_and_nobody_is_shut_out(open_page, shared, small_design):
+LOOKS = {
+    "light": {"color_scheme": "light"},
+    "dark, telephone": {"color_scheme": "dark", "viewport": {"width": 340, "height": 700}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("look", suite.in_turns(LOOKS, 2))
+def test_two_designs_are_compared_and_nobody_is_shut_out(open_page, shared, small_design, look):
     """axe-core finds no serious fault on any page, in light and dark, and on a telephone."""
     from axe_playwright_python.sync_playwright import Axe
 
-    for name, z in (("left", 100.0), ("right", 90.0)):
+    options, left, right = LOOKS[look], f"left-{look[:4]}", f"right-{look[:4]}"
+    for name, z in ((left, 100.0), (right, 90.0)):
         path = shutil.copytree(small_design.folder, shared.folder / name) / folders.SCENE
         text = scene_text.changed(path.read_text(encoding="utf-8"), "name", name)
         path.write_text(scene_text.changed(text, "target.z", z), encoding="utf-8")
     page = open_page(shared.address)
-    for name in ("left", "right"):
+    for name in (left, right):
         page.check(f"input[name=design][value={name}]")
     page.click("text=Compare the chosen designs")
     page.wait_for_selector("#curve path.line-1", state="attached")
     assert {row.locator("th").inner_text() for row in page.locator("tbody tr").all()} == {"name", "target.z"}
-    addresses = ("/", "/scene/small", "/design/left", "/compare?design=left&design=right")
+    addresses = ("/", "/scene/small", f"/design/{left}", f"/compare?design={left}&design={right}")
     found = []
-    for options in ({"color_scheme": "light"}, {"color_scheme": "dark", "viewport": {"width": 340, "height": 700}}):
-        page = open_page(shared.address, bypass_csp=True, **options)
-        for address in addresses:
-            page.goto(shared.root + address)
-            if "scene" in address:
-                page.wait_for_selector(SEEN, timeout=PATIENCE)
-                page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
-            faults = Axe().run(page).response["violations"]
-            found += [
-                (address, options["color_scheme"], fault["id"], node["target"], node["failureSummary"][:150])
-                for fault in faults if fault["impact"] in ("serious", "critical") for node in fault["nodes"][:3]
-            ]  # fmt: skip
-            wide = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
-            if wide > 0:
-                found.append((address, options["color_scheme"], f"{wide} pixels wider than the window"))
+    page = open_page(shared.address, bypass_csp=True, **options)
+    for address in addresses:
+        page.goto(shared.root + address)
+        if "scene" in address:
+            page.wait_for_selector(SEEN, timeout=PATIENCE)
+            page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+        faults = Axe().run(page).response["violations"]
+        found += [
+            (address, options["color_scheme"], fault["id"], node["target"], node["failureSummary"][:150])
+            for fault in faults if fault["impact"] in ("serious", "critical") for node in fault["nodes"][:3]
+        ]  # fmt: skip
+        wide = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+        if wide > 0:
+            found.append((address, options["color_scheme"], f"{wide} pixels wider than the window"))
     assert found == []

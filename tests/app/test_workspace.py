@@ -19,6 +19,7 @@ from bstcad.app.workspace import OpenScene, Workspace
 from bstcad.scene import new_scene, scene_file
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
+from tests import suite
 from tests.app.asking import made, png, tree
 from tests.app.conftest import SMALL
 
@@ -353,7 +354,7 @@ def is_shown(target, what):
     return (value.data if what == "image" else value) == GIVEN[what] and not any(given.values())
 
 
-@pytest.mark.parametrize("light", new_scene.LIGHTS)
+@pytest.mark.parametrize("light", suite.in_turns(new_scene.LIGHTS, 2))
 @pytest.mark.parametrize("what", GIVEN)
 def test_a_new_scene_of_each_light_shows_what_is_given(own, light, what):
     name = own.add(light, **shown(own, what))

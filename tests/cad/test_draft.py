@@ -95,7 +95,7 @@ def test_it_is_a_closed_solid_whose_walls_lean_by_the_draft(front, rim, tmp_path
 
 
 @pytest.mark.parametrize("lean", [LEAN, Draft(4.0), Draft(bevel=0.25)], ids=["both", "draft", "bevel"])
-@pytest.mark.parametrize("rim", RIMS)
+@pytest.mark.parametrize("rim", suite.in_turns(RIMS, 2))
 def test_its_volume_is_that_of_slices(rim, lean):
     lens, wired = plate("plane"), wire(RIMS[rim])
     solid = lens_solid(lens, wired, draft=lean)

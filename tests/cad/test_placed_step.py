@@ -13,6 +13,7 @@ from bstcad.cad.solid import lens_solid
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.step_text import part21
 from bstcad.verify import step_checks
+from tests import suite
 from tests.cad.conftest import FRONT, OUTLINE, rough_back
 
 DIGITS = 1e-12  # cadquery writes directions with twelve; control points lie up to 40 mm from the origin of the lens
@@ -46,7 +47,7 @@ def failed(found):
 
 
 @pytest.mark.parametrize("how", ["stated", "moved coordinates"])
-@pytest.mark.parametrize("move", MOVES)
+@pytest.mark.parametrize("move", suite.in_turns(MOVES, 2))
 def test_a_moved_lens_passes_and_its_placement_is_stated(make_lens, tmp_path, move, how):
     place, words = MOVES[move]
     lens, path = make_lens(m=9), tmp_path / "lens.step"

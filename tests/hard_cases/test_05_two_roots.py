@@ -24,6 +24,7 @@ from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.rays import Status
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
 from bstcad.optics.trace import trace
+from tests import suite
 from tests.by_slope import intersect
 from tests.hard_cases.lenses import DTYPES, ENGINES, NAMES, eps, first_crossing, largest, tracing
 from tests.lenses import SQUARE, N, bundle, net, places, uniform
@@ -51,7 +52,7 @@ STEEP = [(0.5, 3.0, 42.0), (2.0, 6.0, 42.0), (1.0, 12.0, 60.0), (2.0, 12.0, 42.0
 
 
 @DTYPES
-@pytest.mark.parametrize(("depth", "number", "degrees"), STEEP)
+@pytest.mark.parametrize(("depth", "number", "degrees"), suite.in_turns(STEEP, 2))
 def test_of_many_roots_of_a_spline_the_first_ahead_counts(depth, number, degrees, dtype, holds):
     back = waves(depth, number, dtype)
     rays = from_below(back, degrees, 400, dtype)

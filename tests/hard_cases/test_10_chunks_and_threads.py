@@ -40,10 +40,12 @@ from bstcad.optics.trace.measure import RayTubes
 from bstcad.optics.trace.trace import Simulation, from_first_net, to_first_net
 from bstcad.scene.scene import load
 from bstcad.tailoring.baselines.paper import TentMerit
+from bstcad.tailoring.effort import FULL
 from bstcad.tailoring.merit import Merit, SobolevVariable
 from bstcad.tailoring.slope_fit import Fit, fit_slopes
 from bstcad.transport.density import Density
 from tests import suite, two_faces
+from tests.efforts import LITTLE, designed_quickly
 from tests.scenes import DISK, DOME, SMALL
 from tests.tracing import launch, simulated, simulated_plain
 
@@ -259,9 +261,8 @@ QUICK_DESIGNS = {
 def digest_of_a_design(name: str, threads: int) -> str:
     """The control points of a design on so many threads."""
     use_threads(threads)
-    options = pipeline.DesignOptions(compare_later=True)
-    scene = load(DISK, (TAILORED | QUICK_DESIGNS)[name])
-    nets = pipeline.design(scene, device="cpu", options=options).lens.nets
+    scene, effort = load(DISK, (TAILORED | QUICK_DESIGNS)[name]), LITTLE if name in QUICK_DESIGNS else FULL
+    nets = designed_quickly(scene, effort).lens.nets
     return hashlib.sha256(b"".join(net.control_points().tobytes() for net in nets)).hexdigest()
 
 

@@ -19,6 +19,7 @@ from bstcad.tailoring.driver import Hooks
 from bstcad.transport import Density, TransportStep, back_and_forth, mass_error, solve
 from bstcad.transport.mapping import FLOOR, STEPS_PER_GRID
 from bstcad.transport.monge_ampere import MAX_STEPS_FACTOR, newton_on_grids
+from tests import suite
 from tests.scenes import DISK, SMALL
 
 N = 64
@@ -54,7 +55,7 @@ SOURCES = {
 }
 
 
-@pytest.mark.parametrize("source", SOURCES)
+@pytest.mark.parametrize("source", suite.in_turns(SOURCES, 2))
 @pytest.mark.parametrize("target", TARGETS)
 def test_any_target_gets_a_finite_map_and_a_mass_error(holds, source, target):
     values, astray = TARGETS[target]

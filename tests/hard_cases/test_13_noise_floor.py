@@ -29,6 +29,7 @@ from bstcad.optics.trace import trace
 from bstcad.optics.trace.measure import Effort, Light, measure
 from bstcad.scene.accept import Accept
 from bstcad.verify import checks
+from tests import suite
 from tests.tracing import simulated, simulated_plain
 
 APERTURE = Rectangle(20.0, 18.0)
@@ -74,7 +75,7 @@ def slope(errors: list[float], numbers: list[int]) -> float:
     return float(np.polyfit(np.log(numbers), np.log(errors), 1)[0])
 
 
-@pytest.mark.parametrize("dtype", (torch.float32, torch.float64), ids=str)
+@pytest.mark.parametrize("dtype", suite.in_turns((torch.float32, torch.float64), 2), ids=str)
 @pytest.mark.parametrize(("name", "rays", "form", "power"), [
     ("random", by_random, None, -1 / 2), ("stratified", by_strata, simulated, -3 / 4),
     ("stratified", by_strata, simulated_plain, -3 / 4),

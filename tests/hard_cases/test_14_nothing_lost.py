@@ -42,6 +42,7 @@ CONTENTS = {
 }  # fmt: skip
 
 DRAWN = {"figures", "datasheet.pdf"}
+FEW = Effort(256, places=65, points=1024, tubes=97)
 
 
 SCENES = {  # (scene, what makes it small)
@@ -62,7 +63,13 @@ def design_with_checkpoints(folder, name="one face"):
     rendering.lens_picture = lambda mesh: None
     scene = load(*SCENES[name])
     print("ready", flush=True)
-    commands.generate(scene, Path(folder), device="cpu", resume=True, options=ProofOptions(Effort(256)))
+    commands.generate(
+        scene,
+        Path(folder),
+        device="cpu",
+        resume=True,
+        options=ProofOptions(FEW),
+    )
     print("done")
 
 
@@ -115,7 +122,7 @@ def test_ctrl_c_writes_the_best_so_far_and_resume_ends_the_same(tmp_path, monkey
     """The command line itself, with its own checkpoints, against the design that nobody disturbed."""
     monkeypatch.setattr(commands.processes, "submit", commands.processes.run_here)
     draws_nothing(monkeypatch)
-    verify_with(monkeypatch, Effort(256))
+    verify_with(monkeypatch, FEW)
     scene, folder = tmp_path / "small.toml", tmp_path / "lens"
     scene.write_text(load(DISK, SMALL).toml())
     call, calls = stage2.Problem.__call__, []
@@ -169,7 +176,7 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(small_scene, tmp_path, monk
     """
     monkeypatch.setattr(commands.processes, "submit", commands.processes.run_here)  # files of this process may not grow
     draws_nothing(monkeypatch)
-    verify_with(monkeypatch, Effort(256))
+    verify_with(monkeypatch, FEW)
     folder, said = tmp_path / "lens", []
     folder.mkdir()
     (folder / "report.json").write_text("{}")

@@ -61,7 +61,7 @@ def quick_folder(small_design, tmp_path, monkeypatch):
     """The small design in a folder of its own beside nothing else; verified by few rays and without pictures."""
     monkeypatch.setattr(commands.processes, "submit", commands.processes.run_here)
     draws_nothing(monkeypatch)
-    verify_with(monkeypatch, Effort(64, places=65, points=512))
+    verify_with(monkeypatch, Effort(64, places=65, points=512, tubes=97))
     return Path(shutil.copytree(small_design.folder, tmp_path / "design"))
 
 

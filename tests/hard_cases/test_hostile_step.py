@@ -38,7 +38,7 @@ NOISE = "standard error of the RRMSD, times five"  # check that fails by the few
 def folder(small_design, tmp_path, monkeypatch):
     """The small design in an empty place, where temporary files show, too; few points: a change shows anywhere."""
     draws_nothing(monkeypatch)
-    verify_with(monkeypatch, Effort(192, places=65, points=2048))
+    verify_with(monkeypatch, Effort(192, places=65, points=2048, tubes=97))
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setenv("TMPDIR", str(tmp_path / "here"))

@@ -13,12 +13,13 @@ from bstcad.analysis.shape import describe
 from bstcad.cad import step_reading, step_writing
 from bstcad.designs.as_designed import scene_text
 from bstcad.designs.folder import read_nominal
-from bstcad.designs.pipeline import design, resolved
+from bstcad.designs.pipeline import resolved
 from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.report import prescription as prescriptions
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
 from bstcad.tailoring.stage1 import _curvature_of_sag
+from tests.efforts import designed_quickly
 from tests.scenes import DISK, SMALL
 
 FREE = {
@@ -36,7 +37,7 @@ SHAPE = {"centre_thickness": 10.0, "edge_thickness_min": 9.0, "edge_thickness_ma
 @pytest.fixture(scope="module")
 def free():
     """A small disc from a near source, by a lens whose front may be bent."""
-    return design(load(DISK, FREE), device="cpu")
+    return designed_quickly(load(DISK, FREE))
 
 
 def figure(text, name):
@@ -77,7 +78,7 @@ def test_the_resolved_scene_makes_the_same_lens_to_the_last_bit(free, tmp_path):
     path.write_text(scene_text(free.scene, free.lens), encoding="utf-8")
     scene = load(path)
     assert scene.lens.front.curvature == free.lens.front.curvature and scene.lens.front.optimise is False
-    again = design(scene, device="cpu")
+    again = designed_quickly(scene)
     assert again.lens.front.curvature == free.lens.front.curvature
     assert np.array_equal(again.lens.back.control_points(), free.lens.back.control_points())
     assert again.scene == scene

@@ -35,10 +35,10 @@ def test_another_process_always_the_same_does_one_work_after_the_other(fresh, tm
 @pytest.mark.parametrize("awake", [False, True])
 def test_the_second_process_lives_as_long_as_a_long_work_of_this_one(fresh, monkeypatch, awake):
     """Without work it ends, and loads its libraries again for the next one."""
-    monkeypatch.setattr(processes, "IDLE_TIMEOUT", 0.6)
+    monkeypatch.setattr(processes, "IDLE_TIMEOUT", 0.3)
     before = processes.submit(os.getpid).result()
     with processes.kept_awake() if awake else nullcontext():
-        time.sleep(3.0)
+        time.sleep(1.5)
     assert (processes.submit(os.getpid).result() == before) == awake
 
 

@@ -25,9 +25,9 @@ FEW_RAYS = """
 from bstcad import commands
 from bstcad.optics.trace.measure import Effort
 from bstcad.figures.figure_jobs import NoPictures
-from bstcad.verify import checks
-checks.FULL = Effort(256)
-commands.Pictures = NoPictures
+from functools import partial
+few = commands.ProofOptions(Effort(256, places=65, points=1024, tubes=97), NoPictures)
+commands.generate = partial(commands.generate, options=few)
 """
 BOTH = pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
 

@@ -114,7 +114,7 @@ def error_of_picture(lens, profile, rays, pixels=24):
     return math.sqrt((off**2).sum() / (goal.picture**2).sum()), made.flux
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("profile", suite.in_turns(PROFILES, 2))
 def test_the_dome_of_the_equation_makes_an_even_disc(profile):
     """Rays land at φ(θ): the slopes of the net are good to the second order, 0.01° at 129 control points."""
     errors, rho = [], distances(profile)

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.designs import pipeline
 from bstcad.optics.numerics import kernel_choice
 from bstcad.optics.receivers.irradiance import CellTarget, picture_error
 from bstcad.optics.trace.measure import Effort, measure_goals
 from bstcad.scene.scene import Scene, load
 from bstcad.tailoring import folds, stage2
 from tests import suite
+from tests.efforts import designed_quickly
 
 EVEN = """
 name = "even"
@@ -48,7 +48,7 @@ LETTERS = {
     "tailoring.stage2_iterations": 60,
     "tailoring.transport_grid": 128,
 }
-EFFORT = Effort(rays=1448, accuracy=0.0, witness=False)
+EFFORT = Effort(rays=724, accuracy=0.0, witness=False)
 
 
 def even(receiver):
@@ -58,7 +58,7 @@ def even(receiver):
 
 def lit(scene):
     """The light of a scene's design, with its errors by cell."""
-    made = pipeline.design(scene)
+    made = designed_quickly(scene)
     [light] = measure_goals(made.lens.plain(), scene.channels(), made.goals, EFFORT, ghost=None, sampler=None)
     return made.goals[0], light, {each.cell: each.rrmsd for each in light.by_cell}
 

@@ -15,6 +15,7 @@ from bstcad.tailoring.machinability import excess
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.settings import Bounds
 from bstcad.tailoring.stage2 import Problem
+from tests import suite
 from tests.tailoring.test_two_faces import BEAM, WAVES, N, bumpy, goals_of, merit_of, picture
 
 POINT = PointSource((0.5, 0.0, -300.0), half_angle=1.2, wavelength=600.0)
@@ -78,7 +79,7 @@ def ways(nets):
             yield way
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", suite.in_turns(CASES, 2))
 def test_the_gradient_is_that_of_extrapolated_differences(name):
     """Richardson: (4 D(h / 2) - D(h)) / 3 of central differences D errs as h⁴."""
     problem = problem_of(name)

@@ -12,7 +12,6 @@ import torch
 from bstcad import commands
 from bstcad.analysis.shape import describe
 from bstcad.commands import ProofOptions
-from bstcad.designs.pipeline import design
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
@@ -23,6 +22,7 @@ from bstcad.tailoring.machinability import RELIEF_RESERVE, enforce_bounds, exces
 from bstcad.tailoring.settings import Bounds
 from tests import lenses, suite
 from tests.conftest import quick_effort
+from tests.efforts import designed_quickly
 from tests.scenes import DISK, SMALL
 
 PLACE = r"at \([-\d.e]+, [-\d.e]+\) mm"
@@ -38,13 +38,13 @@ WHOLE = Rectangle(4.0, 6.0)
 @pytest.fixture(scope="module")
 def free():
     """The small design that may have any shape: radius 20 mm, slope 3.6 degrees, 9.82 to 10.01 mm thick."""
-    return design(load(DISK, TINY), device="cpu")
+    return designed_quickly(load(DISK, TINY))
 
 
 @pytest.fixture(scope="module")
 def bound():
     """Return a design whose back is bounded by a tool of 50 mm."""
-    return design(load(DISK, TINY | {"lens.tool_radius": 50.0}), device="cpu")
+    return designed_quickly(load(DISK, TINY | {"lens.tool_radius": 50.0}))
 
 
 def steepest(lens):
@@ -124,7 +124,7 @@ def test_each_bound_is_kept_to_where_the_free_lens_does_not(asked, kept_to, free
 def test_a_design_keeps_to_a_range_of_thickness():
     coarse = {"lens.back.control_points": 17, "tailoring.rays": 64, "tailoring.rounds": 1}
     asked = {"tailoring.stage2_iterations": 3, "lens.min_thickness": 9.9, "lens.max_thickness": 10.0}
-    found = describe(design(load(DISK, TINY | coarse | asked), device="cpu").lens)
+    found = describe(designed_quickly(load(DISK, TINY | coarse | asked)).lens)
     assert 9.9 <= found["thickness_min"] <= found["thickness_max"] <= 10.0
 
 
@@ -133,7 +133,7 @@ def test_a_bound_that_no_lens_meets_with_its_light_on_the_target_is_refused():
     aside = {"target.x": [60.0, 100.0], "target.y": [-20.0, 20.0], "target.outline": None, "lens.max_slope": 0.001}
     scene = load(DISK, TINY | {"tailoring.rounds": 2}).changed(aside)
     with pytest.raises(SceneError, match=r"^lens\.max_slope = 0\.001: "):
-        design(scene, device="cpu")
+        designed_quickly(scene)
 
 
 def test_where_bending_does_not_help_the_back_gets_flatter():

@@ -16,6 +16,7 @@ from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.optics.trace.trace import behind
 from bstcad.tailoring.merit import SobolevVariable
 from bstcad.tailoring.net_variables import NetVariables, along_light
+from tests import suite
 from tests.lenses import net
 
 BEAM, POINT = CollimatedSource(aperture=Rectangle(16.0, 16.0)), PointSource((1.0, 0.0, -80.0), half_angle=5.0)
@@ -45,7 +46,7 @@ def jacobian(places, step):
     return torch.stack([torch.stack(torch.gradient(p, spacing=(step, step)), -1) for p in places], -2)
 
 
-@pytest.mark.parametrize("source", [BEAM, POINT], ids=["parallel", "point"])
+@pytest.mark.parametrize("source", suite.in_turns([BEAM, POINT], 2), ids=["parallel", "point"])
 def test_a_change_carried_along_the_light_leaves_the_light_behind_as_it_is(source):
     """Rays move on the near plane, and on the far one just as the unchanged light goes on from there."""
     lens = lens_of()

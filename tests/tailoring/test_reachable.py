@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bstcad import cli
-from bstcad.designs.pipeline import design, reachable_part
+from bstcad.designs.pipeline import reachable_part
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.collimated import CollimatedSource
@@ -22,6 +22,7 @@ from bstcad.tailoring.driver import Edge
 from bstcad.tailoring.grazing import Grazing
 from tests import suite
 from tests.conftest import draws_nothing, quick_effort, verify_with
+from tests.efforts import designed_quickly
 
 SCENE = """
 name = "wide"
@@ -134,12 +135,12 @@ def test_each_of_several_targets_is_cut_to_what_light_can_reach(wide):
     near = "[[target]]\nz = 102.0\nx = [-40.0, 40.0]\ny = [-40.0, 40.0]\npixels = 24\nuniform = true\n"
     wide.write_text(text.replace("[target]", near + "[[target]]"))
     scene = load(wide)
-    made = design(scene.changed({"tailoring.stage2_iterations": 4}))
+    made = designed_quickly(scene.changed({"tailoring.stage2_iterations": 4}))
     part, _ = part_of(scene.single_target_scenes()[1])
     assert made.goals[0].reachable is None and np.array_equal(made.goals[1].reachable, part)
     assert not made.goals[1].picture[~part].any() and made.goals[1].picture[part].all()
     with pytest.raises(SceneError, match=r"^target\[1\]: "):
-        design(scene.changed({"target[1].unreachable": "refuse"}))
+        designed_quickly(scene.changed({"target[1].unreachable": "refuse"}))
 
 
 def test_the_pull_is_zero_up_to_its_angle_and_falls_with_its_gradient():

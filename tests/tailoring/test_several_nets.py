@@ -25,7 +25,7 @@ from bstcad.tailoring.driver import Parameters, Task
 from bstcad.tailoring.machinability import active_bounds, enforce_bounds
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.stage2 import Problem, minimise_merit, steps, variables_of, with_best_nets
-from tests import lenses
+from tests import lenses, suite
 
 N, M, HALF, EVALUATIONS = 1.5, 33, 10.0, 40
 # Square outline, and the beam inside it: the rim of the light moves on the back.
@@ -124,7 +124,7 @@ def test_stage_2_shapes_a_front_and_goes_on_from_where_it_was_left():
     assert all(torch.equal(a.heights, b.heights) for a, b in zip(again.lens.nets, last.lens.nets, strict=True))
 
 
-@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("name", suite.in_turns(BODIES, 2))
 def test_stage_2_alone_shapes_two_nets_of_a_body_with_mirrors(name):
     lens, screen = BODIES[name]
     settings = Tailoring(rays=96, levels=(M,), stage2_iterations=2 * EVALUATIONS, overshoot=0.03).resolved(M)

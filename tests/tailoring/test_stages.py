@@ -12,6 +12,7 @@ from bstcad.scene import scene
 from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.baselines import paper
 from bstcad.tailoring.driver import Driver, Hooks, StageStep, Task
+from bstcad.tailoring.effort import FULL
 from bstcad.tailoring.merit import Landings, Merit
 from tests import suite
 from tests.tracing import simulated
@@ -22,6 +23,7 @@ SMALL = {
     "tailoring.rays": "200",
     "tailoring.transport_grid": "64",
 }
+EFFORT = replace(FULL, fine=replace(FULL.fine, rays=512))  # rays that resolve pictures of 32 x 32 pixels
 
 
 def small(name, **more):
@@ -29,7 +31,7 @@ def small(name, **more):
     wanted = scene.load(f"templates/{name}.toml", SMALL | more)
     settings = wanted.tailoring.resolved(17)
     free = wanted.lens.front.free
-    task = Task(wanted.channels(), wanted.goals, settings, free=free)
+    task = Task(wanted.channels(), wanted.goals, settings, free=free, effort=EFFORT)
     return task, wanted.flat_lens(settings.levels[0])
 
 

@@ -34,7 +34,7 @@ def deepest_gouge(moves, radius, lift, net, outline):
 
 @pytest.mark.parametrize(
     ("outline", "along", "tolerance"),
-    [(Rectangle(6.0, 5.0), "x", 5e-4), (Circle(3.0), "y", 2e-4)],
+    [(Rectangle(4.0, 3.0), "x", 5e-4), (Circle(3.0), "y", 2e-4)],
     ids=["plate", "disc"],
 )
 def test_the_deepest_gouge_is_not_less_than_a_finer_search_finds(outline, along, tolerance):

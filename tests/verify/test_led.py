@@ -20,8 +20,9 @@ from bstcad.report.record import of_json
 from bstcad.scene.scene import load
 from tests import suite
 from tests.conftest import draws_nothing, verify_with
+from tests.efforts import LITTLE
 
-FEW = Effort(256, places=65, points=1024)
+FEW = Effort(256, places=65, points=1024, tubes=97)
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
 LED = {
     "name": "led",
@@ -54,7 +55,9 @@ def made(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
         verify_with(patch, FEW)
-        yield folder, commands.generate(load(TEMPLATES / "disk.toml").changed(LED), folder, device="cpu").facts
+        options = commands.ProofOptions(FEW, tailoring=LITTLE)
+        scene = load(TEMPLATES / "disk.toml").changed(LED)
+        yield folder, commands.generate(scene, folder, options, device="cpu").facts
 
 
 def printed(report):

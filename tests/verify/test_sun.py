@@ -9,7 +9,7 @@ import pytest
 from bstcad import cli
 from tests import suite
 from tests.benchmarks.independent import judge
-from tests.conftest import draws_nothing, quick_effort, verify_with
+from tests.conftest import quickly
 
 SMALL = {
     "lens.back.control_points": 33, "target.pixels": 32, "tailoring.rays": 192, "tailoring.transport_grid": 64,
@@ -21,8 +21,7 @@ SUN = math.radians(0.53) / 2  # angular radius of the sun (rad)
 def plate_of(settings, folder):
     """A plate of 40 x 30 mm that throws letters on a wall 200 mm behind it: its folder."""
     with pytest.MonkeyPatch.context() as patch:
-        draws_nothing(patch)
-        verify_with(patch, quick_effort())
+        quickly(patch)
         patch.chdir(folder)
         assert cli.run(["new", "plate", "--light", "sun", "--size", "40x30", "--distance", "200"]) == 0
         words = [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]

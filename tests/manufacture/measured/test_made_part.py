@@ -125,7 +125,7 @@ FAULTS = {  # a cloud of a lens, the check that fails, words of its sentence
     ),
     "a scale of 1.001": (lambda lens: 1.001 * as_designed(lens), "made-scale", ""),
     "half a face": (lambda lens: half(as_designed(lens)), "made-covered", ""),
-    "another lens": (lambda lens: cloud(with_form_error(lens, 0.05, 1.5), 5000), "made-distance", ""),
+    "another lens": (lambda lens: cloud(with_form_error(lens, 0.05, 1.5), 2000), "made-distance", ""),
 }
 
 

@@ -37,7 +37,7 @@ LENSES = {"bowl": BOWL, "dome": DOME, "nearly flat": NEARLY_FLAT, "oblong": OBLO
 KINDS = ("astigmatism", "coma", "cylinder", "spherical", "trefoil", "random")
 
 
-@pytest.fixture(params=LENSES)
+@pytest.fixture(params=suite.in_turns(LENSES, 2))
 def lens(request):
     return LENSES[request.param]
 

@@ -7,11 +7,13 @@ import pytest
 
 import bstcad
 from bstcad import cli
+from bstcad.api import Design
 from bstcad.manufacture.tolerance.lit_by import LIGHTS, lit_by, scene_lit_by
 from bstcad.optics.trace.measure import Effort, measure
 from bstcad.scene.errors import SceneError
 from bstcad.verify.nominal import Nominal
 from tests import suite
+from tests.efforts import designed_quickly
 
 PLATE = {
     "name": "plate", "source": {
@@ -29,7 +31,7 @@ PLATE = {
 
 @pytest.fixture(scope="module")
 def plate():
-    return bstcad.design(bstcad.load("templates/disk.toml").changed(PLATE), progress=False)
+    return Design(designed_quickly(bstcad.load("templates/disk.toml").changed(PLATE)))
 
 
 def test_the_light_of_the_design_changes_nothing(plate):
@@ -45,7 +47,7 @@ def test_another_light_is_that_of_its_rays(plate, distance):
     found = plate.lit_by("phone", distance=distance)
     scene, away = scene_lit_by(plate.scene, "phone", distance)
     assert away == distance and scene.source.position[2] == -distance
-    light = measure(plate.lens, scene.channels(64), scene.target.screen, plate.target, Effort(1024))
+    light = measure(plate.lens, scene.channels(64), scene.target.screen, plate.target, Effort(512, witness=False))
     picture = light.picture / light.picture.sum()
     [goal] = found.goals
     differs = np.sqrt(((goal.lit - picture) ** 2).sum() / (picture**2).sum())

@@ -14,6 +14,7 @@ from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.outlines import Circle, Rectangle, Rounded
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
 from bstcad.optics.trace import trace
+from tests import suite
 from tests.lenses import lens_of, uniform, wavy
 from tests.optics.kernels.arrays import DTYPES, close
 from tests.optics.lens.test_mirror import LIGHTS, bumpy, mirror
@@ -110,7 +111,7 @@ NETS = {  # a lens, and the rays on their way to its net
 
 
 @pytest.mark.parametrize("plane", PLANES)
-@pytest.mark.parametrize("name", NETS)
+@pytest.mark.parametrize("name", suite.in_turns(NETS, 2))
 def test_the_gradient_in_the_rays_is_that_of_the_plain_form(name, plane):
     """Positions and directions before the face, landings and flux behind it; lost rays have none."""
     lens, source = NETS[name]

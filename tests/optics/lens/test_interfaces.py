@@ -18,7 +18,7 @@ from bstcad.optics.surfaces.rays import Status
 from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere
 from bstcad.optics.trace.trace import across, through, to_first_net, trace
 from bstcad.optics.trace.tubes import launch_tubes
-from tests import lenses
+from tests import lenses, suite
 from tests.lenses import SQUARE, bundle
 from tests.tracing import simulated, stratified
 
@@ -156,7 +156,7 @@ def plainly(rays, interfaces, planes):
 
 
 @pytest.mark.parametrize("plane", PLANES)
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("name", suite.in_turns(SYSTEMS, 2))
 def test_the_gradient_through_several_nets_is_that_of_plain_torch(name, plane):
     lens, found = SYSTEMS[name], []
     goal = PLANES[plane]

@@ -17,6 +17,7 @@ from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.rays import Rays
 from bstcad.optics.surfaces.surfaces import Sphere
 from bstcad.optics.trace.trace import from_first_net, to_first_net
+from tests import suite
 from tests.lenses import SQUARE, lens_of, wavy
 from tests.optics.lens.test_mirror import LIGHTS, bumpy, mirror
 from tests.tracing import from_first_net_plain, stratified
@@ -78,7 +79,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", suite.in_turns(SCENES, 2))
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_kernels_collect_directions_as_the_plain_form_does(name, kind):
     source, lens = SCENES[name]

@@ -16,6 +16,7 @@ from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.optics.trace.finish import Finish, finished_pictures, slope_ratio
+from tests import suite
 from tests.lenses import net
 
 N, HALF, BACK, WALL = 1.49, 12.0, 5.0, 85.0  # index; half side of the plate, vertex of its back, z of the wall (mm)
@@ -77,7 +78,9 @@ def design():
 
 
 # Widths of terraces from 0.3 mm at the rim.  An unpolished print, one polished by hand, and one dipped in resin.
-@pytest.mark.parametrize(("length", "low", "high"), [(0.04, 0.1, 0.35), (0.15, 0.7, 0.9), (0.5, 0.7, 0.9)])
+@pytest.mark.parametrize(
+    ("length", "low", "high"), suite.in_turns([(0.04, 0.1, 0.35), (0.15, 0.7, 0.9), (0.5, 0.7, 0.9)], 2)
+)
 def test_the_picture_of_steps_is_that_of_rays_through_the_stepped_surface(plate, design, length, low, high):
     """50 µm steps: contrast within 10 % (found: 3 %), the light on the screen, and the picture to a fifth."""
     made, truth = predicted(plate, Finish(layer_height=0.05, smoothing_length=length)), traced(0.05, length)
