@@ -66,11 +66,6 @@ class Knob:
     combines: bool = False  # True if the knob varies two other knobs together
 
 
-def other_seed(scene: Scene, point: Settings) -> Settings:
-    """Return the settings `point`, but with the seed of the scene plus one."""
-    return sorted_settings({**dict(point), "tailoring.seed": scene.tailoring.seed + 1})
-
-
 def describe(point: Settings) -> str:
     """Describe settings in words, such as "rays = 512, rounds = 2"."""
     changes = (f"{key.removeprefix('tailoring.')} = {format_value(value)}" for key, value in point)
@@ -181,11 +176,11 @@ def _joint_points(*varied: tuple[str, Any, Sequence[float]]) -> Points:
 # --- order of the runs ------------------------------------------------------------------------------------------------
 
 
-def run_order(scene: Scene, knobs: Sequence[Knob]) -> list[Settings]:
+def run_order(knobs: Sequence[Knob]) -> list[Settings]:
     """Return all runs, the most important first, so that any budget gives the most useful runs.
 
-    First come the preset draft, the base and the preset standard, then neighbours of the base, fast runs with another
-    seed and the preset fine, then further points, and last the preset paper.
+    First come the preset draft, the base and the preset standard, then neighbours of the base and the preset fine, then
+    further points, and last the preset paper.
     """
     presets = knobs[0].points
     single = [knob for knob in knobs[1:] if not knob.combines]
@@ -195,8 +190,7 @@ def run_order(scene: Scene, knobs: Sequence[Knob]) -> list[Settings]:
     def neighbours(varied: Iterable[Knob], *distances: int) -> list[Settings]:
         return [point for steps in distances for knob in varied for point in _neighbour(knob, steps) if point != paper]
 
-    repeated = [other for _, other in _probes(scene, knobs).values()]
-    order = [presets.get("draft", ()), (), presets.get("standard", ()), *neighbours(single, -1), *repeated]
+    order = [presets.get("draft", ()), (), presets.get("standard", ()), *neighbours(single, -1)]
     order += [*neighbours(joint, -1), *neighbours(single, +1), presets.get("fine", ()), *neighbours(joint, +1)]
     order += [*neighbours(single, -2, -3, -4), *neighbours(knobs[1:], 2, -2, 3, -3, 4, -4), paper]
     return list(dict.fromkeys(order))
@@ -210,22 +204,6 @@ def _neighbour(knob: Knob, steps: int) -> list[Settings]:
     points = list(knob.points.values())
     start = points.index(()) if () in points else 1 if steps == -1 else 0 if steps > 0 else -1
     return points[start + steps : start + steps + 1] if start + steps >= 0 else []
-
-
-def _probes(scene: Scene, knobs: Sequence[Knob]) -> dict[str, tuple[Settings, Settings]]:
-    """Return for each method the settings of a fast run, and these settings with another seed."""
-    by_key = {knob.key: knob.points for knob in knobs}
-    quick = {"least-squares": by_key["quality"].get("draft"), "adam": next(iter(by_key.get("adam", {}).values()), None)}
-    return {method: (point, other_seed(scene, point)) for method, point in quick.items() if point is not None}
-
-
-def seed_matters(scene: Scene, knobs: Sequence[Knob], runs: Mapping[Settings, ColdRun]) -> dict[str, bool | None]:
-    """Return for each method True if another seed gives another lens; None: not measured."""
-    nets = {
-        method: [runs[point].net for point in pair if point in runs and runs[point].done]
-        for method, pair in _probes(scene, knobs).items()
-    }
-    return {method: pair[0] != pair[1] if len(pair) == 2 else None for method, pair in nets.items()}
 
 
 # --- the sweep --------------------------------------------------------------------------------------------------------
@@ -298,7 +276,7 @@ class _Sweep:
     def __init__(self, base: Scene, budget: float, folder: Path, progress: Progress) -> None:
         self._base, self._budget, self._folder, self._progress = base, budget, folder, progress
         self._knobs = knobs(base)
-        self._order, self._work = run_order(base, self._knobs), cache(partial(predicted_work, base))
+        self._order, self._work = run_order(self._knobs), cache(partial(predicted_work, base))
         self._under_way: dict[Settings, tuple[float, float]] = {}  # (start time, predicted seconds) of current runs
         self._file = folder / "runs" / f"{environment.version()}.json"
         self.runs: dict[Settings, ColdRun] = {}  # runs that have ended
@@ -434,7 +412,7 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
         calibration=Calibration.of(unit),
         runs=tuple(map(described, runs)),
         knobs=tuple(
-            TableKnob(key=knob.key, title=knob.title, places=knob_points(scene, knob, selected, timed=bool(comparable)))
+            TableKnob(key=knob.key, title=knob.title, places=knob_points(knob, selected, timed=bool(comparable)))
             for knob in knobs
         ),
         front=on_front,
@@ -442,7 +420,6 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
         presets=tuple(
             Preset(name=name, seconds=t if comparable else None, rrmsd=e) for name, (t, e) in presets.items()
         ),
-        seeds=seed_matters(scene, knobs, {run.settings: run for run in runs}),
         history=comparable[()].history if () in comparable else (),
     )
 
@@ -453,32 +430,24 @@ def _judged_on(scene: Scene) -> str:
     return f"the target with the largest RRMSD, of {sizes}" if len(scene.targets) > 1 else sizes
 
 
-def knob_points(
-    scene: Scene, knob: Knob, runs: Mapping[Settings, ColdRun], timed: bool = True
-) -> tuple[KnobPoint, ...]:
-    """Return the points of a knob that were run, as medians over the seeds; timed: True if times are comparable."""
-    averages = []
-    for label, point in knob.points.items():
-        if done := [runs[each] for each in (point, other_seed(scene, point)) if each in runs and runs[each].done]:
-            times, errors = zip(*(run.time_and_error for run in done), strict=True)
-            seconds = statistics.median(times) if timed else None
-            middle: dict[str, Any] = {"seconds": seconds, "rrmsd": statistics.median(errors)}
-            extent: dict[str, Any] = {"lowest": min(errors), "highest": max(errors), "seeds": len(done)}
-            averages.append(KnobPoint(label=label, settings=point, **middle, **extent))
-    return tuple(averages)
+def knob_points(knob: Knob, runs: Mapping[Settings, ColdRun], timed: bool = True) -> tuple[KnobPoint, ...]:
+    """Return the points of a knob that were run; timed: True if times are comparable."""
+    found = ((label, runs[point]) for label, point in knob.points.items() if point in runs and runs[point].done)
+    times = ((label, run, run.time_and_error) for label, run in found)
+    return tuple(
+        KnobPoint(label=label, settings=run.settings, seconds=seconds if timed else None, rrmsd=rrmsd)
+        for label, run, (seconds, rrmsd) in times
+    )
 
 
 def _knob_keys(knobs: Sequence[Knob], point: Settings) -> tuple[str, ...]:
-    """Return the keys of the knobs with a point at these settings, with any seed; ("base",) for the base scene."""
-    without = tuple(entry for entry in point if entry[0] != "tailoring.seed")
-    return tuple(knob.key for knob in knobs if without in knob.points.values()) if without else ("base",)
+    """Return the keys of the knobs with a point at these settings; ("base",) for the base scene."""
+    return tuple(knob.key for knob in knobs if point in knob.points.values()) if point else ("base",)
 
 
 def _labels(scene: Scene, knobs: Sequence[Knob]) -> dict[Settings, str]:
     labels: dict[Settings, str] = {(): f"{scene.tailoring.quality} (the unchanged scene)"}
     for knob in knobs:
         for label, point in knob.points.items():
-            name = label if knob.key == "quality" else f"{knob.title}: {label}"
-            labels.setdefault(point, name)
-            labels.setdefault(other_seed(scene, point), f"{name}, seed {scene.tailoring.seed + 1}")
+            labels.setdefault(point, label if knob.key == "quality" else f"{knob.title}: {label}")
     return labels

@@ -179,7 +179,7 @@ def swept(scene: str, budget: float) -> Record:
 def as_record(facts: Record) -> Record:
     """The parts of tradeoff.json that figure and page show."""
     ran = [run for run in facts["runs"] if run["status"] == "done"]
-    seen = ("label", "seconds", "rrmsd", "lowest", "highest", "seeds")
+    seen = ("label", "seconds", "rrmsd")
     kept = ("title", "budget_seconds", "spent_seconds", "calibration", "reference", "presets", "front_halving")
     return {
         **{name: facts[name] for name in kept},
