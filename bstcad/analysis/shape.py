@@ -23,8 +23,8 @@ from bstcad.optics.lens.interfaces import intersect
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.bspline import QUARTERS, BSplineSurface, span_points, weights
 from bstcad.optics.surfaces.outlines import EVERYWHERE, Outline
-from bstcad.optics.surfaces.radial import dot, require_radial
-from bstcad.optics.surfaces.rays import Rays, Status
+from bstcad.optics.surfaces.radial import require_radial
+from bstcad.optics.surfaces.rays import Rays, Status, dot
 from bstcad.optics.surfaces.sampling import sample_rim
 from bstcad.optics.surfaces.surfaces import points_on, sag
 
