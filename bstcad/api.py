@@ -34,6 +34,7 @@ from bstcad.manufacture.measured.compensation import CompensationSettings as Com
 from bstcad.manufacture.shop.as_built import AsBuilt
 from bstcad.manufacture.shop.rounds import Compensated
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK, FRONT
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.sides import as_pair, simplified, size_text
 from bstcad.optics.surfaces.surfaces import Surface
@@ -162,7 +163,7 @@ class Design:
         m, n = (max(count, MIN_ROUND_POINTS) for count in found.shape)
         net = self.scene.flat_lens((m, n)).back_net
         back = replace(net, z=self.lens.back.z, heights=torch.from_numpy(found.astype(np.float64)))
-        return self.with_lens(replace(self.lens, back=back))
+        return self.with_lens(self.lens.with_back(back))
 
     def solid(
         self, trim: Any = None, holes: Sequence[Any] = (), body: Any = None, *, draft: float = 0.0, bevel: float = 0.0
@@ -463,7 +464,7 @@ def _adapted(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
     if not (isinstance(lens, Lens) and isinstance(getattr(lens.back, "heights", None), torch.Tensor)):
         given = type(lens.back if isinstance(lens, Lens) else lens).__name__
         raise SceneError(f"with_lens: {given} is not possible; give a bstcad.Lens with a bstcad.BSplineSurface as back")
-    lens, shape = replace(lens.plain(), losses=None, clear=None), tuple(lens.back_net.heights.shape)
+    lens, shape = replace(lens.plain(), losses=None).with_clear(None), tuple(lens.back_net.heights.shape)
     if len(shape) != 2:
         raise SceneError(f"with_lens: heights of shape {shape} are not possible; give (m, n), m along x and n along y")
     _check_same("outline", lens.outline, scene.lens.outline)
@@ -477,13 +478,13 @@ def _adapted(lens: Lens, scene: Scene, front: Surface) -> tuple[Scene, Lens]:
     if shapes_front and lens.front_net.shape != as_pair(scene.lens.nets()[1]):
         scene = scene.changed({"lens.front.control_points": simplified(lens.front_net.shape), "lens.front.file": None})
     flat = scene.flat_lens(net.shape)
-    back = _on_net(net, flat.back_net, "back")
+    back = _on_net(net, flat.back_net, BACK)
     if shapes_front:
-        lens = lens.with_front(_on_net(lens.front_net, flat.front_net, "front"))
+        lens = lens.with_front(_on_net(lens.front_net, flat.front_net, FRONT))
     elif not same_front(lens.front, front):
         scene = scene.changed({"lens.front": lens.front})
         lens = lens.with_front(scene.lens.front_surface)  # a net, if the front is of a user's class
-    return scene, scene.assembled(replace(lens, back=back, index=scene.index))
+    return scene, scene.assembled(replace(lens, index=scene.index).with_back(back))
 
 
 def _on_net(face: BSplineSurface, net: BSplineSurface, name: str) -> BSplineSurface:

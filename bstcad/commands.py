@@ -480,7 +480,7 @@ def _write_report(
     for name, picture in pictures.items():
         if picture is not None:
             files.put(folder / "figures" / f"{name}.png", picture)
-    prescribed = prescription.prescription(made.scene, replace(made.lens, clear=lens.clear), contents.shape or {})
+    prescribed = prescription.prescription(made.scene, made.lens.with_clear(lens.clear), contents.shape or {})
     page = report.html(
         contents,
         pictures,

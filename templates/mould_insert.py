@@ -33,7 +33,7 @@ try:
             "moulding.shrinkage: a round rim needs one shrinkage along x and y; cut the block with cavity.step instead"
         )
     lowest = net[..., 2].min() - below
-    insert = bstcad.Lens(bstcad.Plane(lowest), face, rim, design.lens.index)
+    insert = bstcad.Lens.between(bstcad.Plane(lowest), face, rim, design.lens.index)
 
     reach = max(rim.half_extent) * 1.5  # mm
     foot = cq.Workplane("XY", origin=(0, 0, lowest)).circle(reach + 6).extrude(shoulder)

@@ -77,7 +77,7 @@ def lens_of(
     **more,
 ) -> Lens:
     """Return a lens: by default a ball's front before `wavy`; more: other fields of Lens."""
-    return Lens(front or Sphere(15.0, -0.02), back or wavy(), outline, index, **more)
+    return Lens.between(front or Sphere(15.0, -0.02), back or wavy(), outline, index, **more)
 
 
 def bundle(position, direction, dtype: torch.dtype = torch.float64) -> Rays:

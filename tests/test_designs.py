@@ -84,7 +84,7 @@ class TestDesign:
 def bumped(lens, by=2e-4):
     """The lens with a gentle wave on its back (mm)."""
     wave = torch.linspace(0, 6, lens.back.m, dtype=torch.float64).sin()
-    return replace(lens, back=replace(lens.back, heights=lens.back.heights + by * wave[:, None] * wave))
+    return lens.with_back(replace(lens.back, heights=lens.back.heights + by * wave[:, None] * wave))
 
 
 class TestOwnSurfaces:
@@ -116,7 +116,7 @@ class TestOwnSurfaces:
         design = made.with_heights(bumped(made.lens).back.heights)
         assert torch.equal(design.lens.back.heights, bumped(made.lens).back.heights)
         assert design.lens.front == made.lens.front and design.scene == made.scene
-        held = replace(made.lens, clear=(bstcad.Circle(1.0), bstcad.Circle(1.0)))  # by a mount that this scene lacks
+        held = made.lens.with_clear((bstcad.Circle(1.0), bstcad.Circle(1.0)))  # by a mount that this scene lacks
         assert made.with_lens(held).lens.clear is None
         net = design.lens.back.control_points()
         assert np.array_equal(made.with_heights(net[..., 2] - made.lens.back.z).lens.back.control_points(), net)
@@ -127,7 +127,7 @@ class TestOwnSurfaces:
         assert flat.lens.back.x == pytest.approx((-4 * 48 / 44, 4 * 48 / 44))  # two of its spans past the rim
         oblong = made.with_heights(np.zeros((33, 32)))
         assert oblong.scene.lens.back.control_points == (33, 32) and oblong.lens.back.shape == (33, 32)
-        other = made.with_lens(replace(made.lens, front=bstcad.Conic(14.0, 0.004, -0.5)))
+        other = made.with_lens(made.lens.with_front(bstcad.Conic(14.0, 0.004, -0.5)))
         assert other.scene.lens.front.surface == bstcad.Conic(14.0, 0.004, -0.5)
         assert other.scene.target == made.scene.target and torch.equal(other.lens.back.heights, made.lens.back.heights)
 
@@ -147,7 +147,7 @@ class TestOwnSurfaces:
             r"with_heights: numbers of shape \(33, 32, 1\) .*; give \(m, n\) numbers",
         ),
         (lambda d: d.with_heights(np.zeros((4, 4))), "control_points: 4 is not between 5 and 2049"),
-        (lambda d: d.with_lens(replace(d.lens, front=bstcad.Plane(26.0))), "the lens is -1 mm thick at its centre"),
+        (lambda d: d.with_lens(d.lens.with_front(bstcad.Plane(26.0))), "the lens is -1 mm thick at its centre"),
     )
 
     @pytest.mark.parametrize(("change", "sentence"), WRONG)
@@ -157,7 +157,7 @@ class TestOwnSurfaces:
 
 
 def net(design, **more):
-    return replace(design.lens, back=replace(design.lens.back, **more))
+    return design.lens.with_back(replace(design.lens.back, **more))
 
 
 class TestTransport:
@@ -229,7 +229,7 @@ class TestWrite:
         def full(*given, **more):
             raise OSError(28, "No space left on device", str(tmp_path / "out"))
 
-        other = bstcad.Design(replace(fresh._made, lens=replace(fresh.lens, back=fresh.lens.back.moved(25.5))))
+        other = bstcad.Design(replace(fresh._made, lens=fresh.lens.with_back(fresh.lens.back.moved(25.5))))
         with monkeypatch.context() as broken:
             broken.setattr(commands.folders, "write_geometry", full)
             for design, name in ((fresh, "out-unwritten"), (other, "out-unwritten-2"), (fresh, "out-unwritten")):

@@ -133,7 +133,7 @@ def same_merit_and_gradient(wanted):
 def evaluated(wanted, heights):
     """(merit, gradient) of a shallow bowl as the back face."""
     lens = wanted.flat_lens(33).to(heights.dtype, heights.device)
-    lens = replace(lens, back=replace(lens.back, heights=heights * 1e-3 * wanted.lens.outline.half_extent[0]))
+    lens = lens.with_back(replace(lens.back, heights=heights * 1e-3 * wanted.lens.outline.half_extent[0]))
     merit = Merit.of(wanted.channels(), lens, 48, wanted.goals, 0.03)
     value, gradients, _ = Problem(lens, merit)([net.heights for net in lens.nets])
     return value, torch.cat([gradient.reshape(-1) for gradient in gradients])

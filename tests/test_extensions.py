@@ -78,7 +78,7 @@ def test_a_surface_that_no_net_stands_for_is_refused_by_its_kind(scene, ask):
     """Nothing takes it for a sphere of its curvature."""
     back = scene.flat_lens(33).back
     with pytest.raises(ValueError, match="the asphere is no plane, sphere or conic; pass it to scene.changed"):
-        ask(bstcad.Lens(Asphere(15.0, 0.01, 1e-6, 0.0), back, OUTLINE, 1.5))
+        ask(bstcad.Lens.between(Asphere(15.0, 0.01, 1e-6, 0.0), back, OUTLINE, 1.5))
 
 
 def test_a_surface_that_no_net_comes_near_is_refused(scene):
@@ -387,7 +387,7 @@ def test_an_effect_of_a_script_is_that_of_the_package_with_the_same_law(scene):
         lossy = with_effects(scene, named)
         heights = lens.back.heights.clone().requires_grad_()
         tubes = bstcad.RayTubes.launched(lens, lossy.channels(), 96)
-        picture = tubes.picture(replace(lens, back=replace(lens.back, heights=heights)), lossy.target.screen)
+        picture = tubes.picture(lens.with_back(replace(lens.back, heights=heights)), lossy.target.screen)
         gradients += torch.autograd.grad((picture * torch.from_numpy(scene.target.irradiance())).sum(), heights)
         even = lossy.target.irradiance()
         pictures.append(bstcad.measure(lens, lossy.channels(), lossy.target.screen, even, quick_effort()))

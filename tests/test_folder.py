@@ -184,7 +184,7 @@ def test_what_is_written_is_what_is_read(small_design, small_scene, tmp_path):
     scene, nominal = folders.read_nominal(small_design.folder)
     g = torch.Generator().manual_seed(1)
     back = replace(nominal.lens.back, heights=torch.randn(33, 33, generator=g, dtype=torch.float64))
-    lens = replace(nominal.lens, back=back, front=Sphere(15.0, -0.0123456789))
+    lens = nominal.lens.with_back(back).with_front(Sphere(15.0, -0.0123456789))
     design = folders.Made(scene, lens, nominal.goals)
     (tmp_path / "scene.toml").write_text(scene.toml())
     light = Light(nominal.goals[0].picture * 2, rrmsd=0.1, standard_error=0.01, rays=64, flux={}, picture_error=0.02)

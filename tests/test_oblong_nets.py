@@ -89,12 +89,12 @@ def test_sags_along_the_longer_side_are_those_along_the_shorter_one_of_the_net_t
 
 
 def test_landings_and_their_gradient_are_those_of_the_plain_form_and_of_differences():
-    lens = Lens(Sphere(15.0, -0.02), bowl(), Rectangle(22.0, 11.0), 1.6)
+    lens = Lens.between(Sphere(15.0, -0.02), bowl(), Rectangle(22.0, 11.0), 1.6)
     x, y = stratified(Rectangle(20.0, 10.0), 40, 0, torch.float64)
     in_glass = trace.to_first_net(PointSource().rays_through(x, y, 15.0, 1.0), lens)
 
     def merit(form, heights):
-        landed = form(in_glass, replace(lens, back=replace(lens.back, heights=heights)), LevelPlane(200.0))
+        landed = form(in_glass, lens.with_back(replace(lens.back, heights=heights)), LevelPlane(200.0))
         return torch.where(landed.alive, (landed.position**2).sum(0), 0.0).sum(), landed
 
     gradients = []
@@ -112,7 +112,7 @@ def test_landings_and_their_gradient_are_those_of_the_plain_form_and_of_differen
 
 
 def test_the_survey_of_curvatures_is_that_of_the_plain_form():
-    lens = Lens(Sphere(15.0, 0.0), bowl(), Rectangle(24.0, 12.0), 1.5)
+    lens = Lens.between(Sphere(15.0, 0.0), bowl(), Rectangle(24.0, 12.0), 1.5)
     i, j = (p.reshape(-1) for p in torch.meshgrid(torch.arange(M - 2), torch.arange(N - 2), indexing="ij"))
     jet = Spans.of(lens.back, i, j).jet(QUARTERS)
     found = survey(lens)
@@ -160,9 +160,9 @@ def test_levels_have_cells_of_one_shape():
 
 
 def test_tubes_lie_in_the_proportion_of_the_cells_under_the_light():
-    lens = Lens(Sphere(15.0, 0.0), bowl(65, 33, depth=0.2), Rectangle(24.0, 12.0), 1.5)
+    lens = Lens.between(Sphere(15.0, 0.0), bowl(65, 33, depth=0.2), Rectangle(24.0, 12.0), 1.5)
     assert launch_tubes(PointSource(position=(0.0, 0.0, -60.0)), lens, 100).flux.shape == (141, 71)
-    square = replace(lens, back=bowl(33, 33, depth=0.2))
+    square = lens.with_back(bowl(33, 33, depth=0.2))
     assert launch_tubes(PointSource(position=(0.0, 0.0, -60.0)), square, 100).flux.shape == (100, 100)
 
 

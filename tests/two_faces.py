@@ -51,5 +51,5 @@ def scene_of(**changes):
 def made_of(scene, front=0.06, back=-0.08):
     """The lens by hand; front, back: height of the waves of each face (mm)."""
     flat = scene.flat_lens(scene.lens.back.net)
-    lens = replace(flat, front=bent(flat.front, front), back=bent(flat.back, back, (3.0, 2.0)))
+    lens = flat.with_front(bent(flat.front, front)).with_back(bent(flat.back, back, (3.0, 2.0)))
     return Made(scene, scene.as_mounted(lens), scene.goals, DesignCourse(stopped=BY_HAND))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 import torch
@@ -20,6 +19,7 @@ from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import Receiver
 from bstcad.optics.surfaces import sampling
+from bstcad.optics.surfaces.bspline import require_net
 from bstcad.optics.surfaces.outlines import Circle, Outline, Rectangle
 from bstcad.optics.surfaces.rays import Rays
 from bstcad.optics.trace.measure import tubes_of, tubes_picture
@@ -102,7 +102,7 @@ def needed_apertures(source: Emitter, lens: Lens) -> dict[str, Outline | None]:
         a, b = source.extent.half_extent
         elements = [source.element(a * u, b * v) for u, v in EXTENT_POINTS if not (source.extent.is_round and u and v)]
     hits = torch.cat([_hits(element.central, lens) for element in elements], dim=2)
-    of_solid, apertures = hits[lens.solid], dict(zip(("front", "back"), lens.apertures, strict=True))
+    of_solid, apertures = hits[lens.solid], dict(zip((face.name for face in lens.faces), lens.apertures, strict=True))
     numbers = {face: list(lens.passes.numbers_of(face)) for face in lens.passes.faces}
     return {face: _aperture(torch.cat([*of_solid[k]], dim=1), apertures[face]) for face, k in numbers.items()}
 
@@ -133,17 +133,17 @@ def _aperture(hits: Tensor, aperture: Outline) -> Outline | None:
 
 
 @torch.no_grad()
-def rrmsd_of_ripple(channel: Channel, lens: Lens, screen: Screen, face: Literal["front", "back"]) -> float:
+def rrmsd_of_ripple(channel: Channel, lens: Lens, screen: Screen, face: str) -> float:
     """Return the RRMSD between the pictures of a lens with and without the ripple of a face; 0 without a ripple.
 
     channel: light of one point of the source.  The ripple that is removed (`Ripple.heights`) fades towards the rim.
     The RRMSD, which is proportional to the height of a small ripple, is therefore divided by `Ripple.fading`.
     """
-    net = getattr(lens, face)
+    net = require_net(lens.face(face).surface)
     waves = ripple(net)
     if waves.slope == 0:
         return 0.0
-    smooth = replace(lens, **{face: replace(net, heights=net.heights - torch.from_numpy(waves.heights))})
+    smooth = lens.with_surface(face, replace(net, heights=net.heights - torch.from_numpy(waves.heights)))
     n = tubes_of(lens, max(screen.shape))
     before, after = (tubes_picture(each, [channel], screen, n).cpu().numpy() for each in (smooth, lens))
     return difference(after, before) / waves.fading
@@ -171,7 +171,7 @@ def mount_losses(lens: Lens, channels: Sequence[Channel], flange: tuple[float, f
     rim = lens.back.opening(lens.apertures[1])
     for channel in channels:
         own = replace(channel.through(lens), losses=None)
-        bare = replace(own, clear=None)
+        bare = own.with_clear(None)
         area = window(channel.source, bare)
         x, y = sampling.grid(area, n)
         rays = channel.source.rays_through(x, y, own.entrance.z, channel.weight * area.area / n**2)

@@ -21,7 +21,8 @@ from bstcad.analysis.curvature import extremes
 from bstcad.optics.kernels import spline
 from bstcad.optics.lens.interfaces import intersect
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.surfaces.bspline import QUARTERS, BSplineSurface, span_points, weights
+from bstcad.optics.lens.passes import BACK
+from bstcad.optics.surfaces.bspline import QUARTERS, BSplineSurface, require_net, span_points, weights
 from bstcad.optics.surfaces.outlines import EVERYWHERE, Outline
 from bstcad.optics.surfaces.radial import require_radial
 from bstcad.optics.surfaces.rays import Rays, Status, dot
@@ -45,9 +46,10 @@ def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
     x, y = _points(lens.outline, grid)
     points = points_on(lens.back, x, y)
     glass, [centre] = thickness(lens, points), thickness(lens, points_on(lens.back, [0.0], [0.0]))
-    of_front = {}
-    if lens.is_tailored("front"):
-        of_front = _face_figures(lens.front_net, survey_front(lens), points_on(lens.front, x, y))
+    of_faces: dict[str, Any] = {}
+    for face in lens.described_faces:
+        figures = _face_figures(require_net(face.surface), survey(lens, face.name), points_on(face.surface, x, y))
+        of_faces |= {f"{face.prefix}{key}": value for key, value in figures.items()}
     (thinnest, thickest), (edge_thinnest, edge_thickest) = _range(glass), _range(glass[: 4 * grid])
     return {
         "centre_thickness": float(centre),
@@ -55,8 +57,7 @@ def describe(lens: Lens, grid: int = GRID_POINTS) -> dict[str, float | None]:
         "edge_thickness_max": edge_thickest,
         "thickness_min": thinnest,
         "thickness_max": thickest,
-        **_face_figures(lens.back_net, survey(lens), points),
-        **{f"front_{key}": value for key, value in of_front.items()},
+        **of_faces,
     }
 
 
@@ -267,8 +268,22 @@ class Survey:
     slope: Extreme  # largest angle of the tangent plane to z = const (degrees)
 
 
-def survey(lens: Lens, concave: float | None = None, convex: float | None = None, slope: float | None = None) -> Survey:
-    """Find the extremes of the back; concave, convex: smallest radii (mm), slope: largest angle (degrees) allowed."""
+def survey(
+    lens: Lens,
+    face: str = BACK,
+    *,
+    concave: float | None = None,
+    convex: float | None = None,
+    slope: float | None = None,
+) -> Survey:
+    """Find the extremes of a freeform face, seen from outside: from +z the highest, from -z any other.
+
+    concave, convex: smallest radii (mm), slope: largest angle (degrees) allowed.  From -z a ridge of z is a valley.
+    """
+    if face != lens.faces[-1].name:
+        turned = lens.with_back(lens.face(face).surface)
+        from_above = survey(turned, concave=convex, convex=concave, slope=slope)
+        return replace(from_above, concave=from_above.convex, convex=from_above.concave)
     lens = lens.plain()
     back = lens.back_net
     if not back.chart.flat:
@@ -288,14 +303,6 @@ def survey(lens: Lens, concave: float | None = None, convex: float | None = None
         for value, (i, j), n in zip(found, place, count, strict=True)
     )
     return Survey(_radius(valley), _radius(ridge), _angle(lens, steep))
-
-
-def survey_front(
-    lens: Lens, concave: float | None = None, convex: float | None = None, slope: float | None = None
-) -> Survey:
-    """Find the extremes of a freeform front as `survey` does; seen from outside, from -z, a ridge of z is a valley."""
-    found = survey(replace(lens, back=lens.front), concave=convex, convex=concave, slope=slope)
-    return Survey(concave=found.convex, convex=found.concave, slope=found.slope)
 
 
 def _grid(back: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

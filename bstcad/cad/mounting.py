@@ -40,6 +40,7 @@ from bstcad.cad.solid import (
 from bstcad.cad.walls import MIN_WALL, NO_DRAFT, Draft, Loop, NamedFace, face_inside, solid_of
 from bstcad.cad.wires import LoopPiece, shape_in
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK, FRONT
 from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.scene.mount import Box, CircleRim, Flange, Mount, Part
 
@@ -187,7 +188,7 @@ class _Opening:
         tops = [walls.rail_on(lens.back, loop) for loop in self.loops]
         inner = [walls.rail_on(lens.front.around, hole) for hole in holes]
         top, plane = walls.rail_on(Plane(upper - self.z), rim), Plane(lower - self.z)
-        faces = [(cap(back_patch(lens), tops, along=True), "back")]
+        faces = [(cap(back_patch(lens), tops, along=True), BACK)]
         low, high = (tops[0], top) if above_back else (top, tops[0])
         faces += walls.upright_walls(rim, low, high, outward=not above_back)
         if below_front is None:  # the front lies in the lower plane: one face
@@ -230,13 +231,13 @@ def check_fit(lens: Lens, rim: Sequence[LoopPiece], planes: tuple[float, float],
     high, low = rim_heights(lens, rim)
     below = lens.front.around
     flat = below.sags(lens.outline) == (0.0, 0.0) and abs(lower - below.z) < WALL_TOLERANCE
-    for side, z, face, heights in (("upper", upper, "back", high), ("lower", lower, "front", low)):
+    for side, z, face, heights in (("upper", upper, BACK, high), ("lower", lower, FRONT, low)):
         cuts = np.abs(z - heights).min() < MIN_WALL or heights.min() <= z <= heights.max()
-        if cuts and not (flat and face == "front"):
+        if cuts and not (flat and face == FRONT):
             raise ValueError(
                 f"{name}: the flange's {side} face, z = {z:g} mm, cuts the rim of the {face}, which runs from z = "
                 f"{heights.min():.4g} to {heights.max():.4g} mm in the lens's frame; move it below or above this range"
-                + (", or into the plane of a plane front" if face == "front" else "")
+                + (", or into the plane of a plane front" if face == FRONT else "")
             )
     if (np.minimum(upper, high) - np.maximum(lower, low)).min() < MIN_WALL:
         raise ValueError(

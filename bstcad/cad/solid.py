@@ -26,6 +26,7 @@ from bstcad.cad.walls import MIN_WALL, NO_DRAFT, Draft, NamedFace, Rail, face_in
 from bstcad.cad.wires import LoopPiece, RailCurve
 from bstcad.optics.lens.base import check_base, on_base
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK, FRONT
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.sides import as_pair, coarser
 from bstcad.optics.surfaces.surfaces import Plane, points_on, sag
@@ -48,7 +49,7 @@ class NamedSolid(NamedTuple):
     """A solid and the names of its faces, in the order of solid.Faces()."""
 
     solid: cadquery.Solid
-    faces: tuple[str, ...]  # "back", "front", "underside" (plane around the front), "rim", "bevel", "hole" or "flange"
+    faces: tuple[str, ...]  # names of Lens.faces, "underside" (around the front), "rim", "bevel", "hole" or "flange"
 
 
 def lens_solid(
@@ -67,7 +68,7 @@ def lens_solid(
 def named_solid(
     lens: Lens, trim: cadquery.Wire | None = None, holes: Sequence = (), draft: Draft = NO_DRAFT
 ) -> NamedSolid:
-    """Return the solid of `lens_solid` with the names of its faces: "back", "front", then the others."""
+    """Return the solid of `lens_solid` with the names of its faces: the back, the front, then the others."""
     import cadquery
 
     solid, names = lens_shape(lens, cut_loops(lens, trim, holes), draft)
@@ -88,7 +89,7 @@ def lens_shape(
     named, low = _outer_walls(lens, loops, tops[0], draft)
     for each in zip(loops[1:], inner, tops[1:], strict=True):
         named += walls.upright_walls(*each, "hole")
-    caps = [(cap(back, tops, along=True), "back"), *front_caps(lens, [low, *inner])]
+    caps = [(cap(back, tops, along=True), BACK), *front_caps(lens, [low, *inner])]
     faces, names = zip(*caps, *named, strict=True)
     return walls.solid_of(faces, INVALID_LENS), names
 
@@ -217,7 +218,7 @@ def cap(patch: FacePatch, rails: Sequence[Rail], along: bool) -> TopoDS_Face:
 def front_caps(lens: Lens, rails: Sequence[Rail]) -> list[NamedFace]:
     """Return the front, and the plane around it if it has an outline, inside the first rail and outside the others."""
     if lens.front.outline is None:
-        return [(cap(front_patch(lens), rails, along=False), "front")]
+        return [(cap(front_patch(lens), rails, along=False), FRONT)]
     front, rim = optical_cap(lens)
     plane = level_patch(lens.front.around.z)
     around = face_inside(plane.surface, plane.outward, *(rail.against() for rail in rails), rim.along())
@@ -228,7 +229,7 @@ def optical_cap(lens: Lens) -> tuple[NamedFace, Rail]:
     """Return the optical part of a front with its own outline, and its rim, counterclockwise."""
     assert lens.front.outline is not None
     rim = walls.rail_on(lens.front.optical, wires.outline_loop(lens.front.outline))
-    return (cap(front_patch(lens), [rim], along=False), "front"), rim
+    return (cap(front_patch(lens), [rim], along=False), FRONT), rim
 
 
 def image(patch: FacePatch, curve: RailCurve) -> Geom2d_Curve:

@@ -38,7 +38,8 @@ from OCP.TopTools import TopTools_IndexedMapOfShape
 from bstcad.cad import patches
 from bstcad.cad.radial_nets import radial_surface
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.surfaces.bspline import BSplineSurface, knots, position
+from bstcad.optics.lens.passes import BACK, FRONT
+from bstcad.optics.surfaces.bspline import BSplineSurface, knots, position, require_net
 from bstcad.optics.surfaces.outlines import Circle, Outline, Rectangle, Rounded
 from bstcad.optics.surfaces.sides import MIN_SIDE
 from bstcad.optics.surfaces.surfaces import Conic, Plane, Recess, Sphere, Surface, sag
@@ -69,27 +70,42 @@ class StatedSolid(NamedTuple):
     faces: tuple[StatedFace, ...]  # statements on the faces, in the order of parts_of(shape, TopAbs_FACE)
 
 
+class ReadFace(NamedTuple):
+    """A face of a lens as read from a STEP file."""
+
+    shape: TopoDS_Face
+    surface: Surface
+
+
 @dataclass(frozen=True)
 class StepLens:
     """A lens as read from a STEP file, in its own frame; lengths in mm."""
 
     shape: TopoDS_Solid  # solid in the frame of the lens
     control_points: np.ndarray  # control points of the back as read by OCC, (m, n, 3), x along the first axis
-    back: BSplineSurface
-    front: Surface
+    faces: dict[str, ReadFace]  # faces of the lens by name, in the order of Lens.faces
     outline: Outline  # outline of a bare lens; with other walls, the circle or rectangle around the back's edge
     edge: np.ndarray | None  # points along the edge of the back, (n, 2), mm; None: a bare lens
-    faces: tuple[TopoDS_Face, TopoDS_Face]  # front and back
     placement: Placement = field(default_factory=identity)  # placement of the lens's frame in the file
     stated: tuple[StatedFace, ...] = ()  # statements on the faces of `shape`, as in StatedSolid
 
     @property
+    def front(self) -> Surface:
+        """Lowest surface."""
+        return self.faces[FRONT].surface
+
+    @property
+    def back(self) -> BSplineSurface:
+        """Highest surface, which is a net."""
+        return require_net(self.faces[BACK].surface)
+
+    @property
     def misnamed(self) -> str:
-        """First name, "back" or "front", that the file gives to another face, in words; "" if there is none."""
-        faces = dict(zip(("front", "back"), self.faces, strict=True))
+        """First name of one of `faces` that the file gives to another face, in words; "" if there is none."""
         for face, (name, _) in zip(parts_of(self.shape, TopAbs_FACE), self.stated, strict=True):
-            if name in faces and not face.IsSame(faces[name]):
-                own = next((f"the {role}" for role, other in faces.items() if face.IsSame(other)), "another face")
+            if name in self.faces and not face.IsSame(self.faces[name].shape):
+                roles = (role for role, other in self.faces.items() if face.IsSame(other.shape))
+                own = next((f"the {role}" for role in roles), "another face")
                 return f"the file gives the name '{name}' to {own}"
         return ""
 
@@ -97,8 +113,8 @@ class StepLens:
     def clear(self) -> tuple[Outline, Outline]:
         """Clear apertures of front and back, from the edges of the two faces; see `clear_apertures`."""
         if self.front.chart != self.back.chart:
-            return self.front.outline or Circle(_farthest(self.faces[0])), self.outline
-        front, back = clear_apertures(*map(outer_edge, self.faces))
+            return self.front.outline or Circle(_farthest(self.faces[FRONT].shape)), self.outline
+        front, back = clear_apertures(*(outer_edge(face.shape) for face in self.faces.values()))
         return self.front.outline or front, back
 
 
@@ -164,7 +180,7 @@ def read(path: str | Path, stated: StatedSolid | None = None) -> StepLens:
 
 def lens(step_lens: StepLens, index: float) -> Lens:
     """Return the lens of a file, with a refractive index, for ray tracing."""
-    return Lens(step_lens.front, step_lens.back, step_lens.outline, index)
+    return Lens.between(step_lens.front, step_lens.back, step_lens.outline, index)
 
 
 def is_valid(solid: TopoDS_Solid) -> bool:
@@ -245,8 +261,8 @@ def _lens_in(solid: TopoDS_Solid) -> StepLens:
     elif outline is None:
         edge = outer_edge(back_face)
         outline = _bounding_outline(edge)
-    both = chosen[0], back_face
-    return StepLens(solid, net, back_surface, front=front, outline=outline, edge=edge, faces=both)
+    found_faces = {FRONT: ReadFace(chosen[0], front), BACK: ReadFace(back_face, back_surface)}
+    return StepLens(solid, net, found_faces, outline=outline, edge=edge)
 
 
 def _faces(solid: TopoDS_Solid) -> list[OccFace]:
@@ -394,15 +410,15 @@ def _conic(patch: Geom_BSplineSurface) -> Sphere | Conic:
     return Sphere(z, c) if bend == 0 and deviation < 10 * patches.PARABOLA_TOLERANCE else found
 
 
-def sample(step_lens: StepLens, x: np.ndarray, y: np.ndarray, *, of: str = "back") -> tuple[np.ndarray, np.ndarray]:
+def sample(step_lens: StepLens, x: np.ndarray, y: np.ndarray, *, of: str = BACK) -> tuple[np.ndarray, np.ndarray]:
     """Return points (n, 3) of a re-read net at (x, y) (mm), evaluated by OCC, and its unit normals towards +z.
 
-    of: "back", or "front" if the front is a net.  (u, v) are computed from (x, y) with the closed form for uniform
+    of: name of the face, which is a net.  (u, v) are computed from (x, y) with the closed form for uniform
     control points; x and y of the returned points show whether the net of the file is uniform.
     """
-    number = ("front", "back").index(of)
-    u, v = patches.net_parameters(getattr(step_lens, of))(np.ravel(x), np.ravel(y)).T.tolist()
-    found = points_and_tangents(BRepAdaptor_Surface(step_lens.faces[number]).BSpline(), u, v)
+    face = step_lens.faces[of]
+    u, v = patches.net_parameters(require_net(face.surface))(np.ravel(x), np.ravel(y)).T.tolist()
+    found = points_and_tangents(BRepAdaptor_Surface(face.shape).BSpline(), u, v)
     normals = np.cross(found[:, 1], found[:, 2])
     return found[:, 0], normals / np.linalg.norm(normals, axis=1, keepdims=True)
 

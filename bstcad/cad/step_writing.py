@@ -112,7 +112,7 @@ def encode(
 ) -> Iterator[bytes]:
     """Yield pieces of the text of a shape's STEP file, with one product called `name`.
 
-    part: schema, number, author, colour, material and density, and the tolerances of the faces "back" and "front".
+    part: schema, number, author, colour, material and density, and the tolerances of the faces.
     faces: names of all faces, in the order of shape.Faces(); (): no names.
     properties: area, volume and centroid, with which a reader of the file can check the shape; None: not stated.
     """
@@ -180,7 +180,7 @@ def _document(shape: TopoDS_Shape, part: Part, faces: Sequence[str]) -> TDocStd_
         name, description, measure, kind = (Text(part21_string(text)) for text in texts)
         materials = XCAFDoc_DocumentTool.MaterialTool_s(document.Main())
         materials.SetMaterial(label, name, description, part.density or 0.0, measure, kind)
-    for name, width in (("back", part.surface_profile), ("front", part.front_profile)):
+    for name, width in part.profiles.items():
         toleranced = TDF_LabelSequence()
         for face in (face for its, face in zip(faces, labels, strict=True) if its == name):
             toleranced.Append(face)

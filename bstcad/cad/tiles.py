@@ -19,6 +19,7 @@ from bstcad.cad.tiling import Cell, Side, Tiling
 from bstcad.cad.wires import LoopPiece
 from bstcad.optics.lens.face_integrals import MassProperties
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK, FRONT
 from bstcad.optics.surfaces.bspline import is_net
 from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.scene.mount import Part
@@ -32,7 +33,7 @@ class Tile:
 
     cell: Cell
     solid: TopoDS_Solid
-    faces: tuple[str, ...]  # names of the faces: "back", "front", then "rim" or "joint" for each wall
+    faces: tuple[str, ...]  # names of the faces: the back, the front, then "rim" or "joint" for each wall
     properties: MassProperties | None  # area, volume and centroid; None: a face is of a kind that is not integrated
 
     def step(self, name: str, part: Part) -> bytes:
@@ -64,7 +65,7 @@ def tile_shape(lens: Lens, cell: Cell) -> tuple[TopoDS_Solid, tuple[str, ...]]:
     names = ["joint" if side.joint else "rim" for side in cell.sides]
     back = cap(_patch(lens, lens.back, cell), [top], along=True)
     front = cap(_patch(lens, lens.front, cell), [low], along=False)
-    return walls.solid_of([back, front, *built], INVALID_TILE.format(cell.name)), ("back", "front", *names)
+    return walls.solid_of([back, front, *built], INVALID_TILE.format(cell.name)), (BACK, FRONT, *names)
 
 
 def _patch(lens: Lens, face: Surface, cell: Cell) -> FacePatch:

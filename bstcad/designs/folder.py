@@ -30,6 +30,7 @@ from bstcad.designs.as_designed import scene_text
 from bstcad.designs.made import Made
 from bstcad.optics.lens import face_integrals
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import FRONT
 from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface, is_net, knots
 from bstcad.optics.surfaces.radial import RadialSurface
 from bstcad.optics.surfaces.sides import Sides, as_pair, scaled
@@ -41,7 +42,7 @@ from bstcad.runs.processes import Submit, is_alive, run_here
 from bstcad.scene import scene as scenes
 from bstcad.scene.fronts import NET_FILE
 from bstcad.scene.target import numbered
-from bstcad.transport.mapping import TransportMap, nodes
+from bstcad.transport.mapping import AT_ENTRANCE, AT_FACE, TransportMap, nodes
 from bstcad.verify import jobs
 from bstcad.verify.nominal import Nominal
 
@@ -282,7 +283,7 @@ def write_design(design: Made, lights: Sequence[Light], folder: Path) -> None:
         **_numbers(front),
         **({DISTANCES: lens.back_net.heights.cpu().double().numpy()} if not lens.back.chart.flat else {}),
         **({"front_control_points": front.control_points()} if is_net(front) else {}),
-        **(dict(zip(FRONT_KNOTS, map(knots, lens.front_net.shape), strict=True)) if lens.is_tailored("front") else {}),
+        **(dict(zip(FRONT_KNOTS, map(knots, lens.front_net.shape), strict=True)) if lens.is_tailored(FRONT) else {}),
         **{numbered("target", k): goal.picture for k, goal in enumerate(design.goals)},
         **{numbered("reachable", k): part.astype(np.uint8) for k, part in parts if part is not None},
         **{numbered("irradiance", k): light.picture for k, light in enumerate(lights)},
@@ -387,7 +388,7 @@ def read_transport(folder: Path, scene: scenes.Scene) -> TransportMap | None:
     """Return the transport map of a design; None if design.npz has none.  SceneError if design.npz is damaged."""
     columns, rows = (nodes(n).size for n in scene.target.columns_rows)
     names = files.names(folder / DESIGN)
-    for plane in ("back", "entrance"):
+    for plane in (AT_FACE, AT_ENTRANCE):
         if (name := f"transport_{plane}") in names:
             shapes = {"transport_x": (columns,), "transport_y": (rows,), name: (columns, rows, 2)}
             x, y, source = _arrays(folder, shapes, scene).values()
@@ -428,7 +429,7 @@ def _lens(scene: scenes.Scene, found: Mapping[str, np.ndarray]) -> Lens:
         except ValueError as error:
             raise SceneError(f"{DESIGN}: {error}; {REMEDY}") from None
     back = _surface(found["control_points"], blank.back.z)
-    return scene.assembled(Lens(front, back, blank.outline, scene.index, own_passes=blank.passes))
+    return scene.assembled(Lens.between(front, back, blank.outline, scene.index, passes=blank.passes))
 
 
 def _surface(net: np.ndarray, z: float) -> BSplineSurface:

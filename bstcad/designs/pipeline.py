@@ -22,6 +22,7 @@ from bstcad.analysis.steepness import Steepness, needed_steepness
 from bstcad.designs.course import CurvePoint, DesignCourse, PrecisionTest, StageRecord
 from bstcad.designs.made import Made
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import FRONT
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.surfaces.sides import as_pair
 from bstcad.optics.trace.reach import MAX_EXIT_ANGLE, grazing_of, spread_at, unreached
@@ -55,7 +56,7 @@ from bstcad.tailoring.reachable import Reach, reach_of
 from bstcad.tailoring.settings import Settings
 from bstcad.tailoring.source_image import ExtendedSource
 from bstcad.tailoring.stage2 import PrecisionComparison, compare_precisions
-from bstcad.transport.mapping import Mapping, TransportMap
+from bstcad.transport.mapping import AT_FACE, Mapping, TransportMap
 
 PROCEDURES: dict[str, tuple[str, Stage, Stage]] = {  # tailoring.method -> (name of stage 1, stage 1, stage 2)
     "least-squares": ("stage 1", stage1.steps, stage2.steps),
@@ -177,11 +178,11 @@ def design(
         lens, stopped = _stage2(task, driver, lens, followed, state=start.second, best=start.best)
     lens = replace(lens.plain(), index=scene.index, losses=None)
     if scene.lens.front.fixed:  # tailoring may have converted the front to float32
-        lens = replace(lens, front=scene.lens.front_surface)
+        lens = lens.with_front(scene.lens.front_surface)
     sent, source = followed.transport, task.heaviest.source
     steep = None
     if sent is not None:
-        at_back = sent.plane == "back"
+        at_back = sent.plane == AT_FACE
         steep = needed_steepness(source, lens, goals[0], x=sent.x, y=sent.y, origins=sent.source, at_back=at_back)
     making = _design_course(followed, driver.record, stopped, steep)
     designed = resolved(scene, lens), scene.as_mounted(lens), goals
@@ -395,7 +396,7 @@ def _stage1(
     driver.end(name, rrmsd)
     if bounds is not None:
         driver.hooks.progress(BOUNDS_STAGE, 0, 1, "")
-        if lens.is_tailored("front"):  # shifted before stage 2, which corrects the light but does not shift the back
+        if lens.is_tailored(FRONT):  # shifted before stage 2, which corrects the light but does not shift the back
             lens = place_back(lens, lens.back.z, task.min_thickness, bounds)
         lens = enforce_bounds(lens, bounds)
         check_thickness(lens, scene)
@@ -474,7 +475,7 @@ def _corrected(task: Task, lens: Lens) -> Lens:
     if task.edge is not None:
         lens = without_reflection(lens, task.edge)
     bounds = active_bounds(lens, task.bounds, task.min_thickness)
-    if not lens.is_tailored("front"):  # stage 2 may bend the back freely where no light falls
+    if not lens.is_tailored(FRONT):  # stage 2 may bend the back freely where no light falls
         lens = place_back(lens, lens.back.z, task.min_thickness, bounds)
     return lens if bounds is None else enforce_bounds(lens, bounds)
 

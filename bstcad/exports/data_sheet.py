@@ -32,6 +32,7 @@ from bstcad.exports.part_views import (
 from bstcad.figures.drawing import GREY, styled
 from bstcad.figures.light_figures import View, brightest, srgb_grey
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.report.goal_figures import GoalFigures, Photometry
 from bstcad.report.prescription import PART, Order, prescription
@@ -86,7 +87,7 @@ class DataSheet:
     def apertures(self) -> dict[str, Outline | None]:
         """Clear aperture (x, y) that the light needs on each face; None: the whole face, as on a face in a chart."""
         found = needed_apertures(self.scene.light, self.lens)
-        return found | {face: None for face, surface in self.lens.optical_faces.items() if not surface.chart.flat}
+        return found | {face.name: None for face in self.lens.optical_faces if not face.surface.chart.flat}
 
     @property
     def tables(self) -> dict[str, Rows]:
@@ -98,7 +99,7 @@ class DataSheet:
             pairs=list(zip(self.scene.targets, self.figures, strict=True)), across=across, walls=wall_words,
             apertures={face: _aperture(patch, self.lens.plan) for face, patch in self.apertures.items()},
             kinds_of_holes=kinds_of_holes,
-            limits={face: settings_of(self.scene.tolerance, f"{face}.form").get("limit") for face in ("front", "back")},
+            limits={f.name: settings_of(self.scene.tolerance, f"{f.name}.form").get("limit") for f in self.lens.faces},
         )  # fmt: skip
 
 
@@ -142,9 +143,9 @@ def page(sheet: DataSheet) -> Figure:
     paper.line([(left, TABLE_TOP), (right, TABLE_TOP)], THICK)
     paper.line([(TITLE_LEFT, low), (TITLE_LEFT, TABLE_TOP)], THICK)
     paper.line([(LIGHT_LEFT, TABLE_TOP), (LIGHT_LEFT, high)], THIN)
-    forms = (("front", _form(sheet)), ("back", "freeform"))
-    names = tuple((f"{sheet.lens.passes.name(face).capitalize()}: {form}", form) for face, form in forms)
-    used = sheet.apertures["back"]
+    passes, forms = sheet.lens.passes, [(face.name, _form(sheet, face.name)) for face in sheet.lens.faces]
+    names = tuple((f"{passes.name(face).capitalize()}: {form}", form) for face, form in forms)
+    used = sheet.apertures[BACK]
     views = part_views.Views(sheet.lens, sheet.mount or Mount(), sheet.order.origin, used=used, names=names)
     scale = part_views.draw(paper, views, left=left, low=TABLE_TOP, right=LIGHT_LEFT, high=high)
     tables = list(sheet.tables.items())
@@ -156,12 +157,12 @@ def page(sheet: DataSheet) -> Figure:
     return figure
 
 
-def _form(sheet: DataSheet) -> str:
-    """Return the form of the front, such as "R 50 CX"; CX (convex): centre of curvature on the +z side, else CC."""
-    front = sheet.record["front"]
-    radii = {name.removeprefix("radius"): radius for name, radius in front.items() if name[:6] == "radius" and radius}
+def _form(sheet: DataSheet, name: str) -> str:
+    """Return the form of a face, such as "R 50 CX"; CX (convex): centre of curvature on the +z side, else CC."""
+    face = sheet.record[name]
+    radii = {name.removeprefix("radius"): radius for name, radius in face.items() if name[:6] == "radius" and radius}
     words = [f"R{way} {abs(radius):.5g} {'CX' if radius > 0 else 'CC'}" for way, radius in radii.items()]
-    return "freeform" if front["kind"] == "bspline" else ", ".join(words) or "plane"
+    return "freeform" if face["kind"] == "bspline" else ", ".join(words) or "plane"
 
 
 def _column(paper: Paper, left: float, heading: str, rows: Rows) -> None:

@@ -28,6 +28,7 @@ from bstcad.exports.heightmap import HeightMap, default_pixels
 from bstcad.exports.tile_files import joints, tile_files
 from bstcad.exports.toolpath_files import toolpath_files
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK
 from bstcad.optics.surfaces.bspline import is_net
 from bstcad.optics.surfaces.outlines import Circle, Outline
 from bstcad.optics.surfaces.radial import circle_radius, require_radial
@@ -164,20 +165,21 @@ def _files(
             yield from _sidecar("sag", lens, count, light)
         case "points":
             front = (lens.front, lens.plan) if lens.shares_outline else (lens.front.optical, lens.apertures[0])
-            yield "points-front.csv", points_table(lens, *front, count)
-            yield "points-back.csv", points_table(lens, lens.back, lens.outline, count)
+            for face, inside in zip(lens.faces, (front, (lens.back, lens.outline)), strict=True):
+                yield f"points-{face.name}.csv", points_table(lens, *inside, count)
             if lens.back.chart.flat:
                 yield from _sidecar("points", lens, count, light)
         case "zemax":  # a front that is not a net has no grid; its numbers are in prescription.txt
-            for name, face in (("zemax-back", lens.back), ("zemax-front", lens.front)):
-                if is_net(face):
-                    grid = GridSag.of(lens, face, points, light)
+            for face in reversed(lens.faces):
+                if is_net(face.surface):
+                    name, grid = f"zemax-{face.name}", GridSag.of(lens, face.surface, points, light)
                     yield f"{name}.dat", grid.text()
                     yield f"{name}{SIDECAR}", grid.note(f"{name}.dat") + "\n"
         case "turning":
-            yield "turning.csv", turning_cloud(lens, (count + 1) // 2)
-            if lens.front.is_net:
-                yield "turning-front.csv", turning_cloud(lens, (count + 1) // 2, lens.front)
+            for face in reversed(lens.faces):
+                if face.surface.is_net:
+                    name = "turning" if face.name == BACK else f"turning-{face.name}"
+                    yield f"{name}.csv", turning_cloud(lens, (count + 1) // 2, face.surface)
         case "spiral" | "raster":
             yield from toolpath_files(kind, lens, cutting, label.title or label.name, cells=cells)
         case "heightmap":
@@ -311,10 +313,10 @@ def turning_cloud(lens: Lens, points: int, face: Surface | None = None) -> str:
 def _sidecar(name: str, lens: Lens, points: int, light: GridLight | None) -> Iterator[tuple[str, str]]:
     """Yield (name, text) of the sidecar of a table of sags, a sentence for each net; nothing if `light` is None."""
     sentences = []
-    for side, face in (("front", lens.front), ("back", lens.back)):
-        if light is not None and face.is_net:
-            table = f"{name}.csv, {side}" if name == "sag" else f"{name}-{side}.csv"
-            sentences.append(table_note(lens, face, table, points=points, light=light))
+    for face in lens.faces:
+        if light is not None and face.surface.is_net:
+            table = f"{name}.csv, {face.name}" if name == "sag" else f"{name}-{face.name}.csv"
+            sentences.append(table_note(lens, face.surface, table, points=points, light=light))
     if sentences:
         yield f"{name}{SIDECAR}", "\n".join(sentences) + "\n"
 

@@ -233,9 +233,8 @@ def shift_between(lens: Lens, other: Lens, light: GridLight) -> Shift | None:
 
 def shift_by_patches(lens: Lens, face: Surface, patches: Patches, light: GridLight) -> Shift | None:
     """Return the shift of the light if `patches` replace `face` of a lens; None: no light reaches any target."""
-    plain = replace(lens, losses=None).with_tailored("back")
-    other = plain.with_back(patches) if face is lens.back else plain.with_front(patches)
-    return shift_between(plain, other, light)
+    plain = replace(lens, losses=None, tailored=None)
+    return shift_between(plain, plain.with_surface(lens.name_of(face), patches), light)
 
 
 # ---- the file --------------------------------------------------------------------------------------------------------
@@ -305,6 +304,5 @@ def table_note(lens: Lens, face: Surface, name: str, *, points: int, light: Grid
     by = shift_by_patches(lens, face, Patches.through(face, *axes(lens.outline, points)), light)
     if by is None:
         return f"{name}: no light reaches the target."
-    side = "back" if face is lens.back else "front"
-    coarse = f"; zemax-{side}.dat and lens.step are exact" if by.maximum > MAX_SHIFT * by.pixel else ""
+    coarse = f"; zemax-{lens.name_of(face)}.dat and lens.step are exact" if by.maximum > MAX_SHIFT * by.pixel else ""
     return f"{name}: a bicubic spline through its heights moves the light on the target by {by}{coarse}."

@@ -23,6 +23,7 @@ from scipy.optimize import brentq
 from bstcad.exports.exports import across, pitch_radius
 from bstcad.figures.drawing import BLUE, GLASS, GREY, STYLE, VERMILION, round_up
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK
 from bstcad.optics.surfaces.outlines import Circle, Outline
 from bstcad.optics.surfaces.surfaces import Surface, points_and_normals, sag
 from bstcad.report.units import mm, number
@@ -384,7 +385,7 @@ def draw(paper: Paper, views: Views, *, left: float, low: float, right: float, h
 
 def origin(views: Views) -> str:
     """Return the position of the file's origin on the axis in words, relative to the nearer face."""
-    names = map(views.lens.passes.name, ("front", "back"))
+    names = [views.lens.passes.name(face.name) for face in views.lens.faces]
     near, name = min(zip(views.vertices, names, strict=True), key=lambda face: abs(face[0]))
     if not near:
         return f"at the vertex of the {name}"
@@ -426,7 +427,7 @@ def _plan(paper: Paper, views: Views, at: PaperFrame) -> None:
     else:
         paper.dimension((x - a, x + a), y - b - 12, (y - b, y - b), mm(outer.width))
         paper.dimension((y - b, y + b), x - a - 11, (x - a, x - a), mm(outer.height), upright=True)
-    face = views.lens.passes.name("back").capitalize()
+    face = views.lens.passes.name(BACK).capitalize()
     paper.text(x, y + b + 12, f"{face}, seen along \u2212z", ha="center", weight="bold")
     note = f"contours of z every {step}" if step else "no contours: the back is flat"
     paper.text(x, y - b - 17, note, NOTES, ha="center", color=BLUE)

@@ -16,6 +16,7 @@ import numpy as np
 from bstcad.cad.tiling import Cell, Span
 from bstcad.figures.shop_figures import left_figure
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK, FRONT
 from bstcad.optics.surfaces.bspline import require_net
 from bstcad.report.units import quantity
 from bstcad.toolpath import gcode
@@ -48,7 +49,7 @@ def toolpath_files(
     """
     faces = dict(machined_faces(lens))
     for side, face in faces.items():
-        file = f"toolpath-{kind}" + ("" if side == "back" else f"-{side}")
+        file = f"toolpath-{kind}" + ("" if side == BACK else f"-{side}")
         if kind == "spiral":
             turned = spiral(face, cutting)
             found, sentences = check_spiral(turned), [*_of_part(name, side), *spiral_words(turned)]
@@ -92,7 +93,7 @@ def _check_files(
 
 def _farthest(lens: Lens, faces: Mapping[str, MachinedFace], side: str) -> float:
     """Return how far (mm) the face opposite to a side reaches from z = 0 of the frame, away from the tool."""
-    opposite = "front" if side == "back" else "back"
+    opposite = FRONT if side == BACK else BACK
     if opposite in faces:
         return faces[opposite].highest
     return -(lens.front.z + lens.front.sags(lens.plan)[0])
@@ -101,14 +102,14 @@ def _farthest(lens: Lens, faces: Mapping[str, MachinedFace], side: str) -> float
 def _extent(cell: Cell, side: str) -> tuple[Span, Span]:
     """Return x and y (mm) of the ends of a tile in the frame of a machined face."""
     x, y = cell.extent
-    return (x, y) if side == "back" else ((-x[1], -x[0]), y)
+    return (x, y) if side == BACK else ((-x[1], -x[0]), y)
 
 
 def machined_faces(lens: Lens) -> Iterator[tuple[str, MachinedFace]]:
     """Yield name and face of the back, and of the front if it is a net."""
-    yield "back", MachinedFace.back(lens.back_net, lens.plan)
+    yield BACK, MachinedFace.back(lens.back_net, lens.plan)
     if lens.front.is_net:
-        yield "front", MachinedFace.front(require_net(lens.front), lens.plan)
+        yield FRONT, MachinedFace.front(require_net(lens.front), lens.plan)
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
@@ -150,7 +151,7 @@ def _table(heading: str, formats: tuple[str, ...], *columns: np.ndarray) -> str:
 
 
 def _of_part(name: str, side: str) -> Iterator[str]:
-    turned = ", turned over about the y axis: X and Z are those of the lens times -1" if side == "front" else ""
+    turned = ", turned over about the y axis: X and Z are those of the lens times -1" if side != BACK else ""
     yield f"{name}, {side}{turned}."
 
 

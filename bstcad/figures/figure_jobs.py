@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from bstcad.analysis.light import bundle, fan, ray_map
-from bstcad.analysis.shape import MAX_RADIUS, Survey, least_squares, survey, survey_front
+from bstcad.analysis.shape import MAX_RADIUS, least_squares, survey
 from bstcad.cad import mesh as meshes
 from bstcad.designs.course import CurvePoint, StageRecord
 from bstcad.figures import light_figures, photometric_figures, rendering
@@ -27,6 +27,7 @@ from bstcad.figures.rendering import RayPath
 from bstcad.figures.wavefront_figure import wavefront_map
 from bstcad.optics.lens.base import on_base
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.charts import HEIGHTS, Chart
@@ -127,12 +128,12 @@ def draw_lens(source: Emitter, lens: Lens, screens: Sequence[Screen], view: View
     """Return maps of the back and of a tailored front, and a side view of the lens; `view` is not used."""
     screens = [drawn(screen, lens) for screen in screens]
     farthest = max(screens, key=lambda screen: screen.receiver.throw(0.0))
-    of_front = {}
-    if lens.is_tailored("front"):
-        of_front["surface_front"] = png(surface_maps(lens, survey_front(lens), face="front"))
+    maps = {
+        "surface" if face.name == BACK else f"surface_{face.name}": png(surface_maps(lens, face.name))
+        for face in lens.described_faces
+    }
     return {
-        "surface": png(surface_maps(lens, survey(lens))),
-        **of_front,
+        **maps,
         "side_view": png(side_view(lens, fan(source, lens, farthest.receiver), screens)),
     }
 
@@ -175,14 +176,13 @@ def draw_convergence(report: Contents, view: View) -> Pngs:
 
 
 @styled
-def surface_maps(lens: Lens, found: Survey, face: str = "back") -> Figure:
+def surface_maps(lens: Lens, face: str = BACK) -> Figure:
     """Draw maps of h, slope angle and mean curvature of a freeform face inside the outline, over its chart.
 
-    found: extreme values of the face, which the samples of the maps may miss.  face: "back" or "front".
-
+    Extreme values are those of the face's survey, which the samples of the maps may miss.
     The best-fit plane is subtracted from the sag if the PV of the plane exceeds the PV of the residual, else the mean.
     """
-    surface = getattr(lens, face).plain()
+    surface, found = lens.face(face).surface.plain(), survey(lens, face)
     chart = surface.chart
     ends = chart.drawn(np.diag(lens.outline.half_extent)).max(axis=0)
     x, y = (np.linspace(-end, end, MAP_POINTS) for end in ends)

@@ -171,7 +171,7 @@ def calibration_kernel(tubes: int = KERNEL_TUBES) -> Callable[[], Any]:
     u = torch.linspace(-math.pi * WAVE_PERIODS, math.pi * WAVE_PERIODS, KERNEL_NET, dtype=torch.float64)
     outline, span = Rectangle(KERNEL_WIDTH, KERNEL_WIDTH), (-KERNEL_WIDTH / 2, KERNEL_WIDTH / 2)
     back = BSplineSurface(KERNEL_THICKNESS, WAVE_HEIGHT * u.cos()[:, None] * u.cos(), span, span)
-    lens = Lens(Plane(0.0), back, outline, KERNEL_INDEX)
+    lens = Lens.between(Plane(0.0), back, outline, KERNEL_INDEX)
     target = np.full((KERNEL_PIXELS, KERNEL_PIXELS), 1.0)
     channel, screen = (
         Channel(CollimatedSource(outline), KERNEL_INDEX),

@@ -21,6 +21,7 @@ from bstcad.analysis.neglected_effects import Change, Reference, difference
 from bstcad.designs.course import DesignCourse
 from bstcad.optics.lens import media
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK, FRONT
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.profiles import pair_of
@@ -57,10 +58,10 @@ def coarse_lens(scene: Scene) -> Lens:
     if scene.lens.front.free:
         from bstcad.tailoring import stage1  # with scipy.optimize, a tenth of a second to load
 
-        start = replace(lens, back=scene.flat_lens(FRONT_NET).back)
+        start = lens.with_back(scene.flat_lens(FRONT_NET).back)
         free, effort = scene.lens.front.free, FrontSearch(COARSE_CELLS, COARSE_STEPS, repeats=1)
         found = stage1.shaped_front(channel.source, start, goal, free, rim_sags=scene.rim_sags, effort=effort)
-        lens = replace(lens, front=found.front)
+        lens = lens.with_front(found.front)
     slopes, z = None, lens.back.z
     for _ in range(TRANSPORT_ROUNDS):
         window = lit_window(channel.source, lens)
@@ -252,8 +253,8 @@ def diagnosis(scene: Scene, making: DesignCourse, proof: Proof, target: np.ndarr
         "at": {key: at.share for key, at in reached.items()},
         "tightest": {key: at.tightest for key, at in reached.items()},
     }
-    if proof.lens.is_tailored("front"):
-        bounds["both" if proof.lens.is_tailored("back") else "front"] = True  # faces with bounds
+    if proof.lens.is_tailored(FRONT):
+        bounds["both" if proof.lens.is_tailored(BACK) else FRONT] = True  # faces with bounds
     error = remaining(proof.light.picture, target, scene.target.screen.per_unit)
     return {
         "convergence": None if curve is None else asdict(curve),

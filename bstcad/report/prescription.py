@@ -20,11 +20,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bstcad.analysis.shape import MAX_RADIUS, describe, heights, survey_front, thickness_range
+from bstcad.analysis.shape import MAX_RADIUS, describe, heights, survey, thickness_range
 from bstcad.designs.as_designed import vertex
 from bstcad.optics.lens import face_integrals, passes
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.media import density
+from bstcad.optics.lens.passes import BACK, FRONT
 from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface
 from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.report.units import Rows, paragraphs, tables
@@ -53,7 +54,7 @@ EXACT_FACES = (  # sentence on a freeform back, and on two freeform faces
     "Both freeform faces are exact in lens.step, and their control points are in design.npz.",
 )
 SHEET, PART, LENS = "datasheet.pdf", "part.step", "lens.step"
-DATUMS = {"front": "the vertex of the front", "flange": "the lower face of the flange"}  # plane z = 0, by datum
+DATUMS = {FRONT: "the vertex of the front", "flange": "the lower face of the flange"}  # plane z = 0, by datum
 EDGE_TOLERANCE = 1e-3  # free fraction of an outline's area up to which a back counts as filling the outline
 
 Point = tuple[float, float, float]
@@ -78,11 +79,11 @@ def prescription(scene: Scene, lens: Lens, shape: Mapping[str, Any]) -> dict[str
         **({"encapsulant": scene.lens.encapsulant} if scene.lens.encapsulant else {}),  # index before the front
         "outline": asdict(lens.plan),
         "clear": lens.clear and tuple(map(asdict, lens.clear)),  # clear apertures, front and back; None: whole outline
-        "front": _own_outline(front) | _face(scene.lens.front.kind, lens.front_vertex, numbers) | fitted,
-        "back": _face("bspline", vertex(lens), {}),
+        FRONT: _own_outline(front) | _face(scene.lens.front.kind, lens.front_vertex, numbers) | fitted,
+        BACK: _face("bspline", vertex(lens), {}),
         "reflects": lens.reflects,  # True for a mirror
         "net": _net(lens.back_net),
-        **({"front_net": _net(lens.front_net), "front_asked": scene.lens.front.z} if lens.is_tailored("front") else {}),
+        **({"front_net": _net(lens.front_net), "front_asked": scene.lens.front.z} if lens.is_tailored(FRONT) else {}),
         "back_asked": scene.lens.back.z,  # position of the back's vertex in the scene
         **({} if scene.lens.back.chart.flat else {"back_key": scene.lens.back.vertex_key}),  # if not lens.back.z
         "centre_thickness": shape["centre_thickness"],
@@ -205,8 +206,8 @@ def order_of(scene: Scene, lens: Lens, shape: Mapping[str, Any], folder: Path, f
         density=stated.density,
         datum=DATUMS.get(mount.datum if mount else "") or _origin(lens, front + shape["centre_thickness"]),
         origin=mount.origin(front) if mount else 0.0,
-        freeform=("back", "front") if lens.front.is_net else ("back",),
-        optical=tuple(reversed(lens.optical_faces)),
+        freeform=tuple(face.name for face in reversed(lens.faces) if face.surface.is_net),
+        optical=lens.passes.faces[::-1],
         tool_radius=min(radii, default=None),
         back_profile=stated.surface_profile,
         front_profile=stated.front_profile,
@@ -286,10 +287,10 @@ def _front_radius(lens: Lens) -> float | None:
     For a conic this is the meridional radius, R (1 - k c² r²)^(3/2), which decreases towards the rim for k > 0.
     """
     front = lens.front
-    if "front" not in lens.passes.faces:
+    if FRONT not in lens.passes.faces:
         return None
     if front.is_net:
-        found = survey_front(lens).concave.largest
+        found = survey(lens, FRONT).concave.largest
         return found if found < MAX_RADIUS else None
     (x, y), (c, k) = (front.outline or lens.plan).farthest, front.conic()
     if not c < 0:

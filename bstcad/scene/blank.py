@@ -11,7 +11,7 @@ import torch
 from pydantic import ConfigDict, Field
 
 from bstcad.optics.lens.media import refractive_index
-from bstcad.optics.lens.passes import LENS, MIRROR, SECOND_SURFACE, Face, Passes
+from bstcad.optics.lens.passes import LENS, MIRROR, SECOND_SURFACE, Passes
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.surfaces.charts import HEIGHTS, Chart
 from bstcad.optics.surfaces.key import Key
@@ -231,7 +231,7 @@ class LensBlank(Record):
         return self.front.traced(self.outline)
 
     @property
-    def tailored_faces(self) -> tuple[Face, ...]:
+    def tailored_faces(self) -> tuple[str, ...]:
         """Faces that tailoring shapes, in the order of the light."""
         tailored = {"front": self.front.is_tailored, "back": self.back.optimise}
         return tuple(face for face in self.passes.faces if tailored[face])

@@ -14,6 +14,7 @@ from pydantic import Field
 
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.media import medium
+from bstcad.optics.lens.passes import BACK, FRONT
 from bstcad.optics.surfaces.key import Key
 from bstcad.optics.surfaces.outlines import STRICT, Circle, Outline, Rectangle, Rounded
 from bstcad.optics.surfaces.surfaces import Surface, sag, sampled
@@ -30,6 +31,9 @@ MIN_CLEAR_APERTURE = 1e-3  # smallest width of the front's clear aperture after 
 LENS_COLOUR, MIRROR_COLOUR = "#9ed3f580", "#c8ccd0"  # default colours of a part
 MAX_TEXT = 200  # largest number of characters of a text of the title block
 COLOUR = re.compile(r"#(?:[0-9a-fA-F]{6}|[0-9a-fA-F]{8})")
+
+
+PROFILES = {BACK: "surface_profile", FRONT: "front_profile"}  # key of the profile tolerance of each face
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,11 @@ class Part:
 
     __pydantic_config__ = STRICT
 
+    @property
+    def profiles(self) -> dict[str, float | None]:
+        """Widths (mm) of the tolerance zones of the faces, by name; None: none is stated."""
+        return {face: getattr(self, key) for face, key in PROFILES.items()}
+
     def of(self, lens: LensBlank) -> Part:
         """Return the entries with defaults from the lens: material, density and colour."""
         known: dict[str, Any] = {"colour": LENS_COLOUR if lens.passes.enters else MIRROR_COLOUR}
@@ -70,7 +79,7 @@ class Part:
             yield f'part.colour: {self.colour!r} is not a colour; write "#9ed3f5", or "#9ed3f580" with an opacity'
         if self.density is not None and self.material is None and lens.material is None:
             yield "part.density: a density needs the name of its material; add part.material"
-        for key in ("surface_profile", "front_profile"):
+        for key in PROFILES.values():
             if getattr(self, key) is not None and self.schema == "AP214":
                 yield f'part.{key}: AP214 cannot contain this tolerance; remove it, or the line schema = "AP214"'
         thickness = lens.back.z - lens.front.z

@@ -318,7 +318,7 @@ class Scene(Record):
         outline, front = blank.back.lit(blank.outline), blank.flat_front(net, as_wide_as)
         back = blank.back.flat(net, net_extent(outline, as_wide_as or net))
         clear = None if back.chart.flat else (front.outline or blank.outline, outline)
-        return self.assembled(Lens(front, back, outline, self.index, clear=clear, own_passes=passes))
+        return self.assembled(Lens.between(front, back, outline, self.index, clear=clear, passes=passes))
 
     def assembled(self, lens: Lens) -> Lens:
         """Return the lens with the scene's windows, mirrors and mount, and with its tailored faces marked."""
@@ -329,7 +329,7 @@ class Scene(Record):
         """Return the lens with the clear apertures that the mount leaves; the mount of a dome cuts nothing."""
         if self.mount is None or not self.lens.back.chart.flat:
             return lens
-        return replace(lens, clear=self.mount.clear(lens))
+        return lens.with_clear(self.mount.clear(lens))
 
     def channels(self, points: int | None = None, number: int = 0) -> tuple[Channel, ...]:
         """Return the light as a weighted sum of channels; a point source of one wavelength is one channel.

@@ -21,7 +21,15 @@ from torch import Tensor
 
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.numerics.reductions import total
-from bstcad.optics.surfaces.bspline import QUARTERS, SPANS_AT_A_TIME, BSplineSurface, evaluate, net_gradient, span
+from bstcad.optics.surfaces.bspline import (
+    QUARTERS,
+    SPANS_AT_A_TIME,
+    BSplineSurface,
+    evaluate,
+    net_gradient,
+    require_net,
+    span,
+)
 from bstcad.optics.surfaces.outlines import inside
 from bstcad.optics.surfaces.sampling import sample_rim
 from bstcad.tailoring.settings import Bounds
@@ -50,8 +58,8 @@ def clearance(lens: Lens, bounds: Bounds) -> tuple[float, dict[int, Tensor], flo
     numbers of the faces.  Sums have fixed parts, so that no bit depends on the number of threads.
     """
     length, square, worst = unit(lens, bounds), 0.0, -PENALTY_MARGIN
-    front, back = lens.number_of("front"), lens.number_of("back")
-    faces = {front: (lens.front_net, -1.0), back: (lens.back_net, 1.0)}  # (net, ∂t / ∂z)
+    signs = zip(lens.faces, (-1.0, 1.0), strict=True)  # ∂t / ∂z
+    faces = {lens.number_of(face.name): (require_net(face.surface), sign) for face, sign in signs}
     gradients: dict[int, Tensor] = {}
     for x, y, share, thinnest in _points_near_bounds(lens, bounds, PENALTY_MARGIN * length):
         relative, thicker = _excess(lens, x, y, replace(bounds, thinnest=thinnest))

@@ -16,6 +16,7 @@ import numpy as np
 from torch import Tensor
 
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.wavefront import Wave
 from bstcad.optics.receivers.goal import Goal
@@ -136,7 +137,7 @@ class Task:
     def sides(self, lens: Lens, sides: Sides) -> tuple[Sides, ...]:
         """Return the control points per side of each net of a lens whose back has `sides`."""
         front = self.front_sides(sides)
-        return tuple(sides if k == lens.number_of("back") or front is None else front for k in lens.tailored_numbers)
+        return tuple(sides if k == lens.number_of(BACK) or front is None else front for k in lens.tailored_numbers)
 
     @property
     def at_full_size(self) -> Task:

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import FRONT
 from bstcad.optics.trace.reach import largest_deflection
 from bstcad.tailoring import light_behind
 from bstcad.tailoring.driver import Task, no_progress
@@ -127,7 +128,7 @@ def _demand(task: Task, solution: float, lens: Lens) -> tuple[Demand, LightBehin
 @torch.no_grad()
 def _largest_deflection(task: Task, lens: Lens, light: LightBehind) -> float:
     """Return the largest angle (degrees) between the directions of a ray before the front and in the glass."""
-    front, source = lens.with_tailored("front"), task.heaviest.source
+    front, source = lens.with_tailored(FRONT), task.heaviest.source
     window, b = lit_window(source, front), light.intersect(lens.back)
     grid = square_grid(source, front, window, task.effort.trial_cells)
     slopes = front_map(front, grid, window, light.picture, b=b, q=None, solver=Solver())

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.lens.passes import Face
+from bstcad.optics.lens.passes import BACK, FRONT
 from bstcad.optics.numerics.reductions import total
 from bstcad.optics.surfaces import bspline
 from bstcad.optics.surfaces.bspline import BSplineSurface, Jet, Spans
@@ -98,7 +98,7 @@ def active_bounds(lens: Lens, bounds: Bounds | None, least: float) -> Bounds | N
 
     These are the bounds of the scene; without them a tailored front still requires a thickness of `least` mm.
     """
-    return Bounds(thinnest=least) if bounds is None and lens.is_tailored("front") else bounds
+    return Bounds(thinnest=least) if bounds is None and lens.is_tailored(FRONT) else bounds
 
 
 @dataclass(frozen=True)
@@ -141,18 +141,18 @@ def _parts(lens: Lens, nets: dict[int, BSplineSurface], bounds: Bounds) -> Itera
         for k, from_above in _bounds_from_above(lens, bounds).items():
             squared, gradient, worst = _shape_excess(nets[k], lens.outline, from_above)
             yield squared, {k: gradient}, worst
-    if lens.is_tailored("front"):
+    if lens.is_tailored(FRONT):
         yield clearance(lens.to(torch.float64), bounds)
-    elif bounds.thickest is not None and (back := lens.number_of("back")) in nets:
+    elif bounds.thickest is not None and (back := lens.number_of(BACK)) in nets:
         squared, gradient, worst = _thickness_excess(lens.with_back(nets[back]), bounds)
         yield squared, {back: gradient}, worst
 
 
 def _bounds_from_above(lens: Lens, bounds: Bounds) -> dict[int, Bounds]:
     """Return the bounds on z(x, y), seen from +z, for each tailored face, by its number."""
-    front = replace(bounds, concave=bounds.convex, convex=bounds.concave)
-    faces: dict[Face, Bounds] = {"back": bounds, "front": front}
-    return {lens.number_of(face): limits for face, limits in faces.items() if lens.is_tailored(face)}
+    turned = replace(bounds, concave=bounds.convex, convex=bounds.concave)  # of a face seen from -z
+    highest = lens.faces[-1].name
+    return {lens.number_of(f.name): bounds if f.name == highest else turned for f in lens.tailored_faces}
 
 
 def _shape_excess(net: BSplineSurface, outline: Outline, bounds: Bounds) -> tuple[float, Tensor, float]:
@@ -213,7 +213,7 @@ def enforce_bounds(lens: Lens, bounds: Bounds) -> Lens:
     are flattened.  If the front is tailored, the back is shifted only if changes of the faces do not suffice, since a
     shift changes the picture.  SceneError if even a flat back exceeds a bound.
     """
-    for place in (_unmoved, _with_back_moved) if lens.is_tailored("front") else (_with_back_moved,):
+    for place in (_unmoved, _with_back_moved) if lens.is_tailored(FRONT) else (_with_back_moved,):
         lens = place(lens, bounds)
         if not _exceeds(lens, bounds):
             return lens

@@ -54,6 +54,7 @@ from torch import Tensor
 
 from bstcad.optics.lens.interfaces import Law, Refract
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK
 from bstcad.optics.light.channels import Channel, weighted_sum
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.light.wavefront import MM_PER_NM, Wave
@@ -349,7 +350,7 @@ def local_weight(source: Emitter, lens: Lens, goals: Sequence[Goal], number: int
     misses the screen.  On the last net, if light leaves the glass there, the weight is divided by `_excess_leverage`.
     For several goals w is the geometric mean.  number: index of the freeform interface in the lens; None: the back.
     """
-    number = lens.number_of("back") if number is None else number
+    number = lens.number_of(BACK) if number is None else number
     net, onwards = lens.interfaces[number].net, lens.unbounded().interfaces[number:]
     few = [min(m, MAX_WEIGHT_POINTS) for m in net.shape]
     x, y = torch.meshgrid(*_even_axes(net, few), indexing="ij")

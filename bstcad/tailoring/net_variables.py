@@ -32,6 +32,7 @@ from scipy.sparse import csr_array, diags_array
 from torch import Tensor
 
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import FRONT
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.trace.trace import across, behind
@@ -90,7 +91,7 @@ def along_light(source: Emitter, lens: Lens, goals: Sequence[Goal]) -> tuple[csr
     q_x, q_y = torch.meshgrid(*control_point_axes(front), indexing="ij")
     q, device = torch.stack([q_x, q_y]).numpy(), lens.like.device
     coming = source.rays_through(q_x.to(device), q_y.to(device), lens.entrance.z, 1.0)
-    interfaces, number = lens.unbounded().interfaces, lens.number_of("front")
+    interfaces, number = lens.unbounded().interfaces, lens.number_of(FRONT)
     within = behind(across(coming, interfaces[:number]), interfaces[number])
     out = behind(within, interfaces[number + 1])
     glass = lens.index * within.direction[2]

@@ -51,7 +51,7 @@ from bstcad.runs.files import SceneError
 from bstcad.tailoring.effort import GATHERING, Gathering
 from bstcad.tailoring.slope_fit import Fit, blocks, fit_slopes, monomials, with_polynomial
 from bstcad.transport.density import Density, resample_flux
-from bstcad.transport.mapping import Frame, Mapping, Points, TransportMap, nodes, solve
+from bstcad.transport.mapping import AT_ENTRANCE, AT_FACE, Frame, Mapping, Points, TransportMap, nodes, solve
 from bstcad.transport.mapping import Solver as Solver  # exported to packages that may not import transport
 
 SUBCELLS = 2  # samples of the light per axis in a transport cell, since a rim may cross the cell
@@ -348,12 +348,12 @@ def rays_at(grid: FaceGrid, b: Points) -> Rays:
 def map_from_face(points: Points, screen: Screen) -> TransportMap:
     """Return the inverse map, from the target's pixel corners to the points (mm) of the last tailored face.
 
-    points: x and y, each (columns + 1, rows + 1).  The plane of the map is named "back" even if the face is the front.
+    points: x and y, each (columns + 1, rows + 1).  The plane of the map is AT_FACE.
     """
     x, y = (np.linspace(*ends, n + 1) for ends, n in ((screen.x, screen.columns), (screen.y, screen.rows)))
     i, j = nodes(screen.columns), nodes(screen.rows)
     source = np.stack([p[np.ix_(i, j)] for p in points], axis=-1)
-    return TransportMap(x[i], y[j], source.astype(np.float32), "back")
+    return TransportMap(x[i], y[j], source.astype(np.float32), AT_FACE)
 
 
 def pixel_corners(screen: Screen) -> Points:
@@ -442,7 +442,7 @@ def map_from_entrance(mapping: Mapping, lens: Lens, screen: Screen) -> Transport
     corners = pixel_corners(screen)
     if not screen.receiver.is_level:
         corners = screen.receiver.to_level_plane(*corners, lens.front.z)
-    return replace(map_from_face(mapping.inverse(*corners), screen), plane="entrance")
+    return replace(map_from_face(mapping.inverse(*corners), screen), plane=AT_ENTRANCE)
 
 
 def aim_points(mapping: Mapping, lens: Lens, screen: Screen, x: Tensor, y: Tensor) -> Tensor:

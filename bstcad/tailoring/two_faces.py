@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import FRONT
 from bstcad.optics.numerics.reductions import total
 from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.bspline import BSplineSurface
@@ -106,7 +107,7 @@ def _round(
     task: Task, lens: Lens, light: LightBehind, q: Points | None, *, number: int, cells: int, fit: Fit
 ) -> tuple[Lens, SlopeMap, Points]:
     """Run a round; return the lens, the map of its front, and b(t) for the pixel corners of the first target."""
-    source, front = task.heaviest.source, lens.with_tailored("front")
+    source, front = task.heaviest.source, lens.with_tailored(FRONT)
     window, met = slope_map.lit_window(source, front), light.intersect(lens.back)
     b_x, b_y = light.sampled_at(task.goals[0].screen, met[:2])
 

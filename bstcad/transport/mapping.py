@@ -77,6 +77,9 @@ class Mapping:
         return self.source_frame.from_unit(*(out / n).reshape(at.shape))
 
 
+AT_FACE, AT_ENTRANCE = "back", "entrance"  # values of TransportMap.plane, as files name them
+
+
 @dataclass(frozen=True)
 class TransportMap:
     """Origin of the light of each point of a target: the inverse of the transport map of stage 1.
@@ -89,8 +92,8 @@ class TransportMap:
     x: np.ndarray  # (c,) x on the target in its receiver's unit, ascending, float64
     y: np.ndarray  # (r,) y on the target in its receiver's unit, ascending, float64
     source: np.ndarray  # (c, r, 2) float32, x and y (mm) in the scene's frame where the light for (x, y) passes `plane`
-    # "back": the last tailored face along the light, which is the front if only the front is tailored, or for a mirror
-    # behind glass.  "entrance": the plane z = const through the vertex of the first face, where the map of Wang et al.
+    # AT_FACE: the last tailored face along the light, which is the front if only the front is tailored, or for a mirror
+    # behind glass.  AT_ENTRANCE: the plane z = const through the vertex of the first face, where the map of Wang et al.
     # begins (tailoring.method "adam" and "integration", and strong lenses near the source)
     plane: str
 

@@ -18,11 +18,10 @@ import numpy as np
 import torch
 
 from bstcad.analysis.light import Blur, blur, margins, mount_losses, rrmsd_of_ripple
-from bstcad.analysis.shape import AT_BOUND, Extreme, describe, survey, survey_front
+from bstcad.analysis.shape import AT_BOUND, Extreme, describe, survey
 from bstcad.cad import mesh as meshes
 from bstcad.optics.lens import face_integrals
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.lens.passes import Face
 from bstcad.optics.receivers.goal import Goal, worst
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.optics.trace.measure import (
@@ -159,7 +158,7 @@ def verify(
         *solid_checks(),
         *of_aperture,
         *of_shape,
-        *_ripple_checks(shape),
+        *_ripple_checks(cut, shape),
         closed,
         *_mesh_checks(mesh, lens, whole.volume, nominal),
         *map(_target_check, nominal.goals, nominal.stored or [goal.picture for goal in nominal.goals]),
@@ -231,10 +230,10 @@ def _mounted_lens(read: Future[Lens], bare: Lens, nominal: Nominal, path: Path) 
         made = _result(read, path.with_name("part.step"))
         outline = bare.back.chart.outline_in(designed.back.chart, bare.outline)
         lens = replace(_with_design_facts(made, designed), outline=outline)
-        pairs = zip(("front", "back"), lens.apertures, designed.apertures, strict=True)
-        checks = [_aperture_check(*each) for each in pairs]
+        names = (face.name for face in lens.faces)
+        checks = [_aperture_check(*each) for each in zip(names, lens.apertures, designed.apertures, strict=True)]
     except ValueError as error:
-        lens = replace(bare, clear=designed.clear)
+        lens = bare.with_clear(designed.clear)
         name = "part.step: clear apertures can be measured"
         checks = [Check.true(name, False, str(error), id="clear-aperture-measured")]
     losses = mount_losses(lens, nominal.channels, None if flange is None else (flange.z, flange.z + flange.thickness))
@@ -265,7 +264,7 @@ def _stability(
     """
     seed = nominal.scene.tailoring.seed + VERIFY_SEED
     margin = margins(nominal.channels, lens, nominal.goals[0].screen, seed, n=rays)
-    keys = (f"{face}radius_min_{kind}" for face in ("", "front_") for kind in ("concave", "convex"))
+    keys = (f"{face.prefix}radius_min_{kind}" for face in lens.faces for kind in ("concave", "convex"))
     radii = [radius for key in keys if (radius := shape.get(key))]
     non_finite = margin.non_finite + sum(int((~np.isfinite(light.picture)).sum()) for light in lights)
     stability = {
@@ -306,14 +305,13 @@ def time_limit(path: Path) -> float:
     return TIME_LIMIT + (TIME_LIMIT_PER_MB * path.stat().st_size / 1e6 if path.is_file() else 0.0)
 
 
-def _ripple_checks(shape: Mapping[str, float | None]) -> list[Check]:
+def _ripple_checks(lens: Lens, shape: Mapping[str, float | None]) -> list[Check]:
     """State the RMS slope of the ripple of each tailored face: a checkerboard in its net.
 
     There is no limit: the RRMSD contains the effect on the light, and bounds of the scene limit the effect on a tool.
     """
-    slopes = {"": shape["ripple_slope"], " of the front": shape.get("front_ripple_slope")}
     measured = "RMS slope of the checkerboard in the net"
-    named = {f"ripple{of}: {measured}": slope for of, slope in slopes.items()}
+    named = {f"ripple{face.of}: {measured}": shape.get(f"{face.prefix}ripple_slope") for face in lens.described_faces}
     return [Check.at_most(name, slope, None, "rad", id="ripple") for name, slope in named.items() if slope is not None]
 
 
@@ -321,9 +319,8 @@ def _ripple_rrmsd(lens: Lens, nominal: Nominal) -> dict[str, float]:
     """Return the RRMSD due to the ripple of the back alone, and of a tailored front alone, by keys of Proof.shape."""
     light = nominal.heaviest
     channel = replace(light, source=light.source.central, weight=1.0)
-    faces: dict[Face, str] = {"back": "", "front": "front_"} if lens.is_tailored("front") else {"back": ""}
-    screen = nominal.goals[0].screen
-    return {f"{key}ripple_rrmsd": rrmsd_of_ripple(channel, lens, screen, face) for face, key in faces.items()}
+    screen, faces = nominal.goals[0].screen, lens.described_faces
+    return {f"{face.prefix}ripple_rrmsd": rrmsd_of_ripple(channel, lens, screen, face.name) for face in faces}
 
 
 def bound_checks(
@@ -338,11 +335,8 @@ def bound_checks(
     found: dict[str, list[tuple[float, Extreme, str]]] = {}
     radius, degrees, kind = asked.tool_radius, asked.max_slope, "convex" if asked.mould else "concave"
     if radius is not None or degrees is not None:
-        surveys = [(survey, "")] * lens.is_tailored("back") + [(survey_front, " of the front")] * lens.is_tailored(
-            "front"
-        )
-        for surveyed, of in surveys:
-            bending = surveyed(lens, **{kind: radius}, slope=degrees)
+        for face in lens.tailored_faces:
+            bending, of = survey(lens, face.name, **{kind: radius}, slope=degrees), face.of
             if radius is not None:
                 met = getattr(bending, kind)
                 name = f"smallest {kind} radius{of}{FINE_GRID}"

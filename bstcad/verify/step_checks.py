@@ -23,8 +23,8 @@ from bstcad.cad.solid_properties import WholePart
 from bstcad.cad.step_reading import StatedFace, StatedSolid, StepLens
 from bstcad.optics.lens.face_integrals import MassProperties
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.lens.passes import LENS, Passes
-from bstcad.optics.surfaces.bspline import BSplineSurface, is_net
+from bstcad.optics.lens.passes import FRONT, LENS, Face, Passes
+from bstcad.optics.surfaces.bspline import is_net, require_net
 from bstcad.optics.surfaces.surfaces import Surface, points_and_normals
 from bstcad.runs import processes
 from bstcad.scene.mount import Mount, Part
@@ -72,7 +72,7 @@ class ExaminedFile:
 @one_sentence
 def lens(path: Path, index: float, passes: Passes = LENS) -> Lens:
     """Read the lens of a STEP file; index, passes: properties that no file states.  ValueError if it has no lens."""
-    return replace(step_reading.lens(_read(path, _stamp(path)), index), own_passes=passes)
+    return replace(step_reading.lens(_read(path, _stamp(path)), index), passes=passes)
 
 
 @one_sentence
@@ -87,8 +87,7 @@ def check(path: Path, nominal: Lens, form: float, points: int) -> tuple[Check, .
         *_solid_checks(reread.shape),
         *_face_checks(reread.stated, reread),
         *_edge_checks(reread, nominal),
-        *_form_checks(reread, nominal.back_net, form, points),
-        *(_form_checks(reread, nominal.front_net, form, points, of="front") if nominal.is_tailored("front") else ()),
+        *(found for face in nominal.described_faces for found in _form_checks(reread, face, form, points)),
         *_front_checks(reread.front, nominal, form),
     )
 
@@ -167,7 +166,9 @@ def _face_checks(faces: Sequence[StatedFace], lens: StepLens | None, prefix: str
     where = f"{len(wrong)} of {len(faces)} faces are reversed, first the face named '{wrong[0]}'" if wrong else ""
     yield Check.true(f"{prefix}: senses of the faces agree with their edges", not wrong, where, id="face-senses")
     if lens is not None:
-        name = f"{prefix}: faces with the names 'back' and 'front' are the back and the front"
+        names = list(lens.faces)[::-1]
+        quoted, own = " and ".join(f"'{name}'" for name in names), " and ".join(f"the {name}" for name in names)
+        name = f"{prefix}: faces with the names {quoted} are {own}"
         yield Check.true(name, not lens.misnamed, lens.misnamed, id="face-names")
 
 
@@ -181,17 +182,16 @@ def _edge_checks(reread: StepLens, lens: Lens, bare: bool = True) -> Iterator[Ch
         yield Check.at_most(name, wall, GAP_TOLERANCE, unit="mm", where=on_wall, id="edges-off-wall")
 
 
-def _form_checks(
-    reread: StepLens, face: BSplineSurface, tolerance: float, count: int, *, of: str = "back"
-) -> Iterator[Check]:
+def _form_checks(reread: StepLens, designed: Face, tolerance: float, count: int) -> Iterator[Check]:
     """Check a face, evaluated by OCC at `count` Sobol points: coordinates, within `tolerance` (mm), and normals."""
+    of, face = designed.name, require_net(designed.surface)
     form = f"form: deviation of the {of} in the file from the designed one"
-    if of == "front" and not reread.front.is_net:
-        yield Check.true(form, False, "the file's front is not a net", id="form")
+    in_file = reread.faces[of].surface
+    if not is_net(in_file):
+        yield Check.true(form, False, f"the file's {of} is not a net", id="form")
         return
     points = torch.quasirandom.SobolEngine(2, scramble=True, seed=1).draw(count, dtype=torch.float64)
     x, y = (low + p * (high - low) for p, (low, high) in zip(points.T, (face.x, face.y), strict=True))
-    in_file = getattr(reread, of)
     if in_file.kind != face.kind:
         yield Check.true(form, False, f"the file's {of} is no {face.kind} surface as designed", id="form")
         return
@@ -271,7 +271,7 @@ def lens_of_part(folder: Path, designed: Lens, mount: Mount) -> Lens:
     bounded = designed.shares_outline or not front.level  # no edge bounds the light on the plane of a base
     clear = clear[0] if bounded else designed.apertures[0], rim
     front, back = front.moved(front.z + up), back.moved(back.z + up)
-    return replace(designed, front=front, back=back, clear=clear, losses=None)
+    return replace(designed, losses=None).with_front(front).with_back(back).with_clear(clear)
 
 
 @one_sentence
@@ -295,7 +295,7 @@ def check_part(folder: Path, lens: Lens, mount: Mount, part: Part) -> tuple[Chec
     down = np.array([0.0, 0.0, mount.origin(lens.front_vertex)])
     net = lens.back_net.control_points() - down
     of_front = []
-    if lens.is_tailored("front"):
+    if lens.is_tailored(FRONT):
         name, read = f"{PART_FILE}: deviation of the control points of the front", text_checks.net_of_front(text)
         of_front.append(net_check(name, read, lens.front_net.control_points() - down, id="control-points"))
     properties = _properties(path, _stamp(path)) if text.properties.of_shape else None

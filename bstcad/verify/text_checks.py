@@ -13,6 +13,7 @@ import numpy as np
 
 from bstcad.optics.lens.face_integrals import MassProperties
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK, FRONT, of_face
 from bstcad.optics.surfaces.bspline import knots
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.scene.mount import Part
@@ -35,7 +36,7 @@ def lens_checks(text: StepText, lens: Lens) -> list[Check]:
     checks = structure_checks(text, lens.back_net.shape)
     name, back = f"{SOURCE}: deviation of the control points", lens.back_net.control_points()
     checks.append(net_check(name, text.surface.control_points, back, id="control-points"))
-    if lens.front.is_net and (text.front is not None or lens.is_tailored("front")):
+    if lens.front.is_net and (text.front is not None or lens.is_tailored(FRONT)):
         name, front = f"{SOURCE}: deviation of the control points of the front", lens.front_net.control_points()
         checks.append(net_check(name, net_of_front(text), front, id="control-points"))
     return checks
@@ -153,13 +154,15 @@ def density_checks(stated: ValidationProperties) -> Iterator[Check]:
 def part_checks(text: StepText, part: Part, name: str = SOURCE) -> Iterator[Check]:
     """Check material, density and profile tolerances of back and front against the scene's [part]."""
     stated, back, profile = text.properties, text.surface.entity, "profile tolerance"
-    fronts = [each for each in stated.profiles if part.front_profile is not None and each.face == "front"]
-    backs = [each for each in stated.profiles if each not in fronts]
-    numbers: dict[str, tuple[str, Sequence[float], float | None]] = {  # quantity: (unit, stated values, scene's value)
-        profile: ("mm", [each.width for each in backs], part.surface_profile),
-        f"{profile} of the front": ("mm", [each.width for each in fronts], part.front_profile),
-        "density": ("g/cm³", stated.densities, part.density),
+    numbers: dict[str, tuple[str, Sequence[float], float | None]] = {}  # quantity: (unit, stated values, scene's value)
+    named = {face for face, width in part.profiles.items() if face != BACK and width is not None}
+    zones = {  # a face without a name of its own counts as the back
+        face: [each for each in stated.profiles if (each.face if each.face in named else BACK) == face]
+        for face in part.profiles
     }
+    for face, width in part.profiles.items():
+        numbers[f"{profile}{of_face(face)}"] = "mm", [each.width for each in zones[face]], width
+    numbers["density"] = "g/cm³", stated.densities, part.density
     for quantity, (unit, values, required) in numbers.items():
         if required is not None and values:
             off, where = _worst_value([(value,) for value in values], (required,), "the scene states", unit)
@@ -168,11 +171,11 @@ def part_checks(text: StepText, part: Part, name: str = SOURCE) -> Iterator[Chec
         elif values:
             difference = f"the file states {_words((values[0],), unit)}, but the scene states none"
             yield Check.true(f"{name}: {quantity} is the scene's", False, difference, id="stated-values")
-    if backs:
+    if backs := zones[BACK]:
         others = {each.surface for each in backs} - {"", back}
         where = f"it refers to the surface #{min(others)}, but the back is #{back}" if others else ""
         yield Check.true(f"{name}: {profile} refers to the back", not others, where, id="profile-face")
-    if fronts:
+    if fronts := zones[FRONT]:
         where = f"it refers to the surface #{back}, which is the back"
         of_front = back not in {each.surface for each in fronts}
         own = f"{name}: {profile} of the front does not refer to the back"

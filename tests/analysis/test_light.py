@@ -21,6 +21,7 @@ from bstcad.analysis.light import (
     ray_map,
 )
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import MIRROR
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.point import PointSource
@@ -37,7 +38,7 @@ FRONT, BLOCK = Plane(2.0), Rectangle(16.0, 12.0)
 
 def lens_of(sag=None, front=FRONT, outline=BLOCK, m=33, z=10.0, **more):
     """A lens whose net, as large as the outline's box, has the heights sag(x, y)."""
-    return Lens(front, net(sag, z, m, outline.half_extent), outline, **{"index": INDEX} | more)
+    return Lens.between(front, net(sag, z, m, outline.half_extent), outline, **{"index": INDEX} | more)
 
 
 class TestDrawnRays:
@@ -128,7 +129,7 @@ class TestUsed:
 
     def test_a_mirror_has_one_face_that_light_meets(self):
         lamp = PointSource(position=(0.0, 0.0, 50.0), profile="uniform", half_angle=10.0)
-        [face] = self.faces(lamp, reflects=True)
+        [face] = self.faces(lamp, passes=MIRROR)
         assert face.radius == pytest.approx(30.0 * math.tan(math.radians(10.0)), rel=self.GRID)
 
 
@@ -168,7 +169,7 @@ class TestMargins:
         lens = self.wedge(5.0)
         heights = lens.back.heights.clone()
         heights[4, 4], heights[2, 7] = float("nan"), float("inf")
-        assert self.of(replace(lens, back=replace(lens.back, heights=heights)), n=8).non_finite >= 2
+        assert self.of(lens.with_back(replace(lens.back, heights=heights)), n=8).non_finite >= 2
 
 
 class TestBlur:

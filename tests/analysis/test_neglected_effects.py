@@ -27,7 +27,7 @@ SCREEN = Screen(1000.0, (-8.0, 8.0), (-6.0, 6.0), (64, 48))
 
 def plate(slope=0.0):
     """Two planes, of which the back rises by `slope` along x: a prism, which sends light towards +x."""
-    return Lens(Plane(0.0), tilted(slope, THICKNESS, 6.0), Rectangle(12.0, 12.0), INDEX)
+    return Lens.between(Plane(0.0), tilted(slope, THICKNESS, 6.0), Rectangle(12.0, 12.0), INDEX)
 
 
 def checks(period=8):

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from bstcad.analysis.scattering import Scatter
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.lens.passes import SECOND_SURFACE
+from bstcad.optics.lens.passes import MIRROR, SECOND_SURFACE
 from bstcad.optics.surfaces.outlines import Rectangle
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
 from bstcad.optics.trace.finish import Finish
@@ -21,7 +21,9 @@ PER_RMS = math.sqrt(2 / math.pi)  # Ra / RMS of normally distributed heights
 
 
 def lens(front=None, **more):
-    return Lens(front or Plane(0.0), net(lambda x, y: 0.01 * x**2, 5.0, 17, 10.0), Rectangle(18.0, 18.0), N, **more)
+    return Lens.between(
+        front or Plane(0.0), net(lambda x, y: 0.01 * x**2, 5.0, 17, 10.0), Rectangle(18.0, 18.0), N, **more
+    )
 
 
 def rough_face(rms, length, pitch, count):
@@ -90,7 +92,7 @@ def test_faces_add_their_phases_and_a_mirror_doubles_them():
     one = (2 * math.pi * 10.0 / PER_RMS / LINE) ** 2  # of an index difference of 1
     assert Scatter.of(lens(), finish, LINE).strength == pytest.approx(one * 0.49**2)  # the plane front has none
     assert Scatter.of(lens(Sphere(0.0, 0.01)), finish, LINE).strength == pytest.approx(2 * one * 0.49**2)
-    assert Scatter.of(lens(reflects=True), finish, LINE).strength == pytest.approx(one * 2**2)
-    behind_glass = lens(Sphere(0.0, 0.01), own_passes=SECOND_SURFACE)
+    assert Scatter.of(lens(passes=MIRROR), finish, LINE).strength == pytest.approx(one * 2**2)
+    behind_glass = lens(Sphere(0.0, 0.01), passes=SECOND_SURFACE)
     expected = one * (2 * 0.49**2 + (2 * N) ** 2)
     assert Scatter.of(behind_glass, finish, LINE).strength == pytest.approx(expected)

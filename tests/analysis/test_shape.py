@@ -34,7 +34,7 @@ def lens_of(sag, outline=DISC, front=PLATE, z=20.0) -> Lens:
     f = sag(half[0] * place[:, None], half[1] * place[None, :])
     f = (10 * f[1:-1] - f[:-2] - f[2:]) / 8
     heights = torch.from_numpy((10 * f[:, 1:-1] - f[:, :-2] - f[:, 2:]) / 8)
-    return Lens(front, net(heights, z, half=half), outline, 1.5)
+    return Lens.between(front, net(heights, z, half=half), outline, 1.5)
 
 
 def cap(radius, sign=1.0):
@@ -150,7 +150,7 @@ class TestSurvey:
         if heights is None:
             heights = torch.from_numpy(np.random.default_rng(5).normal(0.0, 0.02, (self.M, self.M)))
         half = (-self.HALF, self.HALF)
-        return Lens(Plane(0.0), BSplineSurface(3.0, heights, half, half), outline, 1.5)
+        return Lens.between(Plane(0.0), BSplineSurface(3.0, heights, half, half), outline, 1.5)
 
     def spline(self, lens):
         """(x, y of the places (mm), slope, the two principal curvatures) with five places a span each way.
@@ -187,7 +187,7 @@ class TestSurvey:
 
     def test_the_description_has_the_figures_that_bounds_are_held_to(self):
         lens = self.rough(self.ROUND)
-        shape, found = describe(lens, 65), survey(lens, 0.5, 0.5, 30.0)
+        shape, found = describe(lens, 65), survey(lens, concave=0.5, convex=0.5, slope=30.0)
         assert (shape["radius_min_concave"], shape["radius_min_convex"]) == (
             found.concave.largest,
             found.convex.largest,
@@ -215,7 +215,7 @@ class TestSurvey:
         try:
             for count in (1, 3):
                 torch.set_num_threads(count)
-                found.append(survey(lens, 0.1, 0.1, 20.0))
+                found.append(survey(lens, concave=0.1, convex=0.1, slope=20.0))
         finally:
             torch.set_num_threads(threads)
         assert found[0] == found[1]

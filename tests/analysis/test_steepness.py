@@ -16,7 +16,7 @@ from tests.lenses import net
 
 N, HEIGHT, FAR, PIXELS = 1.5, 15.0, 1e7, 40
 HALF = 18.0  # mm, of the points on the flat back: up to 50 degrees along x, 60 in the corners
-LENS = Lens(
+LENS = Lens.between(
     Recess(Sphere(12.0, -1 / 12), Circle(11.0)),
     net(z=HEIGHT, half=60.0), Circle(28.0), N,
 )  # fmt: skip

@@ -222,9 +222,7 @@ def with_heights(heights: np.ndarray) -> Lens:
     net = control_net(heights)
     flat = load(TEMPLATES / f"{PEER}.toml").flat_lens(len(net))
     half = flat.outline.half_extent[0] * (1 + 1 / (len(heights) - 1))  # the net reaches half a pitch beyond the mesh
-    return replace(
-        flat, back=replace(flat.back, heights=torch.from_numpy(net.T.copy()), x=(-half, half), y=(-half, half))
-    )
+    return flat.with_back(replace(flat.back, heights=torch.from_numpy(net.T.copy()), x=(-half, half), y=(-half, half)))
 
 
 def grown() -> Record:

@@ -144,7 +144,7 @@ def _design() -> tuple[Scene, Lens]:
 def lens_of(m: int) -> Lens:
     """Return the same lens on m x m control points."""
     lens = _design()[1]
-    return replace(lens, back=lens.back.refined(m))
+    return lens.with_back(lens.back.refined(m))
 
 
 def _scene(m: int, pixels: int) -> Scene:

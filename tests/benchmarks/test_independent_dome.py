@@ -65,7 +65,7 @@ def test_a_wavy_dome_makes_the_picture_of_the_independent_judge(profile, place, 
     source, dome = PointSource(place, profile=profile, half_angle=70.0), wavy_dome(65, *waves)
     light = SphereLight(source, Z, CHART, HALF)
     clear = Circle(INNER), Circle(RIM)
-    lens = Lens(Sphere(Z + INNER, -1 / INNER), dome, Circle(RIM), N, clear=clear)
+    lens = Lens.between(Sphere(Z + INNER, -1 / INNER), dome, Circle(RIM), N, clear=clear)
     screen = Screen(200.0, (-extent, extent), (-extent, extent), PIXELS, surface=receiver)
     made, *_ = trace.simulate_plain([(1.0, light, lens, 1)], [screen], 768)
 

@@ -25,6 +25,7 @@ from bstcad.exports.grid_sag import GridSag
 from bstcad.optics.lens.face_integrals import of_lens
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.losses import FresnelLoss, Losses
+from bstcad.optics.lens.passes import LENS, MIRROR
 from bstcad.optics.surfaces.bspline import DEGREE, knots
 from bstcad.optics.trace.measure import tubes_picture
 from bstcad.optics.trace.trace import ghost_light, to_first_net, trace_ghost
@@ -70,7 +71,7 @@ def written(template: str, changes: Mapping[str, Any], folder: Path) -> Written:
     scene, path = load(TEMPLATES / f"{template}.toml", changes), folder / "lens.step"
     step_writing.write(lens_solid(design(scene, device="cpu").lens), path, scene.name)
     lens = step_reading.lens(step_reading.read(path), scene.index)
-    return Written(scene, replace(lens, reflects=scene.lens.back.reflect))
+    return Written(scene, replace(lens, passes=MIRROR if scene.lens.back.reflect else LENS))
 
 
 @pytest.fixture(scope="module")

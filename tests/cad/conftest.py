@@ -38,6 +38,6 @@ def encode(lens: Lens, part: Part, name: str = "lens", faces: Sequence[str] | No
 @pytest.fixture
 def make_lens() -> Callable[..., Lens]:
     def make(front: Surface = FRONT, outline: Outline = OUTLINE, m: int = 17, ripple: float = 1e-3) -> Lens:
-        return Lens(front, rough_back(outline, m, ripple), outline, 1.49)
+        return Lens.between(front, rough_back(outline, m, ripple), outline, 1.49)
 
     return make

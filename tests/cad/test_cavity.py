@@ -35,7 +35,7 @@ def relief(z, size, seed):
 
 
 def lens(front=None):
-    return Lens(front or Sphere(0.3, -0.01), relief(5.0, 0.02, 0), Circle(4.0), 1.49)
+    return Lens.between(front or Sphere(0.3, -0.01), relief(5.0, 0.02, 0), Circle(4.0), 1.49)
 
 
 def poles(face):

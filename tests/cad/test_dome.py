@@ -36,7 +36,7 @@ def dome(front=CAVITY, half=85.0, m=25, wave=0.4, z=0.0):
     net = RadialSurface.sphere(z, R, (1.15 * rim, 1.15 * rim), (m, m))
     s = torch.linspace(-1.0, 1.0, m, dtype=torch.float64)
     net = replace(net, heights=wave * (torch.sin(4 * s)[:, None] + 0.5 * torch.cos(5 * s + 1)))
-    return Lens(front, net, Circle(rim), 1.49, clear=(Circle(INNER * math.sin(half)), Circle(rim)))
+    return Lens.between(front, net, Circle(rim), 1.49, clear=(Circle(INNER * math.sin(half)), Circle(rim)))
 
 
 def cap(radius, height):
@@ -215,7 +215,7 @@ def test_a_dome_keeps_its_own_rim():
 def test_a_part_is_read_back_in_the_chart_of_its_design(tmp_path):
     """A flange in the base plane, and one whose lower face lies below it: apertures, net and a closed solid."""
     lens = on_base(dome(half=80.0, m=25), 0.5)
-    lens = replace(lens, clear=(lens.front.outline, lens.outline))
+    lens = lens.with_clear((lens.front.outline, lens.outline))
     for z in (0.5, -0.4):
         plate = Flange(outline=CircleRim(shape="circle", diameter=40.0), z=z, thickness=1.2 if z < 0 else 0.9)
         mount = Mount(datum="flange", flange=plate)
@@ -239,7 +239,7 @@ def offset_sphere(radius, height, half, m=97):
     _, _, cos = net.directions
     rho = height * cos + torch.sqrt(radius**2 - height**2 * (1 - cos**2))
     net = replace(net, heights=rho - radius)
-    return Lens(Plane(-2.0), net, Circle(rim), 1.49)
+    return Lens.between(Plane(-2.0), net, Circle(rim), 1.49)
 
 
 @pytest.mark.parametrize("height", [0.0, 3.0, -3.0])

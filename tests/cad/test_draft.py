@@ -163,7 +163,7 @@ def test_below_a_flange_it_leans_from_the_flange_on(lean):
         mounted(disc(-1.0, 3.0), [PlacedLens(lens, draft=Draft(1.0))])
 
 
-STEEP = replace(plate(), front=Sphere(-4.0, 0.24), back=waves(half=(4.0, 4.0)), outline=Circle(3.0))
+STEEP = replace(plate(), outline=Circle(3.0)).with_front(Sphere(-4.0, 0.24)).with_back(waves(half=(4.0, 4.0)))
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,7 @@ def disc_wire(radius, x=0.0, y=0.0):
 
 @pytest.mark.parametrize("outline", [Circle(7.0), Rectangle(24.0, 24.0)], ids=lambda outline: outline.shape)
 def test_a_slab(outline):
-    lens = Lens(Plane(8.0), net(half=12.0), outline, 1.5)
+    lens = Lens.between(Plane(8.0), net(half=12.0), outline, 1.5)
     rim = 2 * np.pi * 7 if outline.shape == "circle" else 96.0
     wanted = [2 * outline.area + rim * 12, outline.area * 12, 0, 0, 14.0]
     assert values(of_lens(lens)) == pytest.approx(wanted, rel=1e-12, abs=1e-12)
@@ -64,7 +64,9 @@ def test_a_half_ball_has_its_centroid_at_three_eighths():
     """Nearly: a ball of R = 10 cut at 9.9; V and V c by the formulas of the spherical segment."""
     radius, a = 10.0, 9.9
     s = radius - np.sqrt(radius**2 - a**2)
-    lens = Lens(Sphere(0.0, 1 / radius), net(z=s + 1.0, half=12.0), Circle(a), 1.5)  # a bowl of glass, 1 mm of rim
+    lens = Lens.between(
+        Sphere(0.0, 1 / radius), net(z=s + 1.0, half=12.0), Circle(a), 1.5
+    )  # a bowl of glass, 1 mm of rim
     cap, disc_ = np.pi * s * s * (3 * radius - s) / 3, np.pi * a * a
     below = 3 * (2 * radius - s) ** 2 / (4 * (3 * radius - s))  # the cap's centroid, from the ball's centre
     found = of_lens(lens)

@@ -227,7 +227,7 @@ def test_corners_that_are_made_to_collide_are_welded_all_the_same(tmp_path):
 
 def test_vertices_in_single_precision_lie_on_the_steepest_of_faces():
     """Rounding moves a vertex by 2^-24 of a coordinate; along z, where the slope is 4, by five times that."""
-    lens = Lens(Plane(-5.0), Sphere(0.0, -0.097), Circle(10.0), 1.5)
+    lens = Lens.between(Plane(-5.0), Sphere(0.0, -0.097), Circle(10.0), 1.5)
     radius, turn = np.random.default_rng(0).uniform(9.5, 10.0, 20_000), np.linspace(0, 2 * np.pi, 20_000)
     x, y = radius * np.cos(turn), radius * np.sin(turn)
     exact = np.stack([x, y, sag(lens.back, x, y)], axis=1)

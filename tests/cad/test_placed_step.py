@@ -120,7 +120,7 @@ def test_two_freeform_faces_in_nested_assemblies(make_lens, tmp_path):
     """Places follow each other; the light's side is found though the lens lies upside down."""
     lens = make_lens(m=9)
     front = BSplineSurface(8.0, 0.1 * torch.flip(lens.back.heights, [0]), lens.back.x, lens.back.y)
-    lens = type(lens)(front, rough_back(OUTLINE, 9), OUTLINE, 1.49)
+    lens = lens.between(front, rough_back(OUTLINE, 9), OUTLINE, 1.49)
     places = Location(Vector(1, 2, 3), Vector(0, 1, 1), 50), Location(Vector(10, 0, -4), Vector(1, 0, 0), 170)
     path = in_assembly(lens_solid(lens), tmp_path / "lens.step", *places)
     found, text = step_checks.examine(path), part21.read(path)

@@ -54,7 +54,7 @@ def test_the_preview_is_the_lens_in_metres_with_y_up(make_lens, front, outline):
 
 @pytest.mark.parametrize("outline, half", [(Rectangle(10.0, 8.0), (5.0, 4.0)), (Circle(3.5), (4.0, 4.0))])
 def test_a_coarse_copy_has_the_outline_and_front_and_nearly_the_back(outline, half):
-    lens = replace(plate("convex"), outline=outline, back=waves(129, half=half))
+    lens = replace(plate("convex"), outline=outline).with_back(waves(129, half=half))
     light = coarse_copy(lens, 33)
     assert light.back.m == 33 and lens_solid(light).isValid()
     assert exact_volume(light) == pytest.approx(exact_volume(lens), rel=2e-3)

@@ -42,7 +42,7 @@ LENSES = {
 
 def lens_of(name, m=25):
     front, outline, _ = LENSES[name]
-    return Lens(front, rough_back(outline, m), outline, 1.49)
+    return Lens.between(front, rough_back(outline, m), outline, 1.49)
 
 
 def reread(tile, path):
@@ -62,7 +62,7 @@ def light_of_tile(tile, lens, path, source, screen, start):
     own = shapely.Polygon(ordered(step_reading.outer_edge(faces["back"])))
     x, y, area = start
     inside = torch.from_numpy(shapely.contains_xy(own, x.numpy(), y.numpy()))
-    again = Lens(lens.front, step_reading.freeform_surface(faces["back"]), lens.outline, lens.index)
+    again = Lens.between(lens.front, step_reading.freeform_surface(faces["back"]), lens.outline, lens.index)
     landed = trace(source.rays_through(x[inside], y[inside], lens.front.z, area), again, screen.receiver)
     return collect(landed, screen)[0]
 
@@ -148,7 +148,7 @@ def test_the_light_of_the_tiles_is_that_of_the_lens(tmp_path):
 
 
 def test_what_cannot_be_tiled_is_refused_in_one_sentence():
-    recess = Lens(Recess(Sphere(8.0, 0.01), Circle(5.0)), rough_back(PLATE, 17), PLATE, 1.49)
+    recess = Lens.between(Recess(Sphere(8.0, 0.01), Circle(5.0)), rough_back(PLATE, 17), PLATE, 1.49)
     with pytest.raises(ValueError, match="the front ends in an outline of its own"):
         list(tiles_of(recess, Tiling()))
     with pytest.raises(ValueError, match="a sliver of .* give another number of tiles"):

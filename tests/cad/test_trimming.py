@@ -47,7 +47,7 @@ FRONTS = {
 
 
 def plate(front="plane"):
-    return Lens(FRONTS[front], waves(), Rectangle(10.0, 8.0), 1.5)
+    return Lens.between(FRONTS[front], waves(), Rectangle(10.0, 8.0), 1.5)
 
 
 def stadium(spline=True):
@@ -127,14 +127,14 @@ def test_its_volume_is_that_of_calculus(front):
 def test_without_wires_it_is_the_lens_itself():
     """Cut along its own outline, too."""
     own = {"rectangle": rectangle(10, 8), "circle": cq.Workplane("XY").circle(3.0).wires().val()}
-    for lens in (plate("convex"), replace(plate("convex"), outline=Circle(3.0), back=waves(half=(4.0, 4.0)))):
+    for lens in (plate("convex"), replace(plate("convex"), outline=Circle(3.0)).with_back(waves(half=(4.0, 4.0)))):
         for trim in (None, own[lens.outline.shape]):
             assert occ_volume(lens_solid(lens, trim)) == pytest.approx(exact_volume(lens), rel=2e-6)
 
 
 def test_a_wire_of_one_closed_edge():
     """An ellipse of the half axes 3 and 2 mm, whose area says how much of a plate it cuts out."""
-    flat = replace(plate(), back=net(z=4.0, half=(5.0, 4.0)))
+    flat = plate().with_back(net(z=4.0, half=(5.0, 4.0)))
     ellipse = cq.Workplane("XY").ellipse(3, 2).wires().val()
     solid = lens_solid(flat, ellipse, [cq.Workplane("XY").ellipse(0.5, 0.4).wires().val()])
     assert solid.isValid() and worst_gap(solid) < 1e-7

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -35,7 +34,7 @@ FRONTS = {
 def lens(front="dome", outline="round"):
     a, b = half = half_over(OUTLINES[outline], 33)
     back = net(lambda x, y: -3 * ((x / a) ** 2 + (y / b) ** 2) + 0.2 * torch.sin(5 * x / a), 22.0, 33, half)
-    return Lens(FRONTS[front], back, OUTLINES[outline], 1.5)
+    return Lens.between(FRONTS[front], back, OUTLINES[outline], 1.5)
 
 
 @pytest.mark.parametrize(("front", "outline"), [*((front, "round") for front in FRONTS), ("dome", "oblong")])
@@ -59,7 +58,7 @@ def test_the_step_file_holds_the_lens_exactly(front, outline, tmp_path):
 def test_its_volume_is_that_without_the_cap_of_a_sphere():
     made = lens()
     height = RADIUS - math.sqrt(RADIUS**2 - EDGE**2)
-    flat = replace(made, front=made.front.around)
+    flat = made.with_front(made.front.around)
     cap = math.pi * height**2 * (3 * RADIUS - height) / 3
     assert face_integrals.of_lens(flat).volume - face_integrals.of_lens(made).volume == pytest.approx(cap, rel=1e-11)
     assert named_solid(made).faces.count("underside") == 1
@@ -68,7 +67,7 @@ def test_its_volume_is_that_without_the_cap_of_a_sphere():
 def test_a_front_of_another_outline_or_curvature_is_found(tmp_path):
     step_writing.write_lens(lens(), tmp_path / "lens.step", "lens")
     for other in (Recess(FRONTS["dome"].face, Circle(EDGE - 1e-3)), Recess(Sphere(12.0, -1 / 12.001), Circle(EDGE))):
-        checks = step_checks.check(tmp_path / "lens.step", replace(lens(), front=other), 1e-6, 100)
+        checks = step_checks.check(tmp_path / "lens.step", lens().with_front(other), 1e-6, 100)
         assert any(not check.passed for check in checks)
 
 

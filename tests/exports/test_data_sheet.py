@@ -128,7 +128,7 @@ def lens_of(scene):
     a, b = outline.half_extent if outline.shape == "rectangle" else 2 * (outline.radius * 32 / 27,)
     u, v = torch.meshgrid(*2 * (torch.linspace(-1, 1, 33, dtype=torch.float64),), indexing="ij")
     back = BSplineSurface(scene.lens.back.z, 0.04 * a * (torch.cos(3 * u) * torch.sin(2 * v + 1) + u), (-a, a), (-b, b))
-    return Lens(scene.lens.front.surface, back, outline, scene.index, scene.lens.back.reflect)
+    return Lens.between(scene.lens.front.surface, back, outline, scene.index, passes=scene.lens.passes)
 
 
 def ordered(scene, lens, shape):

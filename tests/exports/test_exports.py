@@ -34,7 +34,7 @@ def wavy(outline, m=21):
     if outline.shape == "circle":
         a = b = outline.radius * (m - 1) / (m - 6)  # the net goes on behind the rim
     heights = torch.from_numpy(np.random.default_rng(7).normal(0.0, 0.02, (m, m)))
-    return Lens(Sphere(1.0, 0.02), BSplineSurface(4.0, heights, (-a, a), (-b, b)), outline, 1.49)
+    return Lens.between(Sphere(1.0, 0.02), BSplineSurface(4.0, heights, (-a, a), (-b, b)), outline, 1.49)
 
 
 def read_zemax(text):

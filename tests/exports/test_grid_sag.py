@@ -10,6 +10,7 @@ from scipy.interpolate import CubicHermiteSpline
 from bstcad.exports import grid_sag
 from bstcad.exports.grid_sag import MAX_SHIFT, GridLight, GridSag, shift_by_patches, table_note
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import MIRROR
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
@@ -27,7 +28,7 @@ def wavy(shape=(21, 17), past=2, outline=OUTLINE):
     heights = torch.from_numpy(np.random.default_rng(7).normal(0.0, 0.002, shape))
     ends = [half * (m - 1) / (m - 1 - 2 * past) for half, m in zip(outline.half_extent, shape, strict=True)]
     back = BSplineSurface(4.0, heights, (-ends[0], ends[0]), (-ends[1], ends[1]))
-    return Lens(Plane(1.0), back, outline, 1.49)
+    return Lens.between(Plane(1.0), back, outline, 1.49)
 
 
 def interpolated(text, x, y):
@@ -75,7 +76,7 @@ def test_where_the_lens_reaches_into_the_end_spans_the_grid_gets_finer(outline):
 def test_light_of_a_point_and_a_face_before_it_are_judged_too():
     """Rays that run askew meet the patches where they meet the face."""
     lens = wavy()
-    lens = replace(lens, front=lens.back.moved(1.0), back=Plane(4.0))
+    lens = lens.with_front(lens.back.moved(1.0)).with_back(Plane(4.0))
     throw = GridLight(PointSource((0.0, 0.0, -30.0), half_angle=5.0, profile="uniform"), BEAM.screens)
     exact, coarse = (GridSag.of(lens, lens.front, points, throw).shift for points in (None, 21))
     assert exact.maximum < 1e-9 < 1e-3 < coarse.rms < coarse.maximum
@@ -87,7 +88,7 @@ def test_light_of_a_point_and_a_face_before_it_are_judged_too():
 def test_a_mirror_is_judged_by_its_own_light():
     """A slope that is off by δ turns reflected light by 2 δ: four times as far as through a lens of index 1.5."""
     through = replace(wavy(), index=1.5)
-    mirror = replace(through, front=Plane(-2.0), reflects=True)
+    mirror = replace(through, passes=MIRROR).with_front(Plane(-2.0))
     lenses = through, mirror
     moved = [shift_by_patches(lens, lens.back, GridSag.of(lens, lens.back, 21).patches, BEAM) for lens in lenses]
     assert moved[1].rms == pytest.approx(4 * moved[0].rms, rel=0.02)

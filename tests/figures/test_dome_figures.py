@@ -19,7 +19,7 @@ from tests.cad.test_dome import CASES, dome, offset_sphere
 @pytest.fixture(scope="module")
 def lens():
     made = CASES["sphere"]
-    return replace(made, back=replace(made.back, z=0.25))
+    return made.with_back(replace(made.back, z=0.25))
 
 
 def test_the_polar_table_holds_points_of_the_dome_and_their_normals(lens, tmp_path):
@@ -85,7 +85,7 @@ def test_the_model_of_the_report_has_the_extent_of_the_solid(name):
 def test_the_outer_size_is_that_of_the_solid_which_may_be_oblong_and_wider_than_its_rim(name):
     oblong = dome(half=78.0)
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, 25), np.linspace(-1.0, 1.0, 25), indexing="ij")
-    oblong = replace(oblong, back=replace(oblong.back, heights=torch.from_numpy(3.0 * x**2 - 5.0 * y**2)))
+    oblong = oblong.with_back(replace(oblong.back, heights=torch.from_numpy(3.0 * x**2 - 5.0 * y**2)))
     lens = on_base({"oblong": oblong, **CASES}[name])
     vertices = mesh.lens_mesh(lens, 96).vertices
     low, high = prescription._corners(lens, None)

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from bstcad.analysis.shape import describe, survey
+from bstcad.analysis.shape import describe
 from bstcad.designs.course import CurvePoint, StageRecord
 from bstcad.figures import drawing, figure_jobs, light_figures
 from bstcad.figures.drawing import png
@@ -53,11 +53,11 @@ def lens_of(sag, outline=None, m=33, front=None):
     line = torch.linspace(-10.0, 10.0, m, dtype=torch.float64)
     heights = sag(line[:, None], line[None, :]).expand(m, m)
     back = BSplineSurface(20.0, heights, (-10.0, 10.0), (-10.0, 10.0))
-    return Lens(front or Plane(8.0), back, outline or Rectangle(20.0, 20.0), 1.5)
+    return Lens.between(front or Plane(8.0), back, outline or Rectangle(20.0, 20.0), 1.5)
 
 
 def maps(lens):
-    return figure_jobs.surface_maps(lens, survey(lens))
+    return figure_jobs.surface_maps(lens)
 
 
 def pixel_at(figure, axes, x, y):

@@ -72,7 +72,7 @@ def lens(front, outline):
     u = np.linspace(-5.0, 5.0, 33)
     x, y = np.meshgrid(u, u, indexing="ij")
     net = np.stack([x, y, 25.0 + 0.02 * np.sin(x) * np.cos(2 * y) + 0.3 * x], axis=-1)
-    return Lens(front, BSplineSurface.from_control_points(net, 25.0), outline, 1.49)
+    return Lens.between(front, BSplineSurface.from_control_points(net, 25.0), outline, 1.49)
 
 
 def read(text):

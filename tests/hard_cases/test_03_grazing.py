@@ -86,7 +86,7 @@ def test_a_ray_beside_a_ball_hits_or_passes(offset, degrees, dtype, holds):
 def test_along_the_axis_at_the_equator(curvature, dtype, holds):
     """A beam wider than the sphere: outside it is flagged; inside it refracts by the sphere's own normal."""
     radius = torch.tensor([10.0 * (1 + offset) for offset in OFFSETS], dtype=torch.float64).to(dtype)
-    lens = Lens(Sphere(15.0, curvature), wavy(dtype, z=40.0), WIDE, N)
+    lens = Lens.between(Sphere(15.0, curvature), wavy(dtype, z=40.0), WIDE, N)
     rays = CollimatedSource(Circle(30.0)).rays_through(radius, torch.zeros_like(radius), 0.0, 1.0)
     inside = trace.to_first_net(rays, lens)
     c = float(torch.tensor(curvature, dtype=dtype))

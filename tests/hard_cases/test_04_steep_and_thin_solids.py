@@ -47,9 +47,9 @@ def steep(outline: Outline, front: Plane | Sphere, m: int, dtype: torch.dtype) -
     h = height / 2 * (torch.cos(math.pi * x)[:, None] + torch.cos(math.pi * y))
     h = h + 0.05 * torch.sin(27 * x)[:, None] * torch.cos(24 * y)
     back = BSplineSurface(30.0, h.to(dtype), (-reach[0], reach[0]), (-reach[1], reach[1]))
-    lens = Lens(front, back, outline, 1.49)
-    thick = describe(replace(lens, back=back.to(torch.float64)))["thickness_min"]
-    return replace(lens, back=replace(back, z=back.z - (thick - EDGE)))
+    lens = Lens.between(front, back, outline, 1.49)
+    thick = describe(lens.with_back(back.to(torch.float64)))["thickness_min"]
+    return lens.with_back(replace(back, z=back.z - (thick - EDGE)))
 
 
 LENSES = {
@@ -80,7 +80,7 @@ def written(request, tmp_path_factory) -> Written:
 
 
 def test_it_is_as_steep_and_as_thin_as_the_case_asks(written):
-    shape = describe(replace(written.lens, back=written.lens.back.to(torch.float64)))
+    shape = describe(written.lens.with_back(written.lens.back.to(torch.float64)))
     assert 60 < shape["slope_max_deg"] < 72
     assert shape["thickness_min"] == pytest.approx(EDGE, abs=1e-6)  # z0 is a float64, heights may be float32
     assert shape["edge_thickness_min"] < 2 * EDGE and shape["thickness_max"] > 10
@@ -88,7 +88,7 @@ def test_it_is_as_steep_and_as_thin_as_the_case_asks(written):
 
 def test_the_solid_is_valid_and_its_face_is_the_designed_one(holds, written):
     """Sixteen digits are written; OCC's own evaluation of a spline is good to some 1e-15 of 30 mm."""
-    lens = replace(written.lens, back=written.lens.back.to(torch.float64))
+    lens = written.lens.with_back(written.lens.back.to(torch.float64))
     found = {check.id: check for check in step_checks.check(written.path, lens, 1e-9, 1 << 14)}
     assert all(check.passed for check in found.values()), found
     holds("distance of the back in the file from the designed back", found["form"].value, 1e-9, "mm")

@@ -77,7 +77,7 @@ def test_of_many_roots_of_a_spline_the_first_ahead_counts(depth, number, degrees
 def test_all_forms_choose_the_same_root(depth, number, degrees):
     back = waves(depth, number)
     rays = from_below(back, degrees, 3000)
-    lens = Lens(Plane(8.0), back, SQUARE, N)
+    lens = Lens.between(Plane(8.0), back, SQUARE, N)
     landed = {}
     for engine in ("plain", "fused"):
         with tracing(engine) as through_back:
@@ -91,7 +91,7 @@ def test_all_forms_choose_the_same_root(depth, number, degrees):
 
 def test_the_forward_kernel_chooses_it_too():
     """A near source before a plane front: rays in the glass up to 38° off the axis, waves steeper than that allows."""
-    source, lens = PointSource((1.0, 0.5, 12.0)), Lens(Plane(15.0), waves(2.5, 12.0), SQUARE, N)
+    source, lens = PointSource((1.0, 0.5, 12.0)), Lens.between(Plane(15.0), waves(2.5, 12.0), SQUARE, N)
     x, y = uniform((2, 3000), 5, -9.9, 9.9)
     rays = source.rays_through(x, y, 15.0, 1.0)
     in_glass = trace.to_first_net(rays, lens)
@@ -110,7 +110,7 @@ def test_a_start_behind_the_face_is_a_miss(engine, dtype):
     """Beyond a smooth face, beyond a wave of a steep one, and on the far side of a wave that lies ahead."""
     smooth, steep = waves(0.5, 3.0, dtype), waves(2.0, 12.0, dtype)
     for back in (smooth, steep):
-        lens = Lens(Plane(8.0), back, SQUARE, N)
+        lens = Lens.between(Plane(8.0), back, SQUARE, N)
         x = torch.linspace(-9.0, 9.0, 60, dtype=torch.float64)
         top = back.z + back.to(torch.float64).relative_sag_and_slope(x, 0 * x)[0] + 0.05
         start = torch.stack([x, 0 * x, top], 1)

@@ -138,7 +138,9 @@ def test_the_forward_kernel_at_knots_and_corners():
     m, half = 9, 10.0
     heights = buried(m, torch.float64)
     heights *= 0.2
-    lens = Lens(Plane(8.0), BSplineSurface(20.0, heights, (-half, half), (-half, half)), Rectangle(2 * half, 20.0), 1.5)
+    lens = Lens.between(
+        Plane(8.0), BSplineSurface(20.0, heights, (-half, half), (-half, half)), Rectangle(2 * half, 20.0), 1.5
+    )
     at = (around_knots(m, torch.float64) * (2 * half / (m - 1)) - half).reshape(-1)
     line = torch.cat([at, torch.tensor([half + 1e-9, -1e6, 1e6], dtype=torch.float64)])
     x, y = (p.reshape(-1).contiguous() for p in torch.meshgrid(line, line, indexing="ij"))

@@ -54,7 +54,9 @@ def test_a_traced_pixel_counts_twenty_million_rays(holds, dtype):
     A sum of n equal numbers rounds each time in the same direction, by at most ROUND; a part adds n / MAX_PARTS.
     """
     heights = torch.zeros((5, 5), dtype=dtype)
-    lens = Lens(Plane(5.0), BSplineSurface(8.0, heights, (-10.0, 10.0), (-10.0, 10.0)), Rectangle(20.0, 20.0), 1.5)
+    lens = Lens.between(
+        Plane(5.0), BSplineSurface(8.0, heights, (-10.0, 10.0), (-10.0, 10.0)), Rectangle(20.0, 20.0), 1.5
+    )
     n = 4473
     found = simulated(CollimatedSource(Rectangle(18.0, 18.0)), lens, SCREEN, n, 0)
     assert found.rays == n * n > HITS and float(found.box.sum()) == float(found.box[2, 2])
@@ -122,7 +124,7 @@ def test_a_control_point_feels_every_ray_that_lands(holds, dtype, compiled):
     """
     g = carried(dtype)
     heights = torch.zeros((9, 9), dtype=dtype, requires_grad=True)
-    lens = Lens(Plane(-2.0), BSplineSurface(0.0, heights, (-4.0, 4.0), (-4.0, 4.0)), Rectangle(8.0, 8.0), 1.5)
+    lens = Lens.between(Plane(-2.0), BSplineSurface(0.0, heights, (-4.0, 4.0), (-4.0, 4.0)), Rectangle(8.0, 8.0), 1.5)
     start = torch.tensor([0.0, 0.0, -1.0], dtype=dtype)[:, None].expand(3, g.numel())
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=dtype)[:, None].expand(3, g.numel())
     rays = Rays(start, axis, torch.ones(1, dtype=dtype).expand(g.shape), torch.zeros(g.shape, dtype=torch.uint8))

@@ -61,7 +61,7 @@ def lens(dtype=torch.float64, m=193) -> Lens:
     x, y = line[:, None], line[None, :]
     h = -1.5 * (x**2 + 0.8 * y**2) + 0.02 * torch.sin(9 * x) * torch.cos(7 * y + 0.3)
     back = BSplineSurface(24.0, h.to(torch.float32).to(dtype), (-10.5, 10.5), (-10.5, 10.5))
-    return Lens(Sphere(15.0, 0.01), back, Circle(10.0), 1.5)
+    return Lens.between(Sphere(15.0, 0.01), back, Circle(10.0), 1.5)
 
 
 def target() -> torch.Tensor:
@@ -75,7 +75,7 @@ def of_two_faces(dtype) -> dict[str, torch.Tensor]:
     """Merit and gradients of two nets for two pictures of lossy light, and for a wave beside them."""
     back = lens(dtype).back
     front = replace(back, z=15.0, heights=-0.1 * back.heights.flip(0, 1))
-    held = Lens(front, back, Circle(10.0), 1.5, tailored=(0, 1))
+    held = Lens.between(front, back, Circle(10.0), 1.5, tailored=(0, 1))
     light = (Channel(SOURCE, held.index, losses=Losses(FresnelLoss(587.6), AbsorptionLoss(0.01))),)
     goals = [Goal("target", screen, target().numpy(), weight) for screen, weight in ((SCREEN, 1.0), (FURTHER, 2.0))]
     found = {}

@@ -50,7 +50,7 @@ def lens(dtype=torch.float64) -> Lens:
     x, y = line[:, None], line[None, :]
     h = 4.0 * (x**2 + 0.8 * y**2) + 0.2 * torch.sin(5 * x) * torch.cos(4 * y + 0.3)
     back = BSplineSurface(22.0, h.to(torch.float32).to(dtype), (-11.0, 11.0), (-10.5, 10.5))
-    return Lens(Sphere(15.0, 0.02), back, Rectangle(20.0, 20.0), 1.6)
+    return Lens.between(Sphere(15.0, 0.02), back, Rectangle(20.0, 20.0), 1.6)
 
 
 def cut(picture: torch.Tensor) -> torch.Tensor:

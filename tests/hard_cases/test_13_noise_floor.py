@@ -41,7 +41,9 @@ NOISE = "standard error of the RRMSD, times five"
 def plate(dtype=torch.float64) -> Lens:
     """Between two planes: the light goes straight on."""
     heights = torch.zeros((9, 9), dtype=dtype)
-    return Lens(Plane(5.0), BSplineSurface(9.0, heights, (-11.0, 11.0), (-10.0, 10.0)), Rectangle(22.0, 20.0), 1.5)
+    return Lens.between(
+        Plane(5.0), BSplineSurface(9.0, heights, (-11.0, 11.0), (-10.0, 10.0)), Rectangle(22.0, 20.0), 1.5
+    )
 
 
 def truth() -> torch.Tensor:

@@ -77,7 +77,7 @@ OUTLINES = st.sampled_from([SQUARE, Circle(9.0), Rectangle(18.0, 14.0)])
 
 
 def lens_with(depth, curvature, outline=SQUARE, ripple=0.03, dtype=torch.float64) -> Lens:
-    return Lens(Sphere(15.0, curvature), wavy(dtype, m=17, depth=depth, ripple=ripple), outline, N)
+    return Lens.between(Sphere(15.0, curvature), wavy(dtype, m=17, depth=depth, ripple=ripple), outline, N)
 
 
 @given(SOURCES, DEPTH, CURVATURE, OUTLINES, st.floats(25.0, 3000.0), SEEDS)
@@ -122,7 +122,7 @@ def test_a_hit_lies_on_its_face_and_ahead(source, depth, curvature, ripple, seed
 def test_a_mirrored_scene_lands_mirrored(depth, curvature, seed, axis):
     lens = lens_with(depth, curvature)
     k = "xy".index(axis)
-    mirrored = replace(lens, back=replace(lens.back, heights=lens.back.heights.flip(k).contiguous()))
+    mirrored = lens.with_back(replace(lens.back, heights=lens.back.heights.flip(k).contiguous()))
     points = uniform((2, 100), seed, -8.0, 8.0)
     place = [0.5, -0.75, 1.0]
     landed = trace.trace(PointSource(tuple(place)).rays_through(*points, 15.0, 1.0), lens, LevelPlane(500.0))

@@ -11,6 +11,7 @@ import torch
 import bstcad
 from bstcad import Circle, Lens, Plane, Rectangle, Sphere
 from bstcad.analysis.shape import describe
+from bstcad.optics.lens.passes import MIRROR
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.report import prescription as order
 from bstcad.report.record import of_json
@@ -62,7 +63,7 @@ def test_what_is_not_stated_is_said_and_a_mirror_s_rear_is_no_optical_face(tmp_p
     (-9.0, "4 mm before the vertex of the mirror, towards the source"),
 ])  # fmt: skip
 def test_the_origin_of_a_mirror_is_seen_from_its_own_faces(z, place):
-    mirror = replace(plate(Plane(z), z + 5.0), reflects=True)
+    mirror = replace(plate(Plane(z), z + 5.0), passes=MIRROR)
     assert order._origin(mirror, z + 5.0) == f"on the axis of the mirror (the centre of its outline), {place}"
 
 
@@ -80,9 +81,9 @@ def test_a_conic_front_is_looked_at_as_far_as_its_rim():
     r = lens.outline.radius
     root = math.sqrt(1 - (1 + k) * (c * r) ** 2)
     bent = abs(c) / root**3 / (1 + (c * r / root) ** 2) ** 1.5
-    assert order._front_radius(replace(lens, front=bstcad.Conic(-2.0, c, k))) == pytest.approx(1 / bent, rel=1e-12)
-    assert order._front_radius(replace(lens, front=bstcad.Conic(-2.0, c, -0.5))) == 50.0
-    assert order._front_radius(replace(lens, front=bstcad.Conic(-2.0, -c, k))) is None
+    assert order._front_radius(lens.with_front(bstcad.Conic(-2.0, c, k))) == pytest.approx(1 / bent, rel=1e-12)
+    assert order._front_radius(lens.with_front(bstcad.Conic(-2.0, c, -0.5))) == 50.0
+    assert order._front_radius(lens.with_front(bstcad.Conic(-2.0, -c, k))) is None
 
 
 def test_a_freeform_front_is_concave_where_it_is_a_ridge():
@@ -92,7 +93,7 @@ def test_a_freeform_front_is_concave_where_it_is_a_ridge():
     ridge = (-(u**2) / 40)[:, None].expand(lens.back.m, -1)
     for sign, radius in ((1, pytest.approx(20.0, rel=1e-3)), (-1, None)):
         front = replace(lens.back, z=-2.0, heights=(sign * ridge).repeat(1, lens.back.m))
-        assert order._front_radius(replace(lens, front=front)) == radius
+        assert order._front_radius(lens.with_front(front)) == radius
 
 
 def test_the_first_figures_have_the_size_of_what_is_sent(tmp_path):
@@ -121,7 +122,7 @@ def plate(front=None, back_z=20.0, outline=None, heights=0 * SLOPE):
     reach = 32 / 28 if outline.is_round else 1.0  # the net of a round lens goes on past the rim
     half_x, half_y = (reach * half for half in outline.half_extent)
     back = BSplineSurface(back_z, heights, (-half_x, half_x), (-half_y, half_y))
-    return Lens(front or Plane(15.0), back, outline, 1.5)
+    return Lens.between(front or Plane(15.0), back, outline, 1.5)
 
 
 def conic(constant):

@@ -38,7 +38,7 @@ def absolute(scene):
     picture = scene.target.irradiance()
     peak = float((picture / scene.target.screen.cell_sizes).max() / picture.sum())
     light = Light(picture, 0.1, 0.0, rays=1, flux=flux, on_screen=ON_TARGET, peak=peak)
-    lens = Lens(Plane(15.0), net(z=20.0), Circle(8.0), 1.5)
+    lens = Lens.between(Plane(15.0), net(z=20.0), Circle(8.0), 1.5)
     [found] = photometry(scene, SimpleNamespace(lights=(light,), lens=lens))
     return found
 

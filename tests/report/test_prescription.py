@@ -103,7 +103,7 @@ def test_a_back_that_moved_says_where_it_stands(free, tmp_path):
 
 def test_a_plane_has_no_radius_and_an_index_no_mass(small_design):
     scene, nominal = read_nominal(small_design.folder)
-    lens = type(nominal.lens)(Plane(15.0), nominal.lens.back, nominal.lens.outline, 1.7)
+    lens = nominal.lens.between(Plane(15.0), nominal.lens.back, nominal.lens.outline, 1.7)
     bare = scene.changed({"lens.front": Plane(15.0), "lens.material": None, "lens.index": 1.7})
     record = prescriptions.prescription(bare, lens, describe(lens) | {"volume": 500.0})
     assert record["front"]["radius"] is None and record["front"]["curvature"] == 0.0 and record["mass"] is None

@@ -41,7 +41,7 @@ def earlier(tmp_path):
     folder.mkdir()
     face = a_face()
     np.savez_compressed(folder / "design.npz", control_points=face.control_points(), target=np.ones((8, 8)))
-    lens = Lens(Plane(20.0), face, Rectangle(16.0, 16.0), 1.5)
+    lens = Lens.between(Plane(20.0), face, Rectangle(16.0, 16.0), 1.5)
     step_writing.write_lens(lens, folder / "lens.step", "earlier")
     return folder
 

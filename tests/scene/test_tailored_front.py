@@ -171,7 +171,7 @@ def test_both_nets_of_a_design_come_back_to_the_last_bit(disk, points, only_fron
     g = torch.Generator().manual_seed(1)
     lens = scene.flat_lens(17)
     lens = lens.with_heights(0.1 * torch.randn(net.shape, generator=g, dtype=torch.float64) for net in lens.nets)
-    lens = replace(lens, front=replace(lens.front, z=15.0 + moved))  # as it is moved clear of the back
+    lens = lens.with_front(replace(lens.front, z=15.0 + moved))  # as it is moved clear of the back
     design = folders.Made(resolved(scene, lens), lens, scene.goals)
     assert design.scene == scene and "optimise = true" in scene.toml()  # from which it is designed again
     for name, data in folders.scene_files(design.scene).items():
@@ -185,7 +185,7 @@ def test_both_nets_of_a_design_come_back_to_the_last_bit(disk, points, only_fron
     assert design.is_lens_of(read)
     heights = nominal.lens.front.heights.clone()
     heights[3, 3] += 1e-9
-    other = replace(nominal.lens, front=replace(nominal.lens.front, heights=heights))
+    other = nominal.lens.with_front(replace(nominal.lens.front, heights=heights))
     assert not replace(read, lens=other).is_lens_of(design)
     with np.load(tmp_path / "design.npz") as arrays:
         kept = dict(arrays)

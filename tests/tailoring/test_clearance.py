@@ -11,6 +11,7 @@ import torch
 
 from bstcad.analysis.shape import thickness_range
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import MIRROR
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.receivers.goal import Goal
@@ -47,7 +48,7 @@ def rough(outline=WHOLE, tailored=(0, 1)):
     """Two random nets of different sizes, 3 mm apart."""
     front = BSplineSurface(0.0, 0.7 * random((7, 12), 1), (-2.0, 2.0), (-3.0, 3.0))
     back = BSplineSurface(3.0, 0.7 * random((9, 8), 0), (-2.2, 2.1), (-3.0, 3.0))
-    return Lens(front, back, outline, 1.5, tailored=tailored)
+    return Lens.between(front, back, outline, 1.5, tailored=tailored)
 
 
 def thickness(lens, x, y):
@@ -107,7 +108,10 @@ def test_a_tool_sees_the_valleys_of_a_sphere_from_its_own_side(curvature):
     """z = κ r² / 2 + …, κ = ±1 / 25 mm: on the back a valley if κ > 0, on the front, which bulges out then, a ridge."""
     ball = BSplineSurface.fitted(Sphere(0.0, curvature), (-8.0, 8.0), (-8.0, 8.0), 65)  # the fit waves at its ends
     flat = replace(ball, heights=torch.zeros_like(ball.heights))
-    front, back = Lens(ball, flat.moved(9.0), WHOLE, 1.5, tailored=(0, 1)), Lens(flat, ball.moved(9.0), WHOLE, 1.5)
+    front, back = (
+        Lens.between(ball, flat.moved(9.0), WHOLE, 1.5, tailored=(0, 1)),
+        Lens.between(flat, ball.moved(9.0), WHOLE, 1.5),
+    )
     for lens, valley in ((front, curvature < 0), (replace(back, tailored=(0, 1)), curvature > 0)):
         for bounds, met in ((Bounds(concave=0.039), not valley), (Bounds(convex=0.039), valley)):
             worst = excess(lens, bounds).worst
@@ -123,7 +127,7 @@ def test_only_a_tailored_front_needs_a_bound_where_none_is_asked():
     assert active_bounds(both, None, 0.5) == active_bounds(front, None, 0.5) == Bounds(thinnest=0.5)
     assert active_bounds(back, None, 0.5) is None
     assert active_bounds(back, asked, 0.5) == active_bounds(both, asked, 0.5) == asked
-    assert not replace(both, reflects=True, tailored=None).is_tailored("front")
+    assert not replace(both, passes=MIRROR, tailored=None).is_tailored("front")
 
 
 def crossing(outline, z=3.0, sides=(33, 21), tailored=(0, 1)):
@@ -132,7 +136,7 @@ def crossing(outline, z=3.0, sides=(33, 21), tailored=(0, 1)):
         net(lambda x, y, sag=sag: sag * torch.exp(-(x**2) - y**2), plane, m, half_over(outline, m))
         for m, plane, sag in ((sides[0], 0.0, 1.8), (sides[1], z, -1.8))
     ]
-    return Lens(*nets, outline, 1.5, tailored=tailored)
+    return Lens.between(*nets, outline, 1.5, tailored=tailored)
 
 
 @pytest.mark.parametrize("outline", [Rectangle(8.0, 8.0), Circle(4.0)], ids=("square", "round"))

@@ -93,7 +93,7 @@ def light(profile):
 def lens_of(dome):
     """Return the lens of an inner sphere and a dome, both about the lamp."""
     clear = Circle(INNER * math.sin(CONE) * (1 + 1e-9)), Circle(RIM)
-    return Lens(Sphere(INNER, -1 / INNER), dome, Circle(RIM), N, clear=clear)
+    return Lens.between(Sphere(INNER, -1 / INNER), dome, Circle(RIM), N, clear=clear)
 
 
 def disc(pixels, parts=16):

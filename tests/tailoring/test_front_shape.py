@@ -18,7 +18,7 @@ RIM = math.hypot(10.0, 10.0)
 
 
 def lens_with(front):
-    return Lens(front, net(z=25.0, m=5), SQUARE, 1.5)
+    return Lens.between(front, net(z=25.0, m=5), SQUARE, 1.5)
 
 
 def searched(front, free, merit, rim_sags=(-math.inf, math.inf)):

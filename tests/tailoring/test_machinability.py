@@ -65,7 +65,7 @@ def steepest(lens):
 
 
 def rough(outline=WHOLE):
-    return Lens(Plane(0.0), lenses.rough(1.0, z=3.0, m=9, half=(2.0, 3.0)), outline, 1.5)
+    return Lens.between(Plane(0.0), lenses.rough(1.0, z=3.0, m=9, half=(2.0, 3.0)), outline, 1.5)
 
 
 def test_the_gradient_for_a_back_alone_is_that_of_finite_differences():
@@ -74,7 +74,7 @@ def test_the_gradient_for_a_back_alone_is_that_of_finite_differences():
     found = excess(lens, bounds)
     way = torch.randn(9, 9, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     up, down = (
-        excess(replace(lens, back=replace(lens.back, heights=lens.back.heights + d * way)), bounds).mean_square
+        excess(lens.with_back(replace(lens.back, heights=lens.back.heights + d * way)), bounds).mean_square
         for d in (step, -step)
     )
     along = float((found.gradients[0] * way).sum())
@@ -145,13 +145,13 @@ def test_where_bending_does_not_help_the_back_gets_flatter():
 
 @suite.in_turn(1, 2)
 def test_a_front_that_no_flat_back_clears_is_refused():
-    lens = replace(rough(), front=Sphere(0.0, 0.2))
+    lens = rough().with_front(Sphere(0.0, 0.2))
     with pytest.raises(SceneError, match=r"^lens\.max_thickness: "):
         enforce_bounds(lens, Bounds(thinnest=1.0, thickest=1.5))
 
 
 def lens(front, outline=lenses.SQUARE, slope=0.3):
-    return Lens(front, lenses.tilted(slope, half=10.0), outline, 1.5)
+    return Lens.between(front, lenses.tilted(slope, half=10.0), outline, 1.5)
 
 
 @pytest.mark.parametrize(
@@ -172,5 +172,5 @@ def test_a_lens_with_room_stays_where_it_was():
 
 def test_it_comes_back_when_it_needs_less():
     flat = lens(Plane(18.0), slope=0.0)
-    far = replace(flat, back=replace(flat.back, z=30.0))
+    far = flat.with_back(replace(flat.back, z=30.0))
     assert place_back(far, 20.0, 0.5).back.z == 20.0

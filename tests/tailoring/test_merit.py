@@ -135,7 +135,7 @@ def test_waves_of_four_control_points_and_shorter_have_nearly_one_scale():
 def test_steps_are_longer_where_the_picture_is_dark():
     """A flat lens and a beam on axis: control points lie over their own part of the picture; the ninth part of the
     irradiance makes steps three times as long."""
-    lens = Lens(Plane(10.0), FLAT, Rectangle(16.0, 16.0), 1.5)
+    lens = Lens.between(Plane(10.0), FLAT, Rectangle(16.0, 16.0), 1.5)
     picture = np.where(np.arange(64) < 32, 0.2, 1.8) * np.ones((48, 1))
     screen = Screen(100.0, (-8.0, 8.0), (-8.0, 8.0), (64, 48))
     weight = local_weight(CollimatedSource(Rectangle(16.0, 16.0)), lens, [Goal("target", screen, picture)])
@@ -145,7 +145,7 @@ def test_steps_are_longer_where_the_picture_is_dark():
 
 
 def test_black_and_unlit_parts_have_a_bounded_weight():
-    lens = Lens(Plane(10.0), FLAT, Rectangle(16.0, 16.0), 1.5)
+    lens = Lens.between(Plane(10.0), FLAT, Rectangle(16.0, 16.0), 1.5)
     picture = np.zeros((64, 64))
     picture[10, 10] = 1.0
     goal = Goal("target", Screen(100.0, (-8.0, 0.0), (-8.0, 8.0), 64), picture)

@@ -30,7 +30,7 @@ def surface(z, sag, m):
 def lens_of(m=97, back=65):
     front = surface(0.0, lambda x, y: 0.004 * (x * x + y * y) + 0.05 * torch.cos(x / 4) * torch.cos(y / 3), m)
     last = surface(12.0, lambda x, y: -0.006 * (x * x + 2 * y * y) + 0.06 * torch.sin(x / 3) * torch.cos(y / 4), back)
-    return Lens(front, last, Rectangle(22.0, 22.0), 1.5, tailored=(0, 1))
+    return Lens.between(front, last, Rectangle(22.0, 22.0), 1.5, tailored=(0, 1))
 
 
 def traced(source, lens, q):
@@ -83,7 +83,7 @@ def test_where_rays_cross_in_the_glass_the_back_gets_no_ripple():
     """There q(b) is many-valued; the carried change is smooth all the same: it falls off towards the highest octave."""
     m = 97
     front = surface(0.0, lambda x, y: 0.004 * (x * x + y * y) + 0.25 * torch.cos(x / 0.8) * torch.cos(y / 0.8), m)
-    lens = Lens(front, lens_of().back, Rectangle(22.0, 22.0), 1.5, tailored=(0, 1))
+    lens = Lens.between(front, lens_of().back, Rectangle(22.0, 22.0), 1.5, tailored=(0, 1))
     places = torch.meshgrid(*[torch.linspace(-6, 6, 97).double()] * 2, indexing="ij")
     within = behind(BEAM.rays_through(*places, 0.0, 1.0), lens.unbounded().interfaces[0])
     there = within.position[:2] + (12.0 - within.above(0.0)) * within.direction[:2] / within.direction[2]

@@ -150,7 +150,7 @@ def test_the_pull_is_zero_up_to_its_angle_and_falls_with_its_gradient():
         u = (math.sin(math.radians(leaving)) ** 2 - math.sin(most) ** 2) / math.cos(most) ** 2
         slope = math.tan(math.asin(math.sin(math.radians(leaving)) / index))
         heights = (slope * x)[:, None].expand(9, 9).contiguous()
-        lens = Lens(Plane(0.0), BSplineSurface(9.0, heights, (-2.0, 2.0), (-2.0, 2.0)), square, index)
+        lens = Lens.between(Plane(0.0), BSplineSurface(9.0, heights, (-2.0, 2.0), (-2.0, 2.0)), square, index)
         pull = Grazing.of(Edge(Channel(CollimatedSource(square), index), most), lens)
         value, gradient, worst = pull(heights)
         if u < 0:

@@ -10,7 +10,7 @@ import torch
 from bstcad.analysis.shape import thickness_range
 from bstcad.optics.lens.interfaces import Interface, Reflect, Refract
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.lens.passes import Pass, Passes
+from bstcad.optics.lens.passes import MIRROR, Pass, Passes
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.point import PointSource
@@ -45,25 +45,25 @@ def picture():
 
 
 FRONTS = {  # a lens, and the light that meets it
-    "front, a net behind it": (Lens(net(0.0), net(8.0, 0.05), SQUARE, N, tailored=(0,)), BEAM),
-    "both": (Lens(net(0.0), net(8.0), SQUARE, N, tailored=(0, 1)), BEAM),
+    "front, a net behind it": (Lens.between(net(0.0), net(8.0, 0.05), SQUARE, N, tailored=(0,)), BEAM),
+    "both": (Lens.between(net(0.0), net(8.0), SQUARE, N, tailored=(0, 1)), BEAM),
     "both, a point": (
-        Lens(net(0.0), net(8.0), SQUARE, N, tailored=(0, 1)), PointSource((0.5, 0.0, -600.0)),
+        Lens.between(net(0.0), net(8.0), SQUARE, N, tailored=(0, 1)), PointSource((0.5, 0.0, -600.0)),
     ),
 }  # fmt: skip
 ABOVE = CollimatedSource(Rectangle(1.9 * HALF, 1.9 * HALF), z=250.0)  # a beam that comes down
 MANGIN = Passes((Pass("front", Refract), Pass("back", Reflect), Pass("front", Refract)))
 BODIES = {  # bodies of mirrors: light comes down to the back, whose front is dark; but up to a Mangin mirror's front
     "two mirrors": (  # after the second light goes down, past the first, to z = -60
-        Lens(
-            Plane(-5.0), net(0.0), SQUARE, 1.0, reflects=True,
+        Lens.between(
+            Plane(-5.0), net(0.0), SQUARE, 1.0, passes=MIRROR,
             behind=(Interface(net(60.0), SQUARE, Reflect(), Status.VIGNETTED),), tailored=(0, 1),
         ),
         replace(SCREEN, z=-60.0),
     ),
     "a mirror behind a glass with a net": (  # which light meets once, as where it leaves the mirror at another angle
-        Lens(
-            Plane(-5.0), net(0.0), SQUARE, 1.0, reflects=True,
+        Lens.between(
+            Plane(-5.0), net(0.0), SQUARE, 1.0, passes=MIRROR,
             before=(
                 Interface(net(8.0), SQUARE, Refract(1.0, N), Status.MISSED_FRONT),
                 Interface(Plane(4.0), EVERYWHERE, Refract(N, 1.0), Status.VIGNETTED),
@@ -73,7 +73,7 @@ BODIES = {  # bodies of mirrors: light comes down to the back, whose front is da
         SCREEN,
     ),
     "a Mangin mirror": (  # whose front light crosses twice
-        Lens(net(0.0), net(8.0), SQUARE, N, own_passes=MANGIN, tailored=(0, 1)), replace(SCREEN, z=-120.0),
+        Lens.between(net(0.0), net(8.0), SQUARE, N, passes=MANGIN, tailored=(0, 1)), replace(SCREEN, z=-120.0),
     ),
 }  # fmt: skip
 MOVED = {
@@ -94,7 +94,7 @@ def problem_of(name):
 def test_what_is_searched_changes_no_image_of_a_source(name):
     """Seen through places of the back, whichever nets are free."""
     lens, source = FRONTS[name]
-    lens = replace(lens, front=net(0.0, 0.1))
+    lens = lens.with_front(net(0.0, 0.1))
     free, back = (
         images((Channel(source, N, 0.5), Channel(replace(source, **MOVED[type(source)]), N, 0.5)), each, SCREEN, 9)
         for each in (lens, replace(lens, tailored=(1,)))
@@ -141,7 +141,7 @@ def test_stage_2_keeps_the_least_thickness_and_finds_the_picture():
     """The faces come within 0.542 mm of each other if they may."""
     task, lens, _ = problem_of("both")
     task = replace(task, settings=replace(task.settings, stage2_iterations=80))
-    near = replace(lens, back=lens.back.moved(0.6))
+    near = lens.with_back(lens.back.moved(0.6))
     (*_, free), (*_, bound) = (steps(replace(task, min_thickness=least), near) for least in (0.01, 0.55))
     assert thickness_range(free.lens)[0] < 0.545 and task.rrmsd(free.lens) < 0.05
     found = enforce_bounds(bound.lens, active_bounds(bound.lens, None, 0.55))
@@ -150,7 +150,7 @@ def test_stage_2_keeps_the_least_thickness_and_finds_the_picture():
 
 
 def test_every_free_net_has_its_entry():
-    lens = Lens(lenses.net(z=15.0, m=9), lenses.net(m=9), SQUARE, N, tailored=(0, 1))
+    lens = Lens.between(lenses.net(z=15.0, m=9), lenses.net(m=9), SQUARE, N, tailored=(0, 1))
     shaped = lens.with_heights((torch.rand((9, 9), dtype=torch.float64), torch.rand((17, 17), dtype=torch.float64)))
     parameters = Parameters.of(shaped)
     assert [entry.z for entry in parameters.nets] == [15.0, 20.0] and parameters.front == {}

@@ -41,7 +41,7 @@ def surface(m, phase, size=0.05):
 )
 def test_wanted_slopes_are_snells_law_inverted(source, front, plane):
     """Slopes measured on a traced lens are the ones wanted for where its rays land."""
-    lens = Lens(front, surface(17, 1.0, 0.4), SQUARE, 1.488)
+    lens = Lens.between(front, surface(17, 1.0, 0.4), SQUARE, 1.488)
     x, y = sampling.grid(Rectangle(11.0, 11.0), 15)
     rays = source.rays_through(x, y, front.z, 1.0)
     landed = trace(rays, lens, plane)
@@ -57,7 +57,7 @@ def test_wanted_slopes_are_snells_law_inverted(source, front, plane):
 def test_an_aim_that_no_face_can_reach_turns_the_ray_as_far_as_one_can(index, reach):
     """Never reflected, never steeper than it may be, towards the aim, and as far as it goes where that is the limit."""
     x, y = torch.meshgrid(*[torch.linspace(-3.0, 3.0, 7, dtype=torch.float64)] * 2, indexing="ij")
-    lens = Lens(Plane(8.0), net(m=5), SQUARE, index)
+    lens = Lens.between(Plane(8.0), net(m=5), SQUARE, index)
     in_glass = to_first_net(CollimatedSource(Circle(8.0)).rays_through(x, y, 8.0, 1.0), lens)
     at_face, _, _ = intersect(lens.back, in_glass, SQUARE, Status.VIGNETTED)
     aim = torch.stack([torch.full_like(x, reach), torch.full_like(x, -0.2 * reach)])
@@ -94,7 +94,7 @@ def test_a_polynomial_goes_on_where_no_ray_falls():
 
 def test_tailor_to_aim_lands_where_a_surface_can():
     """A stretched grid, near the axis: the map is a gradient but for the finite throw, so a surface follows it."""
-    source, lens = CollimatedSource(Circle(8.0)), Lens(Plane(8.0), net(m=33), SQUARE, 1.488)
+    source, lens = CollimatedSource(Circle(8.0)), Lens.between(Plane(8.0), net(m=33), SQUARE, 1.488)
     x, y = sampling.grid(Rectangle(16.0, 16.0), 66)
     rays, screen = source.rays_through(x, y, 8.0, 1.0), LevelPlane(1000.0)
     aim = torch.stack([4 * x, 3 * y])

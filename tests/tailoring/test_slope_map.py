@@ -37,7 +37,7 @@ def known_lens(name):
         ),
         "point and sphere": lambda x, y: 0.05 * torch.sin(0.4 * x) * torch.cos(0.3 * y),
     }
-    return Lens(CASES[name][1], net(sags[name], m=33).from_vertex().moved(20.0), SQUARE, N)
+    return Lens.between(CASES[name][1], net(sags[name], m=33).from_vertex().moved(20.0), SQUARE, N)
 
 
 def slope_error(name, cells):
@@ -49,7 +49,7 @@ def slope_error(name, cells):
     screen, true = replace(screen, pixels=(cells, 3 * cells // 4)), known_lens(name)
     made = simulated(source, true, screen, 16 * cells, 0)
     assert efficiency(made.flux) > 0.999
-    lens = replace(true, back=replace(true.back, heights=torch.zeros_like(true.back.heights)))
+    lens = true.with_back(replace(true.back, heights=torch.zeros_like(true.back.heights)))
     slopes, goal = None, Goal("target", screen, made.box.numpy())
     for _ in range(6):
         window = lit_window(source, lens)
@@ -90,7 +90,7 @@ def test_the_grid_is_met_and_carries_the_flux(name):
 
 def test_a_back_that_no_ray_is_found_to_is_one_sentence():
     """A point 0.05 mm from the front and far beside it: in 20 mm of glass its light gets no further than 18 mm."""
-    lens = Lens(Plane(0.05), net(m=33, half=8.0), Rectangle(16.0, 16.0), 1.49)
+    lens = Lens.between(Plane(0.05), net(m=33, half=8.0), Rectangle(16.0, 16.0), 1.49)
     with pytest.raises(SceneError, match="^source: "):
         lit_window(PointSource(position=(100.0, 0.0, 0.0)), lens)
 

@@ -41,7 +41,7 @@ SOURCES = {
 
 def lens():
     back = net(lambda x, y: -0.003 * (x**2 + y**2) + 0.02 * torch.cos(0.4 * x) * torch.sin(0.3 * y), 6.0, 25)
-    return Lens(Sphere(1.0, 0.005), back, Circle(9.0), INDEX)
+    return Lens.between(Sphere(1.0, 0.005), back, Circle(9.0), INDEX)
 
 
 def extended(source):

@@ -182,7 +182,7 @@ def test_stage_1_finds_the_front_curvature_and_the_back_together():
     assert mapping.transport.mass_error[-1] < 0.02
     found = simulated(task.heaviest.source, tailored, task.goals[0].screen, 300, 0)
     assert efficiency(found.flux) > 0.98
-    assert task.rrmsd(tailored) < 0.6 * task.rrmsd(replace(lens, back=lens.back.refined(17)))
+    assert task.rrmsd(tailored) < 0.6 * task.rrmsd(lens.with_back(lens.back.refined(17)))
 
 
 @suite.in_turn(0, 2)

@@ -37,7 +37,7 @@ WAVES = {
 
 
 def bumpy(m=17):
-    return Lens(rough(0.02, 1, 0.0, m, 14.0), rough(0.02, 2, 8.0, half=14.0), SQUARE, N, tailored=(0, 1))
+    return Lens.between(rough(0.02, 1, 0.0, m, 14.0), rough(0.02, 2, 8.0, half=14.0), SQUARE, N, tailored=(0, 1))
 
 
 def picture(seed):

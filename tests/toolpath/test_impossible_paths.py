@@ -63,7 +63,7 @@ def test_a_face_that_stays_steep_is_refused_before_the_design():
 def test_a_kind_that_fails_leaves_no_file_and_the_other_kinds_are_written(tmp_path):
     """The spiral over the back is written before that over the front fails."""
     folder, gentle = tmp_path / "kept", lens_of(waves, PLATE)
-    both = replace(gentle, front=replace(lens_of(steep, PLATE).back, z=-60.0))
+    both = gentle.with_front(replace(lens_of(steep, PLATE).back, z=-60.0))
     folder.mkdir()
     with pytest.raises(ValueError, match="degrees steep"):
         export(both, ["spiral"], tmp_path, cutting=COARSE)

@@ -2,7 +2,6 @@
 
 import io
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -47,7 +46,7 @@ def test_a_comment_has_no_sign_that_acts_on_a_controller(lens):
 
 @pytest.mark.parametrize("front", [None, Sphere(0.5, -0.01)], ids=["plane", "sphere"])
 def test_zero_is_on_the_top_or_on_the_bottom_of_the_blank(lens, front):
-    lens = lens if front is None else replace(lens, front=front)
+    lens = lens if front is None else lens.with_front(front)
     top, bottom = (files_of(lens, zero=side, stock=0.3) for side in ("top", "bottom"))
     lowest = (
         0.0 if front is None else 0.5 - 0.01 * 25 / 2

@@ -36,7 +36,7 @@ def lens_of(relief, outline, m=65, wide=1.1):
     half = max(outline.half_extent) * wide
     x, y = np.meshgrid(np.linspace(-half, half, m), np.linspace(-half, half, m), indexing="ij")
     back = BSplineSurface(6.0, torch.from_numpy(interpolating_net(relief(x, y))), (-half, half), (-half, half))
-    return Lens(Plane(0.0), back, outline, 1.49)
+    return Lens.between(Plane(0.0), back, outline, 1.49)
 
 
 def written(kind, lens, **settings):

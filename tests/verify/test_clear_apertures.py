@@ -56,8 +56,8 @@ def design(small_design):
 def held(design, mount, curvature=None):
     """The lens of the design in a mount, and that mount."""
     mount, lens = Mount.model_validate(mount), design.lens
-    lens = lens if curvature is None else replace(lens, front=Sphere(lens.front.z, curvature))
-    return replace(lens, clear=mount.clear(lens)), mount
+    lens = lens if curvature is None else lens.with_front(Sphere(lens.front.z, curvature))
+    return lens.with_clear(mount.clear(lens)), mount
 
 
 @pytest.mark.parametrize("name", suite.in_turns(MOUNTS, 2))
@@ -130,7 +130,7 @@ def independent(source, lens, around, screen, count=1 << 17):
 
 def test_walls_that_lean_leave_the_front_what_their_height_makes_of_it():
     """d = tan(draft) (h - bevel) + bevel below a plane front; of a curved one the highest wall counts."""
-    lens = Lens(Plane(15.0), net(m=9, half=9.0), Rectangle(16.0, 16.0), 1.5)
+    lens = Lens.between(Plane(15.0), net(m=9, half=9.0), Rectangle(16.0, 16.0), 1.5)
     lean = {"draft": 4.0, "bevel": 0.3}
     tangent = math.tan(math.radians(4.0))
     box = {"shape": "rectangle", "width": 12.0, "height": 10.0, "corner_radius": 2.0}
@@ -141,7 +141,7 @@ def test_walls_that_lean_leave_the_front_what_their_height_makes_of_it():
             (12 - 2 * taken, 10 - 2 * taken, 2 - taken)
         )
         assert (back.width, back.height, back.corner_radius) == (12.0, 10.0, 2.0)
-    bowl = replace(lens, front=Sphere(15.0, 0.05))
+    bowl = lens.with_front(Sphere(15.0, 0.05))
     front, _ = Mount.model_validate({"rim": box, "draft": 4.0}).clear(bowl)
     by = (12.0 - front.width) / 2  # nearest to the axis is the middle of the long side, where the front is lowest
     height = 19.9 - (20 + 15.0 - math.sqrt(400 - (5.0 - by) ** 2))
@@ -152,7 +152,7 @@ def test_walls_that_lean_leave_the_front_what_their_height_makes_of_it():
 def test_what_a_flange_stands_in_the_way_of():
     """Parallel light at 20 degrees through a plate: its beam is what three circles, each shifted on, have in common."""
     clear = Circle(5.0), Circle(5.0)
-    lens = Lens(Plane(15.0), net(m=9, half=9.0), Rectangle(16.0, 16.0), 1.5, clear=clear)
+    lens = Lens.between(Plane(15.0), net(m=9, half=9.0), Rectangle(16.0, 16.0), 1.5, clear=clear)
     light = [Channel(CollimatedSource(Rectangle(30.0, 30.0), tilt=(0.0, 20.0)), 1.5)]
     outside, glass = math.tan(math.radians(20)), math.tan(math.asin(math.sin(math.radians(20)) / 1.5))
 

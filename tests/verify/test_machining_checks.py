@@ -21,7 +21,7 @@ NONE = dict.fromkeys(KEYS) | {"mould": False}
 
 def saddle(outline):
     lower = (A + B) * (8.0 / (M - 1)) ** 2 / 8  # mm: control points of a quadratic lie below it
-    return Lens(Plane(0.0), net(lambda x, y: (A * x**2 + B * y**2) / 2 - lower, 3.0, M, 4.0), outline, 1.5)
+    return Lens.between(Plane(0.0), net(lambda x, y: (A * x**2 + B * y**2) / 2 - lower, 3.0, M, 4.0), outline, 1.5)
 
 
 def judged(**asked):

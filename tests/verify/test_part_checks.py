@@ -89,7 +89,7 @@ def test_a_part_that_is_not_the_design_s_fails_by_name(written, design, tmp_path
     if harm == "bent":
         bent = design.lens.back.control_points()
         bent[5, 7, 2] += 1e-9
-        lens = replace(design.lens, back=bstcad.BSplineSurface.from_control_points(bent, design.lens.back.z))
+        lens = design.lens.with_back(bstcad.BSplineSurface.from_control_points(bent, design.lens.back.z))
         mounting.write_if_it_fits(lens, scene.mount, tmp_path / "part.step", "bent", scene.part)
     elif harm == "lighter":
         (tmp_path / "part.step").write_text(re.sub(r"(?<=VOLUME_MEASURE\()\s*[-+.E\d]+", "900.0", text))
@@ -149,7 +149,7 @@ ROUNDED = {"shape": "rectangle", "width": 7.0, "height": 5.0, "corner_radius": 1
 ], 3))  # fmt: skip
 def test_a_part_passes_by_itself(design, tmp_path, mount, outline, plane):
     """The outline is that of the back, whatever walls are around it; the walls of a bare lens are checked, too."""
-    lens = replace(design.lens, front=Plane(design.lens.front.z)) if plane else design.lens
+    lens = design.lens.with_front(Plane(design.lens.front.z)) if plane else design.lens
     scene = design.scene.changed({"mount": mount})
     said = scene.part.of(scene.lens)
     mounting.write_if_it_fits(lens, scene.mount, tmp_path / "part.step", "part", said)

@@ -11,7 +11,7 @@ import pytest
 
 import bstcad
 from bstcad import commands
-from bstcad.analysis.shape import describe, survey, survey_front
+from bstcad.analysis.shape import describe, survey
 from bstcad.commands import ProofOptions
 from bstcad.designs import folder as folders
 from bstcad.report import prescription, report
@@ -100,7 +100,7 @@ def changed(net, by=1e-6):
 def test_a_face_that_is_off_by_a_nanometre_in_one_control_point_is_found(two, face):
     """Both readers find it by the net, and OCC by the surface, too."""
     lens, path = two.made.lens, two.folder / "lens.step"
-    other = replace(lens, **{face: changed(getattr(lens, face))})
+    other = lens.with_surface(face, changed(getattr(lens, face)))
     [failed] = [c for c in text_checks.lens_checks(part21.read_lens(path), other) if not c.passed]
     assert failed.id == "control-points" and failed.name.endswith("of the front") == (face == "front")
     by_id = {c.id: c.name for c in step_checks.check(path, other, 1e-8, 4096) if not c.passed}
@@ -109,7 +109,7 @@ def test_a_face_that_is_off_by_a_nanometre_in_one_control_point_is_found(two, fa
 
 def test_a_file_whose_front_is_flat_is_no_lens_of_two_nets(two, tmp_path):
     """The net is missing for either reader, and the rest of the proof goes on."""
-    lens = replace(two.made.lens, front=bstcad.Plane(8.0), tailored=None)
+    lens = replace(two.made.lens, tailored=None).with_front(bstcad.Plane(8.0))
     folders.write_geometry(replace(two.made, lens=lens), tmp_path)()
     text = part21.read_lens(tmp_path / "lens.step")
     [failed] = [check for check in text_checks.lens_checks(text, two.made.lens) if not check.passed]
@@ -123,19 +123,19 @@ def test_a_file_whose_front_is_flat_is_no_lens_of_two_nets(two, tmp_path):
 def test_figures_of_the_front_are_those_of_the_same_face_as_a_back(two):
     """Turned over: a ridge towards +z is a valley for whoever cuts the front from outside."""
     lens, shape = two.made.lens, two.facts["shape"]
-    as_back = describe(replace(lens, back=lens.front, front=lens.back.moved(-30.0), tailored=None), 129)
+    as_back = describe(replace(lens, tailored=None).with_back(lens.front).with_front(lens.back.moved(-30.0)), 129)
     for key in ("sag_pv", "slope_max_deg", "departure_best_sphere", "slope_energy_top_octave"):
         assert shape[f"front_{key}"] == pytest.approx(as_back[key], rel=1e-9)
     assert shape["front_radius_min_concave"] == pytest.approx(as_back["radius_min_convex"], rel=1e-9)
     assert shape["front_radius_min_convex"] == pytest.approx(as_back["radius_min_concave"], rel=1e-9)
-    found = survey_front(lens)
-    assert found.concave.largest == survey(replace(lens, back=lens.front)).convex.largest
+    found = survey(lens, "front")
+    assert found.concave.largest == survey(lens.with_back(lens.front)).convex.largest
 
 
 def test_bounds_hold_for_both_faces(two):
     """The front has the smaller radius of valleys and the back the steeper slope, by limits between theirs."""
     lens, shape = two.made.lens, two.facts["shape"]
-    lens = replace(lens, front=bent(lens.front, 0.2), back=bent(lens.back, -0.02))
+    lens = lens.with_front(bent(lens.front, 0.2)).with_back(bent(lens.back, -0.02))
     shape = describe(lens) | {"volume": 1.0}
     radius = (shape["front_radius_min_concave"] * shape["radius_min_concave"]) ** 0.5
     slope = (shape["front_slope_max_deg"] * shape["slope_max_deg"]) ** 0.5
@@ -269,12 +269,12 @@ def test_prescription_and_data_sheet_have_both_nets(two):
 def test_with_lens_keeps_a_front_that_is_tailored(two):
     design = bstcad.Design(two.made)
     net = design.scene.flat_lens((65, 65)).front
-    other = design.with_lens(replace(two.made.lens, front=bent(net, 0.1)))
+    other = design.with_lens(two.made.lens.with_front(bent(net, 0.1)))
     assert other.scene.lens.front.is_tailored and other.lens.tailored == (0, 1)
     finer = design.scene.changed({"lens.front.control_points": 65}).flat_lens((65, 65)).front
-    again = design.with_lens(replace(two.made.lens, front=bent(finer, 0.1)))
+    again = design.with_lens(two.made.lens.with_front(bent(finer, 0.1)))
     assert again.lens.front.shape == (65, 65) and again.scene.lens.nets() == (65, 65)
     narrow = replace(two.made.lens.front, x=(-1.0, 1.0))
     with pytest.raises(bstcad.SceneError, match="extent of the front's net along x"):
-        design.with_lens(replace(two.made.lens, front=narrow))
+        design.with_lens(two.made.lens.with_front(narrow))
     assert CHANGES["lens.front"]["control_points"] == 33

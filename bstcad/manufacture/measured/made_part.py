@@ -93,7 +93,7 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     checks = (
         *of_cloud,
         *_light_checks(nominal, lights),
-        *_wavefront(replace(lens, back=form.add_to(lens.back_net)), nominal),
+        *_wavefront(lens.with_back(form.add_to(lens.back_net)), nominal),
     )
     facts = _facts(face, alignment, figures, cloud) | {
         "scale": size,
@@ -239,7 +239,7 @@ def _light(
     """
 
     def light_with(form: FormError, effort: Effort) -> Light:
-        return nominal.light(replace(lens, back=form.add_to(lens.back_net)), goal, effort)
+        return nominal.light(lens.with_back(form.add_to(lens.back_net)), goal, effort)
 
     light, quick = light_with(form, effort), replace(effort, accuracy=SAMPLE_ACCURACY * effort.accuracy)
     samples = form.posterior_samples(np.random.default_rng(nominal.scene.tailoring.seed))

@@ -20,7 +20,7 @@ from bstcad.designs.pipeline import DesignOptions, Earlier, design
 from bstcad.manufacture.measured.cloud import load as load_cloud
 from bstcad.manufacture.measured.compensation import measured_form
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.lens.passes import Face
+from bstcad.optics.lens.passes import BACK, FRONT
 from bstcad.optics.surfaces.bspline import BSplineSurface, interpolating_net, is_net
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.optics.surfaces.surfaces import Plane, sag
@@ -31,7 +31,7 @@ from bstcad.scene.scene import Scene
 from bstcad.tailoring import effort as efforts
 from bstcad.tailoring.driver import NO_HOOKS, Hooks, NetParameters, Parameters
 
-KEYS = "front", "thickness", "index"
+KEYS = FRONT, "thickness", "index"
 OPTION = "--as-built"
 RAYS = 1.6  # rays per side of the RRMSDs before, relative to those between the stages: an error of 1 to 2 %
 EXAMPLE = "front=cloud.csv,thickness=12.05,index=1.4912"
@@ -56,7 +56,7 @@ class AsBuilt:
             if key in found:
                 raise SceneError(f"{OPTION} {word}: {key} is given twice; give it once")
             number = _number(value)
-            if number is None and key != "front":
+            if number is None and key != FRONT:
                 raise SceneError(f"{OPTION} {word}: the value is not a finite number; write {EXAMPLE}")
             found[key] = Path(value) if number is None else number
         if not found:
@@ -145,7 +145,7 @@ def _measured_front(made: Made, path: Path) -> NetFront:
     outline = lens.apertures[0]
     nominal = lens.front if is_net(lens.front) else fit_net(lens.front.plain(), lens.outline)
     below = Plane(nominal.z + float(nominal.sags(outline)[0]) - (lens.back_net.vertex_z - lens.front.z))
-    face = Lens(below, nominal, outline, lens.index)  # the front in the place of a back, with which clouds are compared
+    face = Lens.between(below, nominal, outline, lens.index)  # the front as a back, with which clouds are compared
     try:
         form = measured_form(load_cloud(path, outline), face, scene.accept.decentre)
     except ValueError as error:
@@ -166,15 +166,13 @@ def _sampled(nominal: BSplineSurface, form: Any, outline: Outline, side: int) ->
 def _moved(lens: Lens, scene: Scene, shift: float) -> Parameters:
     """Return the parameters of a lens, its back moved by a shift (mm), for the blank of a scene."""
     old, flat, dome = Parameters.of(lens), scene.flat_lens(scene.lens.back.net), scene.lens.dome
-    every: tuple[Face, ...] = ("front", "back")
-    faces = [face for face in every if lens.is_tailored(face)]
+    faces = [face.name for face in lens.tailored_faces]
     nets = {face: old.nets[lens.tailored_numbers.index(lens.number_of(face))] for face in faces}
-    if "back" in nets and dome is None:
-        nets["back"] = NetParameters(nets["back"].z + shift, nets["back"].heights)
-    elif "back" in nets and dome is not None:  # the dome grows about its centre
-        nets["back"] = NetParameters(nets["back"].z, dome.radius / (dome.radius - shift) * nets["back"].heights)
-    shaped = [face for face in faces if flat.is_tailored(face)]  # a front as built is tailored no more
-    shaped.sort(key=lambda face: flat.number_of(face))
+    if BACK in nets and dome is None:
+        nets[BACK] = NetParameters(nets[BACK].z + shift, nets[BACK].heights)
+    elif BACK in nets and dome is not None:  # the dome grows about its centre
+        nets[BACK] = NetParameters(nets[BACK].z, dome.radius / (dome.radius - shift) * nets[BACK].heights)
+    shaped = sorted(filter(flat.is_tailored, faces), key=flat.number_of)  # a front as built is tailored no more
     front = {} if flat.front.is_net else flat.front.parameters()
     return Parameters(tuple(nets[face] for face in shaped), front, old.back + (shift if dome is None else 0.0))
 

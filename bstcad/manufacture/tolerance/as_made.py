@@ -21,6 +21,7 @@ from bstcad.analysis.scattering import Scatter
 from bstcad.manufacture.tolerance.grades import GRADES, base_grade, finish_of, graded_table
 from bstcad.manufacture.tolerance.perturbations import Setup, form_error
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK
 from bstcad.optics.light.channels import Channel, weighted_sum
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import rrmsd_of_pictures
@@ -194,7 +195,7 @@ class SceneLight:
 def _with_form_error(lens: Lens, light: SceneLight, table: Sequence[Tolerance]) -> Lens:
     """Return the lens with one random form error on its back, whose RMS is the limit of back.form."""
     values = settings_of(table, FORM[0])
-    if values.get("grade") == NONE or "back" not in lens.optical_faces:
+    if values.get("grade") == NONE or BACK not in lens.passes.faces:
         return lens
     grade = GRADES.get(values.get("grade", ""))
     size = values.get("limit", 0.0 if grade is None else grade.form)

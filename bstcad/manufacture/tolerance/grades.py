@@ -19,6 +19,7 @@ from typing import Final
 
 from bstcad.manufacture.tolerance.perturbations import Kind, Perturbation, Setup, form_error, kinds, ripple
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK, FRONT
 from bstcad.optics.trace.finish import Finish
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import FINISH_KEYS, FORM, NONE, RIPPLE, TWO_FACE_ERRORS, Tolerance, settings_of
@@ -162,7 +163,7 @@ def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None
     errors += _face_errors(setup.lens, table)
     for k, entry in enumerate(table[1:]):
         off = entry.name and settings_of(table, entry.name).get("grade") == NONE
-        if entry.name and not off and entry.name in TWO_FACE_ERRORS and "front" not in setup.lens.passes.faces:
+        if entry.name and not off and entry.name in TWO_FACE_ERRORS and FRONT not in setup.lens.passes.faces:
             reason = "is an error of a lens with two faces, but a mirror has one face"
             raise SceneError(f"tolerance[{k}].name: {entry.name!r} {reason}; remove that table")
         if entry.name and not off and not any(entry.covers(error.kind.name) for error in errors):
@@ -184,9 +185,9 @@ def _face_errors(lens: Lens, table: Sequence[Tolerance]) -> Iterator[Perturbatio
     for name in (*FORM, *RIPPLE):
         values, by_name = settings_of(table, name), _names_error(table, name)
         face = name.partition(".")[0]
-        if values.get("grade") == NONE or face not in lens.optical_faces or not (by_name or face == "back"):
+        if values.get("grade") == NONE or face not in lens.passes.faces or not (by_name or face == BACK):
             continue
-        if face == "front" and not lens.shares_outline:
+        if face == FRONT and not lens.shares_outline:
             continue  # the front is nearly vertical at its rim, where no net of heights has its form
         grade, cost = GRADES[values.get("grade", DEFAULT_GRADE)], values.get("cost", 1.0)
         try:

@@ -21,6 +21,7 @@ from scipy.stats import norm
 from bstcad.optics.lens.interfaces import Interface
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.media import refractive_index
+from bstcad.optics.lens.passes import BACK, FRONT
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.receivers.irradiance import Screen
@@ -56,7 +57,7 @@ class Setup:
             return self.screen.middle
         if part == "lens":
             back = self.lens.back_net.plain().vertex_z
-            return 0.0, 0.0, (self.lens.front.z + back) / 2 if "front" in self.lens.passes.faces else back
+            return 0.0, 0.0, (self.lens.front.z + back) / 2 if FRONT in self.lens.passes.faces else back
         points = [channel.source.start_point(self.lens.entrance.z) for channel in self.channels]
         mean = np.average(points, axis=0, weights=[channel.weight for channel in self.channels])
         return tuple(mean.tolist())
@@ -101,9 +102,10 @@ class Setup:
     def with_lens_scaled(self, factor: float) -> Setup:
         """Return the setup with its lens scaled by a factor about the pivot of the lens."""
         lens, (_, _, about) = self.lens, self.pivot("lens")
-        lens = lens.with_front(lens.front.scaled(factor, about)).with_back(lens.back.scaled(factor, about))
-        clear = lens.clear and (lens.clear[0].scaled(factor), lens.clear[1].scaled(factor))
-        return replace(self, lens=replace(lens, outline=lens.outline.scaled(factor), clear=clear))
+        for face in lens.faces:
+            lens = lens.with_surface(face.name, face.surface.scaled(factor, about))
+        clear = lens.clear and [aperture.scaled(factor) for aperture in lens.clear]
+        return replace(self, lens=replace(lens, outline=lens.outline.scaled(factor)).with_clear(clear))
 
 
 # --- distributions and trials -----------------------------------------------------------------------------------------
@@ -232,14 +234,14 @@ def _shapes(setup: Setup, material: str | None) -> Iterator[Kind]:
 
 def _change_thickness(setup: Setup, by: float) -> Setup:
     back = setup.lens.back
-    return replace(setup, lens=replace(setup.lens, back=back.moved(back.z + by)))
+    return replace(setup, lens=setup.lens.with_back(back.moved(back.z + by)))
 
 
 def _change_front_power(setup: Setup, by: float) -> Setup:
     """Raise the rim of the front by `by` (mm): curvature c + 2 by / R², R the largest distance from the axis."""
     front = setup.lens.front
     rim2 = sum(p * p for p in (front.outline or setup.lens.outline).farthest)
-    return replace(setup, lens=replace(setup.lens, front=front.bent(2 * by / rim2)))
+    return replace(setup, lens=setup.lens.with_front(front.bent(2 * by / rim2)))
 
 
 def _change_temperature(material: str, setup: Setup, by: float) -> Setup:
@@ -290,7 +292,7 @@ def _change_size(setup: Setup, by: float) -> Setup:
 
 def _alignments(lens: Lens) -> Iterator[Kind]:
     """Yield the wedge between two refracting faces, and the decentre of a front that is not plane."""
-    for axis, name in enumerate("xy" if "front" in lens.passes.faces else ""):
+    for axis, name in enumerate("xy" if FRONT in lens.passes.faces else ""):
         words = f"wedge of the {lens.passes.optic}: tilt of its back about {name} relative to the front"
         yield Kind(f"lens.wedge_{name}", words, "deg", partial(_tilt_back, axis))
         if not lens.front.level:
@@ -327,10 +329,10 @@ FIELD_WAVES = 512  # number of plane waves in a random field on a curved chart
 CELLS_PER_PERIOD = 4.0  # minimum number of control cells in a correlation length or a period
 
 
-def form_error(lens: Lens, correlation_length: float, seed: int, face: str = "back") -> Kind:
+def form_error(lens: Lens, correlation_length: float, seed: int, face: str = BACK) -> Kind:
     """Return a random field on the back or the front as a kind of error; amounts are the RMS of the field (mm)."""
     net, outline = _net(lens, face)
-    seed_of_face = seed + FRONT_SEED_OFFSET * (face == "front")
+    seed_of_face = seed + FRONT_SEED_OFFSET * (face == FRONT)
     field = random_field(net, correlation_length, seed_of_face, inside_outline(outline, net))
     words = f"form of the {face}, correlated over {correlation_length:.3g} mm (sample {seed})"
     return Kind(f"{face}.form_{seed}", words, "mm RMS", partial(_add_form, face, field))
@@ -348,7 +350,7 @@ def ripple(lens: Lens, period: float, pattern: Literal["raster", "spiral"]) -> K
     s = along_x if pattern == "raster" else from_axis
     field = _normalise(np.sin(2 * np.pi * s / period), inside_outline(lens.outline, back))
     words = f"{pattern} ripple of the back, period {period:g} mm"
-    return Kind("back.ripple", words, "mm RMS", partial(_add_form, "back", field))
+    return Kind("back.ripple", words, "mm RMS", partial(_add_form, BACK, field))
 
 
 def random_field(surface: BSplineSurface, correlation_length: float, seed: int, where: np.ndarray) -> np.ndarray:
@@ -413,14 +415,14 @@ def as_net(face: Surface, outline: Outline) -> BSplineSurface:
 def _add_form(face: str, field: np.ndarray, setup: Setup, by: float) -> Setup:
     net, _ = _net(setup.lens, face)
     changed = _add_heights(net, by * field)
-    lens = setup.lens.with_front(changed) if face == "front" else setup.lens.with_back(changed)
-    clear = setup.lens.clear if getattr(setup.lens, face).outline is None else setup.lens.apertures
-    return replace(setup, lens=replace(lens, clear=clear))
+    lens = setup.lens.with_surface(face, changed)
+    clear = setup.lens.clear if setup.lens.face(face).surface.outline is None else setup.lens.apertures
+    return replace(setup, lens=lens.with_clear(clear))
 
 
 def _net(lens: Lens, face: str) -> tuple[BSplineSurface, Outline]:
     """Return the optical part of a face as a net, and the outline of this part."""
-    surface = getattr(lens, face)
+    surface = lens.face(face).surface
     outline = surface.outline or lens.outline
     return as_net(surface.optical, outline), outline
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from bstcad.optics.lens.interfaces import Interface
-from bstcad.optics.lens.passes import LENS, MIRROR, Face, Passes
+from bstcad.optics.lens.passes import BACK, FRONT, LENS, Face, Passes
 from bstcad.optics.surfaces.bspline import BSplineSurface, is_net, require_net
 from bstcad.optics.surfaces.outlines import EVERYWHERE, Outline
 from bstcad.optics.surfaces.rays import Status
@@ -37,23 +37,45 @@ class Lens:
     Rays are traced through `interfaces`; the surfaces that tailoring shapes are those of `tailored_numbers`.
     """
 
-    front: Surface  # lower surface, at smaller z
-    back: Surface  # upper surface, at larger z
-    outline: Outline  # outline of front and back
+    faces: tuple[Face, ...]  # faces of the solid; the lowest, at smallest z, first
+    outline: Outline  # outline of the faces
     index: float  # refractive index at the design wavelength; unused for a first-surface mirror
-    reflects: bool = False  # True if a face reflects; without `own_passes` it selects MIRROR (True) or LENS (False)
+    passes: Passes = LENS  # passes of the light through the solid: its faces, in the order in which they act on it
     losses: LensLosses | None = None  # losses at its faces and in its glass; None: no losses
-    clear: tuple[Outline, Outline] | None = None  # clear apertures (front, back); None: see `apertures`
     before: tuple[Interface, ...] = ()  # interfaces before the solid, such as a window
     behind: tuple[Interface, ...] = ()  # interfaces behind the solid, such as a fold mirror
     tailored: tuple[int, ...] | None = None  # numbers of the interfaces that tailoring shapes; None: the back alone
-    own_passes: Passes | None = None  # passes of the light through the solid; None: determined by `reflects`
 
-    def __post_init__(self) -> None:
-        if self.own_passes is not None:
-            object.__setattr__(self, "reflects", self.own_passes.reflects)
-            if self.own_passes in (LENS, MIRROR):  # stated by `reflects` alone, so that equal lenses compare equal
-                object.__setattr__(self, "own_passes", None)
+    @classmethod
+    def between(
+        cls, front: Surface, back: Surface, outline: Outline, index: float, *,
+        clear: Sequence[Outline] | None = None, **others: Any,
+    ) -> Lens:  # fmt: skip
+        """Return the lens between two surfaces; clear: clear apertures of front and back.  others: see `Lens`."""
+        return cls((Face(FRONT, front), Face(BACK, back)), outline, index, **others).with_clear(clear)
+
+    @property
+    def front(self) -> Surface:
+        """Lowest surface, at smaller z."""
+        return self.faces[0].surface
+
+    @property
+    def back(self) -> Surface:
+        """Highest surface, at larger z."""
+        return self.faces[-1].surface
+
+    def face(self, name: str) -> Face:
+        """Return the face of a name; KeyError if there is none."""
+        return {face.name: face for face in self.faces}[name]
+
+    def name_of(self, surface: Surface) -> str:
+        """Return the name of the face whose surface this is (not an equal one); StopIteration if there is none."""
+        return next(face.name for face in self.faces if face.surface is surface)
+
+    @property
+    def reflects(self) -> bool:
+        """True if a face reflects the light."""
+        return self.passes.reflects
 
     @cached_property
     def interfaces(self) -> tuple[Interface, ...]:
@@ -62,18 +84,12 @@ class Lens:
         return (*self.before, *(own if self.losses is None else self.losses.on(own)), *self.behind)
 
     @property
-    def passes(self) -> Passes:
-        """Passes of the light through the solid: the faces, in the order in which they act on it."""
-        return self.own_passes or (MIRROR if self.reflects else LENS)
-
-    @property
     def _lossless(self) -> tuple[Interface, ...]:
         """Interfaces of the solid without losses, one for each step of `passes`."""
-        surfaces = {"front": self.front.optical, "back": self.back}
-        apertures = dict(zip(("front", "back"), self.apertures, strict=True))
+        apertures = dict(zip((face.name for face in self.faces), self.apertures, strict=True))
         lost = (Status.MISSED_FRONT, *(Status.VIGNETTED for _ in self.passes.steps[1:]))
         return tuple(
-            Interface(surfaces[step.face], apertures[step.face], law, missed)
+            Interface(self.face(step.face).surface.optical, apertures[step.face], law, missed)
             for step, law, missed in zip(self.passes.steps, self.passes.laws(self.index), lost, strict=True)
         )
 
@@ -88,16 +104,16 @@ class Lens:
         return require_net(self.back)
 
     @property
-    def optical_faces(self) -> dict[str, Surface]:
-        """Faces that light meets, by name, in the order of the light; the back alone for a first-surface mirror."""
-        return {face: self.front if face == "front" else self.back for face in self.passes.faces}
+    def optical_faces(self) -> tuple[Face, ...]:
+        """Faces that light meets, in the order of the light; the back alone for a first-surface mirror."""
+        return tuple(map(self.face, self.passes.faces))
 
     @property
     def deflection(self) -> float:
         """Largest ratio of the deflection of a ray at a face to the slope angle of the face, for small angles."""
         return max(self.passes.deflection(face, self.index) for face in self.passes.faces)
 
-    def number_of(self, face: Face) -> int:
+    def number_of(self, face: str) -> int:
         """Return the number of the first interface of a face of the solid; ValueError if no light meets the face."""
         return len(self.before) + [step.face for step in self.passes.steps].index(face)
 
@@ -109,19 +125,29 @@ class Lens:
     @property
     def tailored_numbers(self) -> tuple[int, ...]:
         """Numbers of the interfaces whose nets tailoring shapes, in the order of the light."""
-        return (self.number_of("back"),) if self.tailored is None else self.tailored
+        return (self.number_of(BACK),) if self.tailored is None else self.tailored
 
-    def is_tailored(self, face: Face) -> bool:
+    def is_tailored(self, face: str) -> bool:
         """Return True if tailoring shapes this face of the solid."""
         first = len(self.before)
         return any(first + k in self.tailored_numbers for k in self.passes.numbers_of(face))
 
     @property
-    def has_two_tailored_faces(self) -> bool:
-        """True if tailoring shapes front and back of a lens, which light crosses one after the other."""
-        return self.is_tailored("front") and self.is_tailored("back") and not self.passes.reflects
+    def tailored_faces(self) -> tuple[Face, ...]:
+        """Faces of the solid that tailoring shapes, the highest first: the back, then the front."""
+        return tuple(face for face in reversed(self.faces) if self.is_tailored(face.name))
 
-    def with_tailored(self, *faces: Face) -> Lens:
+    @property
+    def described_faces(self) -> tuple[Face, ...]:
+        """Faces that reports describe: the highest, and each other that tailoring shapes; the highest first."""
+        return tuple(face for face in reversed(self.faces) if face is self.faces[-1] or self.is_tailored(face.name))
+
+    @property
+    def has_two_tailored_faces(self) -> bool:
+        """True if tailoring shapes two faces of a lens, which light crosses one after the other."""
+        return len(self.tailored_faces) > 1 and not self.reflects
+
+    def with_tailored(self, *faces: str) -> Lens:
         """Return the lens in which tailoring shapes these faces of the solid, given in the order of the light."""
         return replace(self, tailored=tuple(self.number_of(face) for face in faces))
 
@@ -133,20 +159,24 @@ class Lens:
     @property
     def front_vertex(self) -> float:
         """z (mm) where the front crosses the axis; a tailored net has another reference plane for its heights."""
-        return float(sag(self.front, 0.0, 0.0)) if self.is_tailored("front") else float(self.front.z)
+        return float(sag(self.front, 0.0, 0.0)) if self.is_tailored(FRONT) else float(self.front.z)
 
     @property
     def last_tailored(self) -> Interface:
         """Last freeform interface, which realises the transport map in stage 1."""
         return self.interfaces[self.tailored_numbers[-1]]
 
+    def with_surface(self, name: str, surface: Surface) -> Lens:
+        """Return the lens with another surface of a face; its clear aperture stays."""
+        return replace(self, faces=tuple(replace(f, surface=surface) if f.name == name else f for f in self.faces))
+
     def with_front(self, front: Surface) -> Lens:
         """Return the lens with another front."""
-        return replace(self, front=front)
+        return self.with_surface(self.faces[0].name, front)
 
     def with_back(self, back: Surface) -> Lens:
         """Return the lens with another back."""
-        return replace(self, back=back)
+        return self.with_surface(self.faces[-1].name, back)
 
     def with_last_net(self, net: BSplineSurface) -> Lens:
         """Return the lens with another surface in place of the last of `nets`."""
@@ -170,7 +200,7 @@ class Lens:
     def _with_surface(self, k: int, surface: Surface) -> Lens:
         solid, steps = self.solid, self.passes.steps
         if solid.start <= k < solid.stop:
-            return self.with_back(surface) if steps[k - solid.start].face == "back" else self.with_front(surface)
+            return self.with_surface(steps[k - solid.start].face, surface)
         around = list(self.interfaces)
         around[k] = replace(around[k], surface=surface)
         return replace(self, before=tuple(around[: solid.start]), behind=tuple(around[solid.stop :]))
@@ -192,9 +222,20 @@ class Lens:
         return last.heights if is_net(last) else torch.zeros(0, dtype=torch.float64)
 
     @property
-    def apertures(self) -> tuple[Outline, Outline]:
-        """Clear apertures of front and back; light that meets a face outside its clear aperture is lost."""
-        return self.clear or (self.front.outline or self.outline, self.outline)
+    def apertures(self) -> tuple[Outline, ...]:
+        """Clear apertures of the faces; light that meets a face outside its clear aperture is lost."""
+        return tuple(face.clear or face.surface.outline or self.outline for face in self.faces)
+
+    @property
+    def clear(self) -> tuple[Outline, ...] | None:
+        """Stated clear apertures of the faces; None: there are none, and `apertures` follows from the outlines."""
+        found = tuple(face.clear for face in self.faces if face.clear is not None)
+        return found or None
+
+    def with_clear(self, clear: Sequence[Outline] | None) -> Lens:
+        """Return the lens with other clear apertures, one for each face; None: none is stated."""
+        each = zip(self.faces, clear or (None,) * len(self.faces), strict=True)
+        return replace(self, faces=tuple(replace(face, clear=aperture) for face, aperture in each))
 
     @property
     def entrance(self) -> Surface:
@@ -203,12 +244,11 @@ class Lens:
 
     def unbounded(self) -> Lens:
         """Return the lens with unlimited apertures of the solid: they stop no ray."""
-        return replace(self, outline=EVERYWHERE, clear=(EVERYWHERE, EVERYWHERE))
+        return replace(self, outline=EVERYWHERE).with_clear([EVERYWHERE] * len(self.faces))
 
     def with_apertures_scaled(self, by: float) -> Lens:
         """Return the lens with the clear apertures of the solid scaled by a factor."""
-        front, back = self.apertures
-        return replace(self, clear=(front.scaled(by), back.scaled(by)))
+        return self.with_clear([aperture.scaled(by) for aperture in self.apertures])
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Lens:
         """Return the lens with its tensors in another precision or on another device."""
@@ -222,4 +262,5 @@ class Lens:
         before, behind = (
             tuple(replace(i, surface=change(i.surface)) for i in around) for around in (self.before, self.behind)
         )
-        return replace(self, front=change(self.front), back=change(self.back), before=before, behind=behind)
+        faces = tuple(replace(face, surface=change(face.surface)) for face in self.faces)
+        return replace(self, faces=faces, before=before, behind=behind)

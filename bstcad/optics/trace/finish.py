@@ -98,10 +98,9 @@ class Finish:
 
     def smoothed_lens(self, lens: Lens) -> Lens:
         """Return the lens with the faces that light meets smoothed, except faces z = const."""
-        for name, face in lens.optical_faces.items():
-            if is_net(face):
-                smooth = self.smoothed(face)
-                lens = lens.with_front(smooth) if name == "front" else lens.with_back(smooth)
+        for face in lens.optical_faces:
+            if is_net(face.surface):
+                lens = lens.with_surface(face.name, self.smoothed(face.surface))
         return lens
 
 

@@ -29,6 +29,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import FRONT
 from bstcad.optics.light.channels import Channel, SourceSampler, points_per_line, source_numbers, weighted_sum
 from bstcad.optics.numerics.reductions import dot, total
 from bstcad.optics.receivers.goal import Goal, interpolated
@@ -224,7 +225,7 @@ def _light(setup: _Setup, goal: Goal, channels: Sequence[Channel], rays: _Rays, 
     (value, error), (tent, _) = _value(rays.boxes, target), _value(rays.tents, target)
     smoothed, error_of_smoothed = _smoothed(rays.boxes, target)
     # two nets, windows and mirrors have no kernel for the whole path, and yet have a witness
-    plain = lens.is_tailored("front") or bool(lens.before or lens.behind)
+    plain = lens.is_tailored(FRONT) or bool(lens.before or lens.behind)
     lossless = all(c.losses is None for c in channels)
     paths = ((c.source, c.through(lens), screen.receiver) for c in channels)
     simple = lossless and (plain or all(whole_kernel("trace.simulate", *path) for path in paths))

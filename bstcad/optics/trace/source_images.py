@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.numerics.reductions import total
 from bstcad.optics.receivers.irradiance import Screen, rrmsd, tent
@@ -125,7 +126,7 @@ def _through(channels: Sequence[Channel], lens: Lens, screen: Screen, x: Tensor,
     """
     lens = channels[0].through(lens)
     p, q, rays = tubes.rays_to([channel.source for channel in channels], lens, x, y)
-    last = replace(lens.unbounded(), losses=None).interfaces[lens.number_of("back") :]
+    last = replace(lens.unbounded(), losses=None).interfaces[lens.number_of(BACK) :]
     rays = replace(rays, position=rays.position - lens.back.standoff * rays.direction)
     [landed] = through(rays, last, [screen.receiver])
     centre = tubes.middle(p), tubes.middle(q)

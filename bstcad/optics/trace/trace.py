@@ -327,8 +327,7 @@ def ghost(lens: Lens) -> tuple[Interface, ...]:
     The reflectance of the faces follows from the lens's losses.
     """
     assert lens.losses is not None  # without losses no face reflects
-    number = lens.number_of("front")
-    front, back = lens.interfaces[number : number + 2]
+    front, back = lens.interfaces[lens.solid]
     outwards = replace(front, law=Refract(lens.index, lens.passes.index_before), status_if_missed=Status.VIGNETTED)
     _, outwards = lens.losses.on((front, outwards))  # losses of `outwards` for light from inside the glass
     return front, _from_inside(back), _from_inside(outwards), back

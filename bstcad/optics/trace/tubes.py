@@ -18,6 +18,7 @@ from torch import Tensor
 
 from bstcad.optics.lens.interfaces import cross
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import BACK
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.light.path import MAX_BROYDEN_STEPS, MIN_BROYDEN_DIVISOR, Found, Path
 from bstcad.optics.numerics import kernel_choice
@@ -144,7 +145,7 @@ def _tubes(source: Emitter, lens: Lens, x: Tensor, y: Tensor, cut: bool) -> Tube
     light = replace(light, flux=torch.ones_like(light.flux))
     rays = [light]  # in front of each interface
     interfaces = lens.unbounded().interfaces
-    first, back = lens.tailored_numbers[0], lens.number_of("back")
+    first, back = lens.tailored_numbers[0], lens.number_of(BACK)
     end = lens.solid.stop if lens.solid.stop > back + 1 else back  # faces behind the back: in a second-surface mirror
     for k in range(max(first, end)):
         rays.append(cross(rays[k], interfaces[k]).rays)
@@ -286,7 +287,7 @@ def rays_to(
     the interface, not yet deflected; rays that are not found there are lost.
     """
     x, y = (p.to(lens.like.device) for p in (x, y))
-    number = lens.number_of("back") if number is None else number
+    number = lens.number_of(BACK) if number is None else number
     face = lens.interfaces[number].surface
     h = face.relative_sag_and_slope(x.to(lens.like), y.to(lens.like))[0].double()
     sources: Sequence[Emitter] = (source,) if isinstance(source, Emitter) else source

@@ -24,6 +24,7 @@ from trimesh import Trimesh
 
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.losses import FresnelLoss, Losses
+from bstcad.optics.lens.passes import BACK, FRONT, LENS, MIRROR
 from bstcad.optics.light.channels import Channel, points_per_line
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.emitters import Emitter
@@ -55,7 +56,7 @@ def cannot(lens: Lens, channels: Sequence[Channel]) -> str:
     """Return the reason, a sentence, why Mitsuba cannot trace this light; "" if it can."""
     if lens.before or lens.behind:
         return "it simulates only the lens, and there are windows or mirrors before or behind it"
-    if lens.own_passes is not None:
+    if lens.passes not in (LENS, MIRROR):
         return "it simulates a lens or a mirror, and light takes another path through this solid"
     if (first := channels[0].source).kind not in LAMPS:
         return f"Mitsuba has no lamp for the light of {type(first).__name__}"
@@ -126,10 +127,10 @@ def _scene_without_lamps(lens: Lens, screen: Screen, folder: Path) -> tuple[dict
     """Return the scene without lamps, with meshes (files in `folder`) fine enough for the screen, and their error."""
     back, (below, above) = faces.face(lens.back, lens.outline), lens.apertures
     upper, error = _fine_mesh(back, above, lens, screen, up=True)
-    meshes = {"back": upper}
-    if "front" in lens.passes.faces:
+    meshes = {BACK: upper}
+    if FRONT in lens.passes.faces:
         front, level = faces.face(lens.front, below), faces.face(lens.front.around, lens.outline)
-        meshes["front"], of_front = _fine_mesh(front, below, lens, screen, up=False)
+        meshes[FRONT], of_front = _fine_mesh(front, below, lens, screen, up=False)
         error = FaceError.worst((error, of_front))
         foot = (front, below) if lens.front.outline is None else (level, above)
         meshes |= {"wall": faces.wall(foot[0], back, (foot[1], above)), "plate": faces.plate(front, below)}
@@ -160,7 +161,7 @@ def _scene(bench: dict[str, Entry], channels: Sequence[Channel], lens: Lens, *, 
     material = {"type": "dielectric", "int_ior": channels[0].index, "ext_ior": 1.0}
     if not lens.passes.enters:
         material = {"type": "conductor", "material": "none"}
-    bench = bench | {name: bench[name] | {"bsdf": material} for name in bench.keys() & {"front", "back"}}
+    bench = bench | {name: bench[name] | {"bsdf": material} for name in bench.keys() & set(lens.passes.faces)}
     tracer = {"type": "ptracer", "max_depth": edges, "rr_depth": 100, "hide_emitters": True}
     scene = {"type": "scene", "integrator": tracer} | bench | lamps(channels, lens, folder)
     return _mitsuba().load_dict(scene, optimize=False)

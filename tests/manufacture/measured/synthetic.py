@@ -29,12 +29,12 @@ def with_form_error(lens, rms, correlation, seed=1):
     error, *moved = (_over(lens, part) for part in (heights, *motions))
     heights = heights - np.tensordot(np.linalg.lstsq(np.stack(moved, axis=1), error, rcond=None)[0], motions, axes=1)
     heights *= rms / _over(lens, heights).std()
-    return replace(lens, back=replace(back, heights=back.heights + torch.from_numpy(heights)))
+    return lens.with_back(replace(back, heights=back.heights + torch.from_numpy(heights)))
 
 
 def _over(lens, heights):
     """A form error at 20 000 places over the outline."""
-    return points(replace(lens, back=replace(lens.back, z=0.0, heights=torch.from_numpy(heights))), 20_000)[:, 2]
+    return points(lens.with_back(replace(lens.back, z=0.0, heights=torch.from_numpy(heights))), 20_000)[:, 2]
 
 
 def points(lens, count, seed=2):

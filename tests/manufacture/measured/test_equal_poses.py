@@ -17,7 +17,7 @@ from tests.manufacture.measured.synthetic import low_order, points
 def placed(relief, degrees=0.0, astigmatism=0.0):
     """Return the face of a bowl with a relief (mm) at x and y, and 1500 points of a part that is turned, aligned."""
     back = net(lambda x, y: 0.02 * (x**2 + y**2) + 1e-4 * (x**2 + y**2) ** 2 + relief(x, y), 5.0, 65, 6.0)
-    face = BackFace.of(Lens(Plane(0.0), back, Circle(5.0), 1.5))
+    face = BackFace.of(Lens.between(Plane(0.0), back, Circle(5.0), 1.5))
     random, given = np.random.default_rng(4), points(face.lens, 1500)
     given[:, 2] += low_order(given, "astigmatism", astigmatism, random) + random.normal(0.0, 1e-4, len(given))
     start = identity_pose(face).compose(turn_about_axis(face, degrees), face.reach)

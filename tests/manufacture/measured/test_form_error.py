@@ -26,7 +26,7 @@ from tests.manufacture.measured.synthetic import points, with_form_error
 @pytest.fixture(scope="module")
 def lens():
     back = net(lambda x, y: 0.02 * x**2 + 0.01 * y**2 + 0.0005 * x**3, 5.0, 33, 6.0)
-    return Lens(Plane(0.0), back, Circle(5.0), 1.5)
+    return Lens.between(Plane(0.0), back, Circle(5.0), 1.5)
 
 
 def test_the_minimum_zone_is_that_of_all_points(lens):
@@ -56,7 +56,7 @@ def test_a_known_error_has_a_known_zone(lens):
 
 
 def test_an_alignment_never_mirrors(lens):
-    mirrored = replace(lens, back=replace(lens.back, heights=lens.back.heights.flip(0)))
+    mirrored = lens.with_back(replace(lens.back, heights=lens.back.heights.flip(0)))
     face = BackFace.of(lens)
     found = align(face, points(mirrored, 3000), identity_pose(face))
     assert np.linalg.det(found.pose.rotation) == pytest.approx(1.0) and found.rms > 0.01

@@ -95,7 +95,7 @@ def test_a_decentre_of_ten_micrometres_is_found_to_a_tenth_and_fails_where_less_
 def test_the_pose_of_the_part_is_found_and_points_of_other_faces_are_counted(nominal):
     """Points of the front, of the sides and of the rim are not used."""
     back = cloud(nominal.lens, 5000)
-    below = cloud(replace(nominal.lens, back=nominal.lens.back.moved(nominal.lens.back.z - 8.0)), 1500)
+    below = cloud(nominal.lens.with_back(nominal.lens.back.moved(nominal.lens.back.z - 8.0)), 1500)
     face = BackFace.of(nominal.lens)
     everything = np.vstack([back, below])
     found = align(face, everything, first_pose(face, everything)[0])
@@ -105,7 +105,7 @@ def test_the_pose_of_the_part_is_found_and_points_of_other_faces_are_counted(nom
 
 def test_motions_that_a_flat_face_does_not_determine_are_left_alone(nominal):
     lens = nominal.lens
-    flat = replace(lens, back=replace(lens.back, heights=torch.zeros_like(lens.back.heights)))
+    flat = lens.with_back(replace(lens.back, heights=torch.zeros_like(lens.back.heights)))
     face = BackFace.of(flat)
     given = points(flat, 5000) + [0.0, 0.0, 0.3] + np.random.default_rng(0).normal(0, 1e-4, (5000, 3)) * [0, 0, 1]
     found = align(face, given, first_pose(face, given)[0])
@@ -146,7 +146,7 @@ def test_the_scale_along_each_axis_is_found_where_the_relief_determines_it(nomin
     fitted = axis_scales(face, align(face, found, first_pose(face, found)[0]))
     assert np.array(fitted.scales) == pytest.approx(true, abs=1e-4)
     assert max(fitted.uncertainties) < 1e-4
-    flat = replace(lens, back=replace(lens.back, heights=torch.zeros_like(lens.back.heights)))
+    flat = lens.with_back(replace(lens.back, heights=torch.zeros_like(lens.back.heights)))
     face, found = BackFace.of(flat), points(flat, 3000)
     facts = axis_scales(face, align(face, found, first_pose(face, found)[0])).facts()
     assert facts["scale_xyz"] == [None, None, None] == facts["scale_xyz_uncertainty"]
@@ -253,7 +253,7 @@ def test_many_parts_of_one_design_are_judged_beside_it(small_design, nominal, tm
 @pytest.mark.parametrize("degrees", suite.in_turns([90.0, 137.0, 180.0], 3))
 def test_a_turned_part_is_aligned_by_its_relief(degrees):
     """Relief of 1 µm on a bowl: a part upside down was said to be of another lens, or to have reversed axes."""
-    bowl = Lens(Plane(0.0), net(lambda x, y: 0.02 * x**2 + 0.01 * y**2, 5.0, 65, 6.0), Circle(5.0), 1.5)
+    bowl = Lens.between(Plane(0.0), net(lambda x, y: 0.02 * x**2 + 0.01 * y**2, 5.0, 65, 6.0), Circle(5.0), 1.5)
     lens = with_form_error(bowl, 1e-3, 0.7)
     face, given = BackFace.of(lens), clouds.Cloud(cloud(lens, 3000, 2e-5, SHIFT, (0.0, 0.0, degrees)), "mm", Path())
     found, checks_of_cloud = made_part.aligned(given, face, None)

@@ -16,7 +16,7 @@ def test_the_pose_lies_within_two_uncertainties_in_19_of_20_sparse_clouds():
 
     The pose by least squares lies up to 90 µm beside; it is kept if fine relief is unsure by more than 5 µm.
     """
-    bowl = Lens(Plane(0.0), net(lambda x, y: 0.02 * x**2 + 0.01 * y**2, 5.0, 65, 6.0), Circle(5.0), 1.5)
+    bowl = Lens.between(Plane(0.0), net(lambda x, y: 0.02 * x**2 + 0.01 * y**2, 5.0, 65, 6.0), Circle(5.0), 1.5)
     lens = with_form_error(bowl, 1e-3, 0.7)
     face, worst = BackFace.of(lens), []
     for seed in range(20):

@@ -26,7 +26,7 @@ def made(lens, seed, true, kind):
 
 def smooth(sag, outline=ROUND, half=6.0):
     """A lens without relief, with a plane front."""
-    return Lens(Plane(0.0), net(sag, 5.0, 65, half), outline, 1.5)
+    return Lens.between(Plane(0.0), net(sag, 5.0, 65, half), outline, 1.5)
 
 
 BOWL = smooth(lambda x, y: 0.02 * x**2 + 0.01 * y**2 + 0.0005 * x**3)

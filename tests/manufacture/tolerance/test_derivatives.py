@@ -151,4 +151,4 @@ def made(setup: Setup, amounts: dict[str, torch.Tensor]) -> Lens:
         x=tuple(factor * end for end in lens.back.x),
         y=tuple(factor * end for end in lens.back.y),
     )
-    return replace(lens, front=front, back=back, index=index).unbounded()
+    return replace(lens, index=index).with_front(front).with_back(back).unbounded()

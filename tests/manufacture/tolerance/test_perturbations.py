@@ -31,7 +31,7 @@ TUBES = 257
 
 def plate_of(m):
     """A plate of 24 x 24 x 12 mm."""
-    return Lens(Plane(8.0), net(m=m, half=12.0), Rectangle(24.0, 24.0), 1.5)
+    return Lens.between(Plane(8.0), net(m=m, half=12.0), Rectangle(24.0, 24.0), 1.5)
 
 
 @pytest.fixture(scope="module")

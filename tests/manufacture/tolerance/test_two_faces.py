@@ -25,6 +25,7 @@ from bstcad.manufacture.tolerance.perturbations import (
 )
 from bstcad.manufacture.tolerance.study import Wavefronts
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import MIRROR
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.point import PointSource
@@ -43,7 +44,7 @@ N, LINE, BACK, SEEN = 1.5, 500.0, 12.0, 40.0  # index, nm, vertex of the back, p
 
 def lit(front, back=None, light=None):
     """A lens of 24 x 24 mm in a parallel beam, before a screen 100 mm from the origin."""
-    lens = Lens(front, back or net(None, BACK, 65, 12.5), Rectangle(24.0, 24.0), N)
+    lens = Lens.between(front, back or net(None, BACK, 65, 12.5), Rectangle(24.0, 24.0), N)
     light = light or CollimatedSource(Circle(3.0), z=0.0, wavelength=LINE)
     return Setup(lens, (Channel(light, N),), Screen(100.0, (-8.0, 8.0), (-8.0, 8.0), (64, 64)))
 
@@ -236,7 +237,7 @@ def test_one_face_against_the_other_is_off_only_where_a_table_names_it(setup):
 
 @pytest.mark.parametrize("name", ["lens.wedge_x", "front.form"])
 def test_a_mirror_has_no_second_face(setup, name):
-    mirror = replace(setup, lens=replace(setup.lens, reflects=True))
+    mirror = replace(setup, lens=replace(setup.lens, passes=MIRROR))
     with pytest.raises(SceneError, match=rf"tolerance\[0\].name: '{name}' "):
         perturbations(mirror, graded_table((Tolerance(name=name, limit=1e-3),)))
     assert perturbations(mirror, graded_table((Tolerance(name=name, grade="none"),)))

@@ -114,7 +114,7 @@ CHANGED = {  # constant: (where it stands, a value that no ray can fail to feel)
 def lens(cliff):
     """A round front and a wavy back; with a cliff in its corner (mm) most rays are steep to the net as a whole."""
     back = net(lambda x, y: 0.02 * torch.sin(1.1 * x) * torch.cos(y) + cliff * (x > 7.0) * (y > 7.0), m=33, half=8.0)
-    return Lens(Sphere(10.0, 0.01), back, Rectangle(16.0, 16.0), 1.5)
+    return Lens.between(Sphere(10.0, 0.01), back, Rectangle(16.0, 16.0), 1.5)
 
 
 def seen(cliff):
@@ -123,7 +123,7 @@ def seen(cliff):
     box = simulated(SOURCE, now, SCREEN, 64, 0).box
     tubes = launch_tubes(SOURCE, now, 32)
     heights = now.back.heights.clone().requires_grad_()
-    landed = tubes.landing(replace(now, back=replace(now.back, heights=heights)), LevelPlane(SCREEN.z))
+    landed = tubes.landing(now.with_back(replace(now.back, heights=heights)), LevelPlane(SCREEN.z))
     picture, _ = tubes.collect(landed, SCREEN)
     (gradient,) = torch.autograd.grad((picture**2).sum(), heights)
     return torch.cat([t.detach().reshape(-1) for t in (box, picture, gradient)])

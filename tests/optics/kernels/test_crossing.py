@@ -38,7 +38,7 @@ SCENES = {  # a source, a front, an outline; every Status that rays through a wi
 @DTYPES
 def test_landings_and_their_gradient(scene, dtype):
     source, front, outline, fates = SCENES[scene]
-    lens = Lens(front, deep(dtype=dtype), outline, 1.6)
+    lens = Lens.between(front, deep(dtype=dtype), outline, 1.6)
     x, y = stratified(Rectangle(23.0, 23.0), 90, 0, dtype)
     in_glass = trace.to_first_net(source.rays_through(x, y, 15.0, 1.0), lens)
     z, weight = LevelPlane(400.0), uniform((2, *x.shape), 1)
@@ -46,7 +46,7 @@ def test_landings_and_their_gradient(scene, dtype):
     for form, kind in ((trace.from_first_net, dtype), (from_first_net_plain, torch.float64)):
         heights = lens.back.heights.detach().to(kind).requires_grad_()
         bundle = replace(in_glass, position=in_glass.position.to(kind), direction=in_glass.direction.to(kind))
-        landed = form(bundle, replace(lens, back=replace(lens.back, heights=heights)), z)
+        landed = form(bundle, lens.with_back(replace(lens.back, heights=heights)), z)
         merit = torch.where(landed.alive, (landed.position * weight.to(kind)).sum(0), 0.0).sum()
         results.append((landed, torch.autograd.grad(merit, heights)[0]))
     (kernel, g), (plain, g_plain) = results
@@ -66,7 +66,7 @@ def test_landings_and_their_gradient(scene, dtype):
 def test_a_grid_of_rays_is_traced_as_its_rays_are(scene):
     """The search for a ray of a grid begins beside the hits of two rows before; that of a listed ray, at the plane."""
     source, front, outline, fates = SCENES[scene]
-    lens, z = Lens(front, deep(), outline, 1.6), LevelPlane(400.0)
+    lens, z = Lens.between(front, deep(), outline, 1.6), LevelPlane(400.0)
     x, y = torch.meshgrid(*(torch.linspace(-11.5, 11.5, n, dtype=torch.float64) for n in (70, 300)), indexing="ij")
     grid = trace.to_first_net(source.rays_through(x, y, 15.0, 1.0), lens)
     listed = trace.to_first_net(source.rays_through(x.reshape(-1), y.reshape(-1), 15.0, 1.0), lens)
@@ -79,7 +79,7 @@ def test_a_grid_of_rays_is_traced_as_its_rays_are(scene):
 def test_a_beam_meets_a_front_that_reaches_beyond_where_it_begins():
     """12 mm before the front of a lens 20 mm wide: where a beam begins is a convention, to the closed form none."""
     front = replace(deep(depth=-30.0), z=15.0)
-    lens = Lens(front, deep(), Rectangle(20.0, 20.0), 1.6, tailored=(0, 1))
+    lens = Lens.between(front, deep(), Rectangle(20.0, 20.0), 1.6, tailored=(0, 1))
     beam = CollimatedSource(Rectangle(17.0, 17.0))
     x, y = stratified(Rectangle(17.0, 17.0), 60, 0)
     rays, interface = beam.rays_through(x, y, 15.0, 1.0), lens.interfaces[0]
@@ -119,7 +119,7 @@ def test_the_gradient_in_the_rays_is_that_of_the_plain_form(name, plane):
     weight, gradients, landings = uniform((2, *x.shape), 1), [], []
     for form in (trace.from_first_net_to_each, from_first_net_to_each_plain):
         leaves = [t.detach().clone().requires_grad_() for t in (lens.back.heights, coming.position, coming.direction)]
-        moved = replace(lens, back=replace(lens.back, heights=leaves[0]))
+        moved = lens.with_back(replace(lens.back, heights=leaves[0]))
         found = form(replace(coming, position=leaves[1], direction=leaves[2]), moved, PLANES[plane])
         merit = sum(
             torch.where(landed.alive, (landed.position * (weight + k)).sum(0) + landed.flux, 0.0).sum()
@@ -159,7 +159,7 @@ def test_the_gradient_in_the_rays_is_finite_differences():
 )
 def test_a_ray_of_no_number_is_lost_alone(form, source, name):
     """An index made from it must not be out of range: on a GPU that would end the whole process."""
-    lens = Lens(Plane(15.0), deep(), Rectangle(20.0, 20.0), 1.5)
+    lens = Lens.between(Plane(15.0), deep(), Rectangle(20.0, 20.0), 1.5)
     x, y = sampling.grid(Rectangle(10.0, 10.0), 4)
     in_glass = trace.to_first_net(source.rays_through(x, y, 15.0, 1.0), lens)
     wrong = getattr(in_glass, name).clone()

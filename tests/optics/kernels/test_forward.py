@@ -36,9 +36,9 @@ def deep(front=None, outline=SQUARE, m=17, depth=4.0, **more):
 
 
 # A back that falls so much towards its rim that steep rays leave it past the horizontal: those turn back.
-DOME = Lens(Sphere(1.37, -0.25), net(lambda x, y: -0.025 * (x**2 + y**2), 3.28, 33), Circle(10.0), 1.2)
+DOME = Lens.between(Sphere(1.37, -0.25), net(lambda x, y: -0.025 * (x**2 + y**2), 3.28, 33), Circle(10.0), 1.2)
 # A plane so steep that part of it lies before the front: rays that enter there are outside the glass already.
-RAMP = Lens(Plane(15.0), tilted(2.5, 22.0, 11.0), SQUARE, 1.05)
+RAMP = Lens.between(Plane(15.0), tilted(2.5, 22.0, 11.0), SQUARE, 1.05)
 CLEAR = Rounded(18.0, 20.0, corner_radius=4.0), Rounded(19.0, 18.0, corner_radius=7.0)
 CONE = {"profile": "uniform", "half_angle": 33.0}
 BEAM, NARROW = (
@@ -135,9 +135,9 @@ SCREEN = Screen(400.0, (-40.0, 90.0), (-60.0, 50.0), (40, 27))
 def test_the_simulation_is_the_plain_one(name):
     """Pictures, ledger and count; the float32 net is the same net in both, only plain arithmetic on it is coarser."""
     source, lens, fates = SCENES[name]
-    lens = replace(lens, back=lens.back.to(torch.float32))
+    lens = lens.with_back(lens.back.to(torch.float32))
     found = simulated(source, lens, SCREEN, 300, seed=5)
-    plain = simulated_plain(source, replace(lens, back=lens.back.to(torch.float64)), SCREEN, 300, seed=5)
+    plain = simulated_plain(source, lens.with_back(lens.back.to(torch.float64)), SCREEN, 300, seed=5)
     assert found.rays == plain.rays > 3000
     # the same rays in the same pixels: sums of numbers of the order of the whole flux, in another order
     for one, other in ((found.box, plain.box), (found.tent, plain.tent)):
@@ -278,7 +278,7 @@ def test_what_the_kernel_takes(monkeypatch):
     assert kernel_choice.whole_kernel("trace.simulate", lens.interfaces) is forward.simulate
     for other in (lens.back.heights.to(torch.float16), lens.back.heights.to("meta")):
         assert not kernel_choice.whole_kernel("trace.simulate", lens.with_heights([other]).interfaces)
-    freeform = replace(lens, front=replace(lens.back, z=6.0, heights=lens.back.heights - 10))
+    freeform = lens.with_front(replace(lens.back, z=6.0, heights=lens.back.heights - 10))
     window = replace(lens.interfaces[0], surface=Plane(1.0))
     for unknown in (freeform, replace(lens, before=(window,))):
         assert not kernel_choice.whole_kernel("trace.simulate", unknown.interfaces)
@@ -302,7 +302,7 @@ class Asphere(Sphere):
 
 def test_a_new_kind_of_front_is_traced_by_its_own_equation():
     """Not by the kernel, to which it would be a conic of the same curvature."""
-    lens = replace(SCENES["collimated, plane"][1], front=Asphere(10.0, 0.01))
+    lens = SCENES["collimated, plane"][1].with_front(Asphere(10.0, 0.01))
     beam = CollimatedSource(Circle(8.0))
     traced, plain = (run(beam, lens, SCREEN, 40, 0).box for run in (simulated, simulated_plain))
     sphere = simulated(beam, lens.with_front(Sphere(10.0, 0.01)), SCREEN, 40, 0).box
@@ -317,7 +317,7 @@ def test_it_is_compiled_once():
         for dtype in (torch.float32, torch.float64):
             back = deep().back.to(dtype)
             for front in (Plane(15), Sphere(15, torch.tensor(0.01, dtype=dtype)), Sphere(15, 0)):
-                lens = Lens(front, back, Circle(radius), 2)
+                lens = Lens.between(front, back, Circle(radius), 2)
                 for source in (PointSource(position=(0, 0, 0)), CollimatedSource(Circle(radius)), PointSource(**CONE)):
                     simulated(source, lens, Screen(400, (-300, 500), (-400, 350), 40), 4, seed)
                     before = before or len(compiled.signatures)

@@ -28,7 +28,7 @@ SCREEN = Screen(60.0, (-40.0, 40.0), (-40.0, 40.0), 24)
 def immersed(index_before, front=None, back=None, **more):
     """Return a lens between a medium of this index and air."""
     lens = lens_of(back or wavy(depth=1.0, half=20.0), front or Plane(4.0), EVERYWHERE, N, **more)
-    return replace(lens, own_passes=replace(LENS, index_before=index_before))
+    return replace(lens, passes=replace(LENS, index_before=index_before))
 
 
 @pytest.mark.parametrize("degrees", [0.0, 10.0, 39.0])
@@ -79,7 +79,7 @@ def test_the_kernels_agree_with_plain_torch(index_before, face):
         back = RadialSurface.sphere(0.0, 15.0, (17.0, 17.0), (17, 17))
         rim = Circle(back.chart.length(math.radians(70.0)))
         passes = replace(LENS, index_before=index_before)
-        lens = Lens(Plane(4.0), back, rim, N, losses=BARE, clear=(Circle(14.0), rim), own_passes=passes)
+        lens = Lens.between(Plane(4.0), back, rim, N, losses=BARE, clear=(Circle(14.0), rim), passes=passes)
         light = SphereLight.of(LAMP, 0.0, back.chart, half_angle=math.radians(70.0))
     lights = [(1.0, light, lens, 3)]
     fused, plain = (simulate(lights, [SCREEN], 64)[0] for simulate in (trace.simulate, trace.simulate_plain))

@@ -26,7 +26,7 @@ BARE = Losses(FresnelLoss(WAVELENGTH))
 
 
 def plate(losses=BARE, index=N, thickness=4.0, outline=EVERYWHERE):
-    return Lens(Plane(10.0), tilted(0.0, 10.0 + thickness, half=60.0), outline, index, losses=losses)
+    return Lens.between(Plane(10.0), tilted(0.0, 10.0 + thickness, half=60.0), outline, index, losses=losses)
 
 
 # --- flux -------------------------------------------------------------------------------------------------------------
@@ -51,7 +51,7 @@ def test_glass_absorbs_along_three_ways_through_it():
 
 def test_beyond_the_critical_angle_all_is_reflected():
     """A wedge of 45 degrees turns light by a right angle at its back: R = 1 there, and what leaves is none of it."""
-    lens = Lens(Plane(0.0), tilted(1.0, 40.0, half=60.0), EVERYWHERE, N, losses=BARE)
+    lens = Lens.between(Plane(0.0), tilted(1.0, 40.0, half=60.0), EVERYWHERE, N, losses=BARE)
     _, down, _, _ = ghost(lens)
     for degrees in (41.9, 45.0, 80.0):
         cos = torch.tensor(math.cos(math.radians(degrees)), dtype=torch.float64)
@@ -70,7 +70,7 @@ def test_a_wedge_throws_its_ghost_where_geometry_has_it(front):
     """Angles to the axis in a wedge of angle A: 2 A after the back, 3 A to the back's normal at the exit."""
     wedge, thickness, x0, throw = math.radians(5.0), 4.0, 1.0, 500.0
     slope = -math.tan(wedge)  # the back falls along +x; its normal leans by A towards +x
-    lens = Lens(front, tilted(slope, 10.0 + thickness, half=60.0), EVERYWHERE, N, losses=BARE)
+    lens = Lens.between(front, tilted(slope, 10.0 + thickness, half=60.0), EVERYWHERE, N, losses=BARE)
     out, _ = trace_ghost(bundle((x0, 0.0, 0.0), (0.0, 0.0, 1.0)), lens)
     landed = LevelPlane(throw).to(out)
 

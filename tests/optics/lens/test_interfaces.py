@@ -61,7 +61,7 @@ def rays_of(source, lens, n=40, size=16.0):
 
 def test_a_window_before_a_lens_and_a_fold_mirror_behind_it_are_data():
     """The window moves the light as a plate does; the mirror sends it to the plane's mirror image."""
-    lens = Lens(Sphere(0.0, 0.01), net(6.0, 0.3), SQUARE, N)
+    lens = Lens.between(Sphere(0.0, 0.01), net(6.0, 0.3), SQUARE, N)
     rays = rays_of(SOURCE, lens)
     folded = trace(rays, replace(lens, behind=FOLD), LevelPlane(60.0 - 35.0))
     torch.testing.assert_close(folded.position, trace(rays, lens, LevelPlane(60.0 + 35.0)).position, rtol=0, atol=1e-12)
@@ -82,7 +82,7 @@ def test_a_window_before_a_lens_and_a_fold_mirror_behind_it_are_data():
 
 def test_a_system_is_simulated_as_its_rays_and_its_tubes_are_traced():
     """Plain rays, since no one kernel traces the whole system, and fused tubes: the same light on the same pixels."""
-    lens = replace(Lens(Sphere(0.0, 0.01), net(6.0, 0.2), SQUARE, N), before=WINDOW, behind=FOLD)
+    lens = replace(Lens.between(Sphere(0.0, 0.01), net(6.0, 0.2), SQUARE, N), before=WINDOW, behind=FOLD)
     screen = Screen(10.0, (-40.0, 40.0), (-40.0, 40.0), 8)
     source = PointSource((1.0, -2.0, -60.0), profile="uniform", half_angle=7.0)
     rays, tubes = simulated(source, lens, screen, 300, 0), launch_tubes(source, lens, 120).picture(lens, screen)
@@ -96,7 +96,7 @@ def test_a_system_is_simulated_as_its_rays_and_its_tubes_are_traced():
 
 MANGIN = Passes((Pass("front", Refract), Pass("back", Reflect), Pass("front", Refract)))
 LOSSES = Losses(FresnelLoss(587.6), AbsorptionLoss(0.01))
-TWO = Lens(net(0.0, 0.4, 2), net(6.0, 0.5), SQUARE, N, tailored=(0, 1))
+TWO = Lens.between(net(0.0, 0.4, 2), net(6.0, 0.5), SQUARE, N, tailored=(0, 1))
 MIRROR = replace(FOLD[0], surface=replace(net(60.0, 0.5, 3), x=(-40.0, 40.0), y=(-40.0, 40.0)))
 SYSTEMS = {
     "lens": TWO,
@@ -104,7 +104,7 @@ SYSTEMS = {
     "with a window": replace(TWO, before=WINDOW, tailored=(2, 3)),
     "with a fold mirror": replace(TWO, behind=FOLD),
     "freeform fold mirror": replace(TWO, behind=(MIRROR,), tailored=(0, 1, 2)),
-    "lossy Mangin mirror": replace(TWO, own_passes=MANGIN, losses=Losses(absorption=AbsorptionLoss(0.01))),
+    "lossy Mangin mirror": replace(TWO, passes=MANGIN, losses=Losses(absorption=AbsorptionLoss(0.01))),
     "a plate between them": replace(
         TWO, tailored=(0, 4),
         behind=(*(replace(i, surface=i.surface.moved(i.surface.z + 30.0)) for i in WINDOW), MIRROR),
@@ -116,7 +116,7 @@ PLANES = {"level": LevelPlane(15.0), "tilted": TiltedPlane((3.0, 2.0, 15.0), (20
 def test_light_goes_through_a_mangin_mirror_as_snell_has_it():
     """Between flat faces t mm apart a ray of sine s is displaced by 2 t s / r, on a path of 2 t n / r, r² = n² - s²."""
     flat = [net(z, 0.0) for z in (0.0, 6.0)]
-    lens = Lens(*flat, SQUARE, N, own_passes=MANGIN)
+    lens = Lens.between(*flat, SQUARE, N, passes=MANGIN)
     assert lens.passes.sense == 1 and lens.passes.reversal == -1 and lens.number_of("back") == 1
     assert [interface.surface for interface in lens.interfaces] == [flat[0], flat[1], flat[0]]
     rays = rays_of(SOURCE, lens, size=10.0)
@@ -132,7 +132,7 @@ def test_light_goes_through_a_mangin_mirror_as_snell_has_it():
 
 def test_a_mangin_mirror_is_simulated_as_its_tubes_are_traced():
     """Light that comes back to the front beside its rim is lost: a fifth of what enters."""
-    lens = Lens(Sphere(0.0, 0.01), net(6.0, 0.2), SQUARE, N, own_passes=MANGIN)
+    lens = Lens.between(Sphere(0.0, 0.01), net(6.0, 0.2), SQUARE, N, passes=MANGIN)
     screen = Screen(-30.0, (-60.0, 60.0), (-60.0, 60.0), 8)
     source = PointSource((1.0, -2.0, -60.0), profile="uniform", half_angle=30.0)
     rays, tubes = simulated(source, lens, screen, 600, 0), launch_tubes(source, lens, 240).picture(lens, screen)
@@ -143,7 +143,7 @@ def test_a_mangin_mirror_is_simulated_as_its_tubes_are_traced():
 def test_the_metal_of_a_mangin_mirror_is_met_from_the_glass():
     """The face reflects |(m - n) / (m + n)|² at normal incidence, and light crosses a bare front before and after."""
     metal, flat = 1.2 + 6.0j, [net(z, 0.0) for z in (0.0, 6.0)]
-    lens = Lens(*flat, SQUARE, N, own_passes=MANGIN, losses=Losses(FresnelLoss(587.6, metal=metal)))
+    lens = Lens.between(*flat, SQUARE, N, passes=MANGIN, losses=Losses(FresnelLoss(587.6, metal=metal)))
     rays = CollimatedSource(Rectangle(4.0, 4.0)).rays_through(*stratified(Rectangle(4.0, 4.0), 4, 0), 0.0, 1.0)
     left = trace(rays, lens, LevelPlane(-20.0)).flux / rays.flux
     wanted = (1 - ((N - 1) / (N + 1)) ** 2) ** 2 * abs((metal - N) / (metal + N)) ** 2
@@ -194,7 +194,7 @@ def test_the_gradient_through_two_nets_is_finite_differences():
 
 def test_beyond_a_net_the_gradient_is_that_of_its_rim():
     """The front sends light past the back's net: sag and slopes do not change across the rim."""
-    lens = replace(TWO, back=replace(TWO.back, x=(-5.0, 5.0), y=(-5.25, 5.25))).unbounded()
+    lens = TWO.with_back(replace(TWO.back, x=(-5.0, 5.0), y=(-5.25, 5.25))).unbounded()
     rays, way = rays_of(SOURCE, lens, size=18.0), torch.cos(torch.arange(21.0)).double()
 
     def value(share, form):

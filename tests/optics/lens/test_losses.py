@@ -60,7 +60,7 @@ def test_a_metal_reflects_what_complex_amplitudes_say(kind):
 
 def rough_lens(m=13, heights=0.15, losses=ALL, front=None):
     back = rough(heights, z=14.0, m=m, half=5.5)
-    return Lens(front or Sphere(8.0, -0.02), back, Rectangle(9.0, 9.0), N, losses=losses)
+    return Lens.between(front or Sphere(8.0, -0.02), back, Rectangle(9.0, 9.0), N, losses=losses)
 
 
 SOURCES = (CollimatedSource(Circle(4.0)), PointSource((0.2, -0.1, 0.0), profile="lambertian"))
@@ -110,7 +110,7 @@ def test_the_gradient_of_the_merit_is_that_of_differences_losses_and_all(source,
 def test_what_is_lost_on_the_way_is_counted_whole_and_without_gradient():
     """A ray that misses keeps its flux, and the others' gradients stay finite."""
     lens = rough_lens()
-    lens = replace(lens, back=replace(lens.back, heights=lens.back.heights.clone().requires_grad_()))
+    lens = lens.with_back(replace(lens.back, heights=lens.back.heights.clone().requires_grad_()))
     x = torch.tensor([0.0, 40.0], dtype=torch.float64)
     rays = SOURCES[1].rays_through(x, torch.zeros(2, dtype=torch.float64), 8.0, 1.0)
     landed = trace.trace(rays, lens, LevelPlane(SCREEN.z))

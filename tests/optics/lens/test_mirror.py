@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from bstcad.optics.lens.interfaces import Interface, Reflect, Refract, cross
+from bstcad.optics.lens.passes import MIRROR
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
@@ -34,7 +35,7 @@ LIGHTS = {
 
 
 def mirror(back):
-    return lens_of(back, Plane(0.0), reflects=True)
+    return lens_of(back, Plane(0.0), passes=MIRROR)
 
 
 def paraboloid(c):

@@ -31,7 +31,7 @@ SCREEN = Screen(500.0, (-1e4, 1e4), (-1e4, 1e4), 16)
 
 def lens(front=DOME, outline=ROUND):
     """A back that falls towards the rim, so that light of 60 degrees meets it."""
-    return Lens(front, net(lambda x, y: -6 * (x**2 + y**2) / 35**2, 24.0, half=35.0), outline, 1.5)
+    return Lens.between(front, net(lambda x, y: -6 * (x**2 + y**2) / 35**2, 24.0, half=35.0), outline, 1.5)
 
 
 @pytest.mark.parametrize("face", [DOME.face, Conic(8.0, 0.05, -2.0)], ids=lambda face: face.kind)
@@ -87,7 +87,7 @@ def test_the_underside_of_a_dome_ends_at_its_rim_in_space():
     """The outline of a dome is a circle of its chart, 30.7 mm here; seen along the axis its rim has 20 mm sin 75°."""
     lit = SphereChart(20.0).length(math.radians(75.0))
     back = RadialSurface.sphere(0.0, 20.0, (1.1 * lit, 1.1 * lit), (33, 33))
-    dome = Lens(DOME, back, Circle(lit), 1.5, clear=(Circle(EDGE), Circle(lit)))
+    dome = Lens.between(DOME, back, Circle(lit), 1.5, clear=(Circle(EDGE), Circle(lit)))
     [light] = simulate_plain([(1.0, PointSource(), dome, 1)], [SCREEN], 200)
     rim = 20.0 * math.sin(math.radians(75.0))
     within = [r * r / (r * r + PLANE**2) for r in (rim, EDGE)]

@@ -9,6 +9,7 @@ import torch
 
 from bstcad.optics.kernels.forward import land
 from bstcad.optics.lens.interfaces import cross
+from bstcad.optics.lens.passes import MIRROR
 from bstcad.optics.light.channels import Channel, channels_of, drawn_channels
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.point import PointSource
@@ -48,7 +49,11 @@ def transfer(lens, state, z, sense):
 
 @pytest.mark.parametrize(
     ("lens", "sense"),
-    [(curved(), 1), (curved(Sphere(1.0, -0.04), 1.7), 1), (replace(curved(), front=Plane(0.0), reflects=True), -1)],
+    [
+        (curved(), 1),
+        (curved(Sphere(1.0, -0.04), 1.7), 1),
+        (replace(curved(), passes=MIRROR).with_front(Plane(0.0)), -1),
+    ],
     ids=("lens", "strong lens", "mirror"),
 )
 def test_etendue_is_conserved_ray_by_ray(lens, sense):
@@ -137,7 +142,7 @@ def test_a_disc_behind_a_pinhole_makes_its_own_image(tilt):
 
 def test_a_flat_mirror_shows_a_chip_as_large_as_the_distances_say():
     """Each place of the mirror is a pinhole: the image of a rectangle w x h has the variances w²/12 and h²/12."""
-    mirror = lens_of(net(z=0.0, half=11.0), Plane(-3.0), reflects=True)
+    mirror = lens_of(net(z=0.0, half=11.0), Plane(-3.0), passes=MIRROR)
     chip = PointSource((0.0, 0.0, 50.0), profile="uniform", half_angle=40.0, width=4.0, height=2.0)
     found = images(channels_of(chip, lambda nm: 1.0, 64), mirror, Screen(150.0, (-60.0, 60.0), (-60.0, 60.0), 120))
     variances = (found.offset**2 * found.flux).sum((1, 2)) / found.flux.sum()  # pixels of 1 mm

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import MIRROR
 from bstcad.optics.light.channels import Channel, SourceSampler, drawn_channels, given_channels
 from bstcad.optics.light.measured_rays import PARTS, MeasuredRays, RayOrder
 from bstcad.optics.light.point import PointSource
@@ -22,7 +23,7 @@ from bstcad.photometry.ray_set import RaySet
 from tests.lenses import wavy
 
 UPRIGHT = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-SLAB = Lens(Plane(5.0), Plane(9.0), Circle(10.0), 1.5)
+SLAB = Lens.between(Plane(5.0), Plane(9.0), Circle(10.0), 1.5)
 
 
 class Given(MeasuredRays):
@@ -114,9 +115,9 @@ def test_rays_and_their_model_light_a_tilted_plane_alike(sense):
     point = PointSource((1.0, 2.0, 0.0), 550.0, rays=lamp, tilt=(8.0, -5.0), rotate=35.0)
     assert np.allclose(lamp.facts.origin, (0.4, -0.7, 0.3), atol=1e-4) and lamp.facts.extent is None
     z = 20.0 * sense
-    lens = Lens(Plane(z), Plane(z + 3.0), Circle(100.0), 1.5)
+    lens = Lens.between(Plane(z), Plane(z + 3.0), Circle(100.0), 1.5)
     if sense < 0:
-        lens = Lens(Plane(z - 3.0), Plane(z), Circle(100.0), 1.0, reflects=True)
+        lens = Lens.between(Plane(z - 3.0), Plane(z), Circle(100.0), 1.0, passes=MIRROR)
     [strip] = [*launch_strips(point.bundle(0), lens, 200, seed=1)][:1]
     axes = torch.tensor(point.file_axes(sense), dtype=torch.float64)
     own = axes @ (torch.stack([*strip.position[:2], strip.above(0.0)]) - torch.tensor([[1.0], [2.0], [0.0]]))
@@ -141,7 +142,7 @@ def test_rays_and_their_model_light_a_tilted_plane_alike(sense):
 
 def test_a_lens_judged_by_rays_is_the_lens_judged_by_their_source():
     """A Lambertian disc of 1 mm, and a file of its rays: RRMSD and ledger agree within their noise."""
-    lens = Lens(Plane(14.0), wavy(), Circle(10.0), 1.5)
+    lens = Lens.between(Plane(14.0), wavy(), Circle(10.0), 1.5)
     screen = Screen(300.0, (-60.0, 60.0), (-60.0, 60.0), 12)
     target = np.ones((12, 12))
     disc = PointSource((0.0, 0.0, 0.0), 550.0, diameter=1.0)

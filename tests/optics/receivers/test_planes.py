@@ -11,6 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bstcad.optics.lens.interfaces import cross
+from bstcad.optics.lens.passes import LENS, MIRROR
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.point import PointSource
@@ -37,7 +38,7 @@ ALL = pytest.mark.parametrize("light", LIGHTS)
 
 def optic(size, reflects):
     back = net(lambda x, y: size * torch.cos(0.3 * x + 1) * torch.sin(0.4 * y + 2), 8.0, 33)
-    return lens_of(back, Plane(0.0) if reflects else Sphere(0.0, 0.01), reflects=reflects)
+    return lens_of(back, Plane(0.0) if reflects else Sphere(0.0, 0.01), passes=MIRROR if reflects else LENS)
 
 
 def coming_through(light):
@@ -61,7 +62,7 @@ def test_the_axes_are_those_of_space_turned_about_x_then_about_y(tilt):
 def test_rays_land_on_the_plane(light, z):
     """n · (P - C) = 0 in space, P on the ray, and x and y on the plane lead back to P; also far from the origin."""
     coming, lens = coming_through(light)
-    lens = replace(lens, front=lens.front.moved(z), back=replace(lens.back, z=lens.back.z + z))
+    lens = lens.with_front(lens.front.moved(z)).with_back(replace(lens.back, z=lens.back.z + z))
     plane = TiltedPlane((30.0, -5.0, 300.0 + z), TILT)
     leaving = cross(replace(coming, z=coming.z + z), lens.last_tailored).rays
     landed = plane.to(leaving)
@@ -111,7 +112,7 @@ def test_the_gradient_of_the_merit_is_its_derivative(light):
     change = net(lambda x, y: torch.cos(1.1 * x + 2) * torch.sin(0.9 * y + 1), m=33).heights
 
     def value(heights):
-        return merit(merit.landing(replace(lens, back=replace(lens.back, heights=heights))))[0]
+        return merit(merit.landing(lens.with_back(replace(lens.back, heights=heights))))[0]
 
     heights, step = lens.back.heights.clone().requires_grad_(), 1e-6
     (g,) = torch.autograd.grad(value(heights), heights)

@@ -32,7 +32,7 @@ def sag(x, y):
 @pytest.fixture(scope="module")
 def plate():
     surface = net(sag, BACK, 129, 1.05 * HALF)
-    return Lens(Plane(0.0), surface, Rectangle(2 * HALF, 2 * HALF), N), Channel(
+    return Lens.between(Plane(0.0), surface, Rectangle(2 * HALF, 2 * HALF), N), Channel(
         CollimatedSource(Rectangle(2 * HALF, 2 * HALF), z=0.0, wavelength=587.6), N
     )
 

@@ -87,7 +87,7 @@ def test_a_ray_that_turns_back_does_not_land(form):
     and moves away from the screen; its line meets the screen's plane only behind it."""
     back = tilted(-math.tan(math.radians(20)))
     leaving = bundle([[-3.0, 0.0, 19.0]], [[math.sin(math.radians(60)), 0.0, math.cos(math.radians(60))]])
-    lens = Lens(Plane(15.0), back, SQUARE, 1.5)
+    lens = Lens.between(Plane(15.0), back, SQUARE, 1.5)
     at_back, z_x, z_y = heading(leaving, back)
     turned = deflect(at_back, z_x, z_y, Refract(1.5, 1.0)).rays.direction[:, 0].tolist()
     leaves = math.degrees(math.asin(1.5 * math.sin(math.radians(40))))
@@ -100,7 +100,7 @@ def test_axial_closed_form_is_the_newton_answer():
     axial = CollimatedSource(Circle(12.0)).rays_through(x, y, 8.0, 1.0)
     searched = replace(axial, axial=False)
     for front in (Plane(8.0), Sphere(8.0, -0.03)):
-        lens = Lens(front, wavy(), SQUARE, N)
+        lens = Lens.between(front, wavy(), SQUARE, N)
         closed, newton = (
             from_first_net_plain(trace.to_first_net(b, lens), lens, LevelPlane(1000.0)) for b in (axial, searched)
         )
@@ -115,7 +115,7 @@ def test_axial_closed_form_is_the_newton_answer():
 def test_a_plane_parallel_plate_shifts_and_does_not_turn():
     """Lateral shift t sin θ (1 - cos θ / (n cos θ')), the textbook's."""
     rays, thickness = from_point(half=6.0), 5.0
-    lens = Lens(Plane(15.0), net(z=15.0 + thickness), SQUARE, N)
+    lens = Lens.between(Plane(15.0), net(z=15.0 + thickness), SQUARE, N)
     at_back, z_x, z_y = heading(trace.to_first_net(rays, lens), lens.back)
     out = deflect(at_back, z_x, z_y, Refract(N, 1.0)).rays
     assert out.alive.all()
@@ -137,7 +137,7 @@ def test_paraxial_rays_follow_the_transfer_matrix(curvature, z):
     """Curved front, flat back: power (n - 1) c; with thickness t the ray of height h lands at
     h (1 - (n - 1) c t / n) - h (n - 1) c (z - z_back); the focus is f - t / n behind the back, f = 1 / ((n - 1) c)."""
     thickness, power = 6.0, (N - 1) * curvature
-    lens = Lens(Sphere(14.0, curvature), net(), SQUARE, N)
+    lens = Lens.between(Sphere(14.0, curvature), net(), SQUARE, N)
     h = torch.tensor([1e-3, 2e-3], dtype=torch.float64)
     rays = CollimatedSource(Circle(5.0)).rays_through(h, -h, 0.0, 1.0)
     expected = h * (1 - power * thickness / N) - h * power * (z - 20.0)
@@ -154,7 +154,7 @@ def test_a_prism_deviates_by_its_closed_form():
     slope = 0.3
     x, y = sampling.grid(SQUARE, 5)
     rays = CollimatedSource(Circle(30.0)).rays_through(x, y, 0.0, 1.0)
-    landed = trace.trace(rays, Lens(Plane(8.0), tilted(slope), SQUARE, N), LevelPlane(1000.0))
+    landed = trace.trace(rays, Lens.between(Plane(8.0), tilted(slope), SQUARE, N), LevelPlane(1000.0))
     tilt = math.atan(slope)
     turn = math.asin(N * math.sin(tilt)) - tilt
     # normal (-s, 0, 1): leaving glass the ray bends away from the normal, to +x
@@ -173,7 +173,7 @@ def test_gradient_in_curvature_net_and_start_is_finite_differences(kind, curvatu
     source = PointSource() if kind == "point" else CollimatedSource(Circle(12.0))
 
     def landing(heights, curvature, x, y):
-        lens = Lens(Sphere(15.0, curvature), replace(start, heights=heights), SQUARE, N)
+        lens = Lens.between(Sphere(15.0, curvature), replace(start, heights=heights), SQUARE, N)
         return trace.trace(source.rays_through(x, y, 15.0, 1.0), lens, LevelPlane(60.0)).position
 
     x, y = (a.reshape(-1).requires_grad_() for a in stratified(Rectangle(12.0, 12.0), 2, 0))

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.lens.passes import MIRROR
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.point import PointSource
 from bstcad.optics.light.wavefront import PlaneWave, SphericalWave, ZernikeWave, path_from_sphere
@@ -37,17 +38,17 @@ def bumps(size, phase, z, m):
 
 def plano_hyperbolic():
     """Collimated to a focus F behind the back: a hyperboloid of constant -n² (Hecht, Optics, 5.2.1)."""
-    return Lens(Plane(10.0), Conic(20.0, -1 / (F * (N - 1)), -(N**2)), ROUND, N)
+    return Lens.between(Plane(10.0), Conic(20.0, -1 / (F * (N - 1)), -(N**2)), ROUND, N)
 
 
 def collimating():
     """A point F before the front, whose light is parallel in the glass: the same hyperboloid, turned round."""
-    return Lens(Conic(10.0, 1 / (F * (N - 1)), -(N**2)), FLAT, ROUND, N)
+    return Lens.between(Conic(10.0, 1 / (F * (N - 1)), -(N**2)), FLAT, ROUND, N)
 
 
 def focusing():
     """Parallel light to a focus F behind the front: an ellipsoid of constant -1/n², then a sphere about that."""
-    return Lens(Conic(10.0, N / (F * (N - 1)), -1 / N**2), Sphere(20.0, 1 / (F - 10.0)), ROUND, N)
+    return Lens.between(Conic(10.0, N / (F * (N - 1)), -1 / N**2), Sphere(20.0, 1 / (F - 10.0)), ROUND, N)
 
 
 LAMP = PointSource((0.0, 0.0, 10.0 - F), wavelength=NM, profile="uniform", half_angle=4.5)
@@ -57,12 +58,12 @@ STIGMATIC = {
     "an elliptic front": (focusing(), BEAM, SphericalWave((0.0, 0.0, 10.0 + F), 30.0)),
     "behind the focus": (plano_hyperbolic(), BEAM, SphericalWave((0.0, 0.0, 20.0 + F), 300.0)),
     "a parabolic mirror": (
-        Lens(Plane(0.0), Conic(10.0, 1 / (2 * F), -1.0), ROUND, 1.0, reflects=True),
+        Lens.between(Plane(0.0), Conic(10.0, 1 / (2 * F), -1.0), ROUND, 1.0, passes=MIRROR),
         replace(LAMP, position=(0.0, 0.0, 10.0 + F)),
         PlaneWave(200.0),
     ),
     "a beam across a plate": (
-        Lens(Plane(10.0), FLAT, ROUND, N),
+        Lens.between(Plane(10.0), FLAT, ROUND, N),
         replace(BEAM, tilt=(3.0, -5.0)),
         PlaneWave(30.0, replace(BEAM, tilt=(3.0, -5.0)).axes[2]),
     ),
@@ -107,7 +108,7 @@ def test_a_focus_moved_sideways_is_a_tilt(moved):
 
 
 def test_a_beam_that_leans_is_late_on_the_side_it_leans_to():
-    lens = Lens(Plane(10.0), FLAT, ROUND, N)
+    lens = Lens.between(Plane(10.0), FLAT, ROUND, N)
     source = replace(BEAM, tilt=(0.0, 0.01))  # degrees, towards +x
     found = wavefront_error(source, lens, PlaneWave(30.0), 256)
     sin = source.axes[2][0]
@@ -120,14 +121,14 @@ def test_a_beam_that_leans_is_late_on_the_side_it_leans_to():
 
 def test_a_stated_wave_is_missed_by_itself_on_its_circle_alone():
     """A plane wave where c_4 = 0.25 waves RMS is wanted."""
-    lens = Lens(Plane(10.0), FLAT, ROUND, N)
+    lens = Lens.between(Plane(10.0), FLAT, ROUND, N)
     wave = ZernikeWave((0.0, 0.0, 0.0, 0.25), 8.0, 30.0)
     found = wavefront_error(BEAM, lens, wave, 512)
     assert found.without_tilt.rms == pytest.approx(0.25, rel=5e-3)
     assert found.flux == pytest.approx(0.64, rel=5e-3) and np.abs(found.x).max() == pytest.approx(8.0, abs=0.05)
 
 
-BUMPY = Lens(bumps(0.02, 0.3, 10.0, 17), bumps(-0.03, 1.1, 20.0, 23), ROUND, N)
+BUMPY = Lens.between(bumps(0.02, 0.3, 10.0, 17), bumps(-0.03, 1.1, 20.0, 23), ROUND, N)
 
 
 @pytest.mark.parametrize("source", [
@@ -168,14 +169,14 @@ def test_the_map_has_the_slopes_of_the_rays():
 
 def test_figures_do_not_depend_on_where_the_scene_stands():
     away = 1e5
-    lens = replace(BUMPY, front=BUMPY.front.moved(10.0 + away), back=BUMPY.back.moved(20.0 + away))
+    lens = BUMPY.with_front(BUMPY.front.moved(10.0 + away)).with_back(BUMPY.back.moved(20.0 + away))
     here = wavefront_error(BEAM, BUMPY, PlaneWave(30.0), 64)
     there = wavefront_error(BEAM, lens, PlaneWave(30.0 + away), 64)
     assert there.without_tilt.rms == pytest.approx(here.without_tilt.rms, rel=1e-6)
 
 
 def test_losses_and_lost_rays_count_in_the_flux():
-    narrow = replace(BUMPY, clear=(ROUND, Circle(5.0)))
+    narrow = BUMPY.with_clear((ROUND, Circle(5.0)))
     found = wavefront_error(BEAM, narrow, PlaneWave(30.0), 128)
     assert found.flux == pytest.approx(0.25, rel=0.02) and np.abs(found.x).max() < 5.5
 

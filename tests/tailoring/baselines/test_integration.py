@@ -50,7 +50,7 @@ class Known:
         x, y = torch.meshgrid(line, line, indexing="ij")
         if self.front is None:
             return self.source.rays_through(x, y, self.face.z, 1.0)
-        lens = Lens(self.front, net(z=self.face.z), WIDE, self.law.n_in)
+        lens = Lens.between(self.front, net(z=self.face.z), WIDE, self.law.n_in)
         return to_first_net(self.source.rays_through(x, y, self.front.z, 1.0), lens)
 
     def aims(self, coming):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import torch
 
+from bstcad.optics.lens import passes
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.point import PointSource
 from bstcad.optics.receivers.irradiance import Screen
@@ -23,7 +24,7 @@ def lens(front=None, outline=SQUARE, **more):
     return lens_of(waved(), front or Sphere(12.0, -0.01), outline, 1.49, **more)
 
 
-MIRROR = lens(Plane(0.0), reflects=True)
+MIRROR = lens(Plane(0.0), passes=passes.MIRROR)
 SCREEN = Screen(400.0, (-30.0, 30.0), (-20.0, 20.0), (48, 32))
 TILTED = replace(SCREEN, x=(-48.0, -34.0), y=(-34.0, -20.0), pixels=32, tilt=(20.0, -15.0))
 WIDE = replace(SCREEN, x=(-120.0, 90.0), y=(-90.0, 110.0))

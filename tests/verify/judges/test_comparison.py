@@ -74,7 +74,7 @@ class TestStandIn:
 
         def trace(glass, channels, screen, rays, seed):
             if wrong == "a turned lens":
-                glass = replace(glass, back=replace(glass.back, heights=glass.back.heights.T.contiguous()))
+                glass = glass.with_back(replace(glass.back, heights=glass.back.heights.T.contiguous()))
             traced = honest(glass, channels, screen, rays, seed)
             return replace(traced, halves=traced.halves * {"lost light": 0.99, "no light": 0.0}.get(wrong, 1.0))
 
@@ -114,7 +114,7 @@ def test_a_wrong_lens_fails(monkeypatch, wrong):
             return glass, [replace(channel, index=channel.index + 0.01) for channel in channels]
         heights, along = glass.back.heights, torch.linspace(-1, 1, glass.back.m, dtype=torch.float64)
         off = 0.005 * (along[:, None] ** 2 - along**2) if wrong != "turned" else heights.T - heights
-        return replace(glass, back=replace(glass.back, heights=heights + off)), channels
+        return glass.with_back(replace(glass.back, heights=heights + off)), channels
 
     trace = batoid.trace
     monkeypatch.setattr(

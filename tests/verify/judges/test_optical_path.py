@@ -26,7 +26,7 @@ SOURCES = {
 
 
 def two_nets():
-    return Lens(waved(10.0, 33, 0.03, 0.4), waved(20.0, 41, -0.05, 1.1), APERTURE, 1.49)
+    return Lens.between(waved(10.0, 33, 0.03, 0.4), waved(20.0, 41, -0.05, 1.1), APERTURE, 1.49)
 
 
 @pytest.fixture
