@@ -27,7 +27,7 @@ from bstcad.commands import OwnCheck, OwnSection, ProofOptions
 from bstcad.designs import folder as folders
 from bstcad.designs import pipeline
 from bstcad.designs.course import BY_HAND, DesignCourse
-from bstcad.designs.made import Made, same_front
+from bstcad.designs.designed_lens import DesignedLens, same_front
 from bstcad.figures.drawing import png
 from bstcad.figures.light_figures import View, irradiance_triptych
 from bstcad.manufacture.measured.compensation import CompensationSettings as CompensationSettings
@@ -39,6 +39,7 @@ from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.sides import as_pair, simplified, size_text
 from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.optics.trace.measure import Effort, tubes_picture
+from bstcad.planning.net_choice import with_net
 from bstcad.report import record
 from bstcad.report.record import Report, rrmsds
 from bstcad.report.units import number, quantity
@@ -77,7 +78,7 @@ def design(
         warnings.warn(warning, stacklevel=2)
     processes.keep_freed()
     with progresses.for_script(progress) as shown:
-        scene = commands.with_default_net(scene, lambda line: shown("control points", 1, 1, line))
+        scene, _ = with_net(scene, lambda line: shown("control points", 1, 1, line))
         hooks, options = Hooks(progress=shown), pipeline.DesignOptions(merit, compare_later=True)
         return Design(pipeline.design(scene, device=device, hooks=hooks, options=options, began=began))
 
@@ -101,7 +102,7 @@ class Design:
     `verify` reads the files of the folder to which the design was last written, or from which it was opened.
     """
 
-    def __init__(self, made: Made, report: Report | None = None, folder: Path | None = None) -> None:
+    def __init__(self, made: DesignedLens, report: Report | None = None, folder: Path | None = None) -> None:
         self._made = made
         self.report = report  # report of the last verification; None: not verified yet
         self.folder = folder  # folder of the design's files; None: not written yet
@@ -141,7 +142,7 @@ class Design:
         """
         self.scene.lens.require_heights("with_lens")
         scene, lens = _adapted(lens, self._made.scene, self.lens.front)
-        made = replace(self._made, scene=scene, lens=scene.as_mounted(lens), making=DesignCourse(stopped=BY_HAND))
+        made = replace(self._made, scene=scene, lens=scene.as_mounted(lens), course=DesignCourse(stopped=BY_HAND))
         return Design(replace(made, transport=None, precision_comparison=None))
 
     def with_heights(self, heights: Any) -> Design:
@@ -368,8 +369,7 @@ class Design:
         """
         from bstcad.manufacture.tolerance.as_made import as_made  # loaded late, as in commands.tolerance
 
-        made = self._made
-        return as_made(made.scene, made.lens, made.goals, grade=grade, layer_height=layer_height)
+        return as_made(self._made, grade, layer_height)
 
     def lit_by(self, light: str, *, distance: float | None = None) -> LitBy:
         """Predict the pictures of the lens in another light: "sun", "lamp", "led" or "phone" (the flashlight of one).
@@ -379,7 +379,7 @@ class Design:
         """
         from bstcad.manufacture.tolerance.lit_by import lit_by  # loaded late, as in commands.tolerance
 
-        return lit_by(self._made.scene, self._made.lens, self._made.goals, name=light, distance=distance)
+        return lit_by(self._made, light, distance)
 
     def show(self, png: AnyPath | None = None) -> None:
         """Draw the lens with rays and screen in the file `png` or, if None, in a window; return once it is closed."""
@@ -409,7 +409,7 @@ class Design:
         """Return the folder with the files of this design; SceneError if there is none."""
         if self.folder is None or not self._has_files():
             raise SceneError(f"{self.scene.name}: this design has no files yet; write it to a folder first")
-        if not self._made.is_lens_of(folders.read_nominal(self.folder)[1]):
+        if not self._made.is_lens_of(folders.read_nominal(self.folder)):
             raise SceneError(f"{self.folder}: the folder now contains another design; write this one elsewhere")
         return self.folder
 
@@ -442,9 +442,9 @@ class Design:
         if self.report is not None:
             where = f", in {self.folder}" if self.folder else ""
             return f"RRMSD {rrmsds(self.report.contents)}, {self.report.verdict}{where}"
-        if self._made.making.stopped == BY_HAND:
+        if self._made.course.stopped == BY_HAND:
             return "changed by hand; not verified yet"
-        values = [stage.rrmsd for stage in self._made.making.stages if stage.rrmsd is not None]
+        values = [stage.rrmsd for stage in self._made.course.stages if stage.rrmsd is not None]
         return f"RRMSD {number(values[-1])} as tailored; not verified yet" if values else "not verified yet"
 
     def _irradiance(self, number: int = 0) -> np.ndarray:

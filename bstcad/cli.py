@@ -102,6 +102,7 @@ with signals.exit_on_signal():  # loading these libraries takes a quarter of a s
 
 if TYPE_CHECKING:
     from bstcad.planning.batch import BatchScene
+    from bstcad.planning.net_choice import Choice
     from bstcad.report.record import Contents, Examined
     from bstcad.scene.scene import Scene
 
@@ -208,6 +209,14 @@ def warn(scene: Scene, where: str = "") -> None:
         note_on_stderr(f"warning: {where}{warning}")
 
 
+def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
+    """Print the warnings of a scene and the line on a chosen net; return the scene with its net, and the Choice."""
+    from bstcad.planning import net_choice
+
+    warn(scene)
+    return net_choice.with_net(scene, note_on_stderr)
+
+
 def note_on_stderr(line: str) -> None:
     """Print a line on stderr, such as the chosen net, the size of a file, or the plan of a batch."""
     print(f"bstcad: {line}", file=sys.stderr, flush=True)
@@ -256,8 +265,7 @@ def generate(
     folder = output or user_path(Path("outputs") / wanted.name)
     files.check_free(folder)
     commands = load_commands()
-    warn(wanted)
-    wanted = commands.with_default_net(wanted, note_on_stderr)
+    wanted, _ = with_net(wanted)
     if commands.folders.step_size(wanted) >= commands.folders.LARGE_STEP:
         note_on_stderr(commands.folders.size_sentence(wanted))
     with progress.watch(Console(stderr=True)) as watched:
@@ -287,7 +295,6 @@ def plan(
         wanted = load_scene(scene, settings)
         from bstcad import commands
         from bstcad.designs import folder as folders
-        from bstcad.planning.net_choice import with_net
         from bstcad.planning.plan import plan as planned
         from bstcad.planning.plan import reach_drawn
         from bstcad.report import report as reports
@@ -296,10 +303,7 @@ def plan(
 
     if made is not None and made not in GRADE_NAMES:
         raise SceneError(f"--made {made}: unknown grade; give one of {', '.join(GRADE_NAMES)}")
-    warn(wanted)
     wanted, choice = with_net(wanted)
-    if choice is not None:
-        note_on_stderr(choice.line)
     given = wanted, scene.read_text(encoding="utf-8-sig"), [setting.partition("=")[0] for setting in settings or []]
     drawn = () if png is None else reach_drawn(wanted)
     parts = planned(*given)

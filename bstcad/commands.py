@@ -28,7 +28,7 @@ from bstcad.cad.tiling import Tiling
 from bstcad.designs import folder as folders
 from bstcad.designs.as_designed import scene_text
 from bstcad.designs.course import StageRecord
-from bstcad.designs.made import Made
+from bstcad.designs.designed_lens import DesignedLens
 from bstcad.designs.pipeline import DesignState, design, purpose
 from bstcad.exports import data_sheet, exports
 from bstcad.exports.data_sheet import DataSheet
@@ -39,7 +39,7 @@ from bstcad.figures import rendering
 from bstcad.figures.drawing import png as rendered
 from bstcad.figures.figure_jobs import NoPictures, Pictures, draw_convergence, draw_light, draw_wavefront, light_path_of
 from bstcad.figures.light_figures import View, changed_picture, draw_judges, draw_part
-from bstcad.figures.photometric_figures import draw_isolux, far_field_of
+from bstcad.figures.photometric_figures import draw_isolux
 from bstcad.figures.rendering import RayPath
 from bstcad.manufacture.measured import cloud as clouds
 from bstcad.manufacture.measured import made_part
@@ -54,7 +54,7 @@ from bstcad.manufacture.tolerance import tolerances
 from bstcad.manufacture.tolerance.tolerances import Tolerances
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.trace.measure import FULL, Effort, Light, SpectralLine
-from bstcad.planning.effect_estimates import diagnosis, left_out
+from bstcad.planning.effect_estimates import diagnosis, left_out, simulated
 from bstcad.planning.net_choice import with_net
 from bstcad.report import prescription, record, report
 from bstcad.report.goal_figures import GoalFigures, figures_of, photometry
@@ -87,7 +87,7 @@ TILE_FILES = "tile-*-*.step", "toolpath-raster*tile-*-*.*", "heightmap-tile-*-*.
 # In a run with a time limit: time reserved for the report, and smallest time for the rays of the verification (s).
 REPORT_TIME, MIN_RAY_TIME = 2.0, 0.5
 
-Drawing = Callable[..., Pictures]  # class that draws figures; called with (scene, processes.submit)
+Drawing = Callable[..., Pictures]  # class that draws figures; called with (design, processes.submit)
 # Functions of a script that add to a report: checks, from (proof, folder of the files), or a section (heading, HTML).
 OwnCheck = Callable[[Proof, Path], Iterable[Check]]
 OwnSection = Callable[[Contents], tuple[str, str]]
@@ -119,7 +119,7 @@ def generate(
     During the design a checkpoint is written beside `folder` at intervals; with `resume` the design continues from
     this checkpoint.  After a Ctrl-C the best lens so far is written to the folder that `output_folder` returns.
     """
-    scene = with_default_net(scene, lambda line: hooks.progress("control points", 1, 1, line))
+    scene, _ = with_net(scene, lambda line: hooks.progress("control points", 1, 1, line))
     _refuse_exports(scene)
     path, say = files.beside(folder, "checkpoint"), lambda text: hooks.progress("checkpoint", 0, 0, text)
     keeper = Keeper(path, purpose(scene, device), say, kind=DesignState)
@@ -138,20 +138,12 @@ def generate(
                 found = design(scene, device=device, hooks=hooks, began=began, start=state)
         with _checkpoint_on_error(keeper):
             options = replace(options, limit=scene.tailoring.max_time)
-            report = write(found, output_folder(folder, found.making.stopped or ""), options, hooks.progress)
-        if found.making.stopped == "interrupt":
+            report = write(found, output_folder(folder, found.course.stopped or ""), options, hooks.progress)
+        if found.course.stopped == "interrupt":
             keeper.flush()
         else:
             keeper.remove()
     return report
-
-
-def with_default_net(scene: Scene, say: Callable[[str], None] = lambda line: None) -> Scene:
-    """Return the scene with its net, or with a chosen net if it states none; `say` receives a line on the choice."""
-    scene, choice = with_net(scene)
-    if choice is not None:
-        say(choice.line)
-    return scene
 
 
 def output_folder(folder: Path, stopped: str) -> Path:
@@ -161,13 +153,15 @@ def output_folder(folder: Path, stopped: str) -> Path:
     """
     if stopped != "interrupt" or not (folder / "report.json").exists():
         return folder
-    if record.making(folder / "report.json").stopped == "interrupt":
+    if record.read_course(folder / "report.json").stopped == "interrupt":
         return folder
     folder = folder.resolve()
     return folder.with_name(f"{folder.name}-unfinished")
 
 
-def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), progress: Progress = no_progress) -> Report:
+def write(
+    made: DesignedLens, folder: Path, options: ProofOptions = ProofOptions(), progress: Progress = no_progress
+) -> Report:
     """Write a design to `folder`, replacing an earlier design, and verify the written files.
 
     If it cannot be written or verified, a note on the error names another folder with its design.npz and scene.
@@ -177,7 +171,7 @@ def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), prog
         folders.kept_if_unwritten(made, folder),
         folders.replacing(folder) as building,
         _second_process_ended(),
-        (options.drawing or Pictures)(made.scene, processes.submit) as drawn,
+        (options.drawing or Pictures)(made, processes.submit) as drawn,
     ):
         made, proof = _write_and_prove(made, building, drawn, options, progress=progress)
         proven = time.perf_counter()
@@ -191,7 +185,7 @@ def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), prog
         progress("report", 0, 1, "")
         estimates = _left_out(made, proof)  # while the second process draws the pictures
         drawn.result()
-        made = replace(made, making=made.making.with_stages(StageRecord("report", time.perf_counter() - proven)))
+        made = replace(made, course=made.course.with_stages(StageRecord("report", time.perf_counter() - proven)))
         contents = replace(record.with_failures(_contents(made, proof, estimates), exported.failures), order=order)
         drawn.begin(draw_convergence, contents)
         _write_report(made, proof.lens, contents, building, drawn=drawn, options=options)
@@ -200,19 +194,19 @@ def write(made: Made, folder: Path, options: ProofOptions = ProofOptions(), prog
     return Report(contents, irradiances, notes=tuple(exported.notes))
 
 
-def prove(made: Made, options: ProofOptions = ProofOptions(), progress: Progress = no_progress) -> Report:
+def prove(made: DesignedLens, options: ProofOptions = ProofOptions(), progress: Progress = no_progress) -> Report:
     """Write a design to a temporary folder, verify these files, and return the report."""
     processes.begin()
     with tempfile.TemporaryDirectory(prefix="bstcad-") as folder, _second_process_ended():
-        drawn = NoPictures(made.scene, processes.submit)
+        drawn = NoPictures(made, processes.submit)
         made, proof = _write_and_prove(made, Path(folder), drawn, options, progress=progress)
     contents = _contents(made, proof, _left_out(made, proof))
     return Report(contents, tuple(light.picture for light in proof.lights))
 
 
 def _write_and_prove(
-    made: Made, folder: Path, drawn: Pictures, options: ProofOptions, progress: Progress
-) -> tuple[Made, Proof]:
+    made: DesignedLens, folder: Path, drawn: Pictures, options: ProofOptions, progress: Progress
+) -> tuple[DesignedLens, Proof]:
     """Write the geometry to `folder` and verify it; return (design with the times of both stages, its proof)."""
     made = replace(made.with_report_data(), stored=None, lit=())  # design.npz is written again
     processes.return_freed()  # the second process needs the memory for the solid
@@ -227,7 +221,7 @@ def _write_and_prove(
         progress("write", 1, 1, "")
         written = time.perf_counter()
         if options.limit is not None:
-            left = options.limit - REPORT_TIME - made.making.seconds_total - (written - began)
+            left = options.limit - REPORT_TIME - made.course.seconds_total - (written - began)
             effort = options.effort or FULL
             options = replace(options, effort=replace(effort, seconds=min(effort.seconds, max(left, MIN_RAY_TIME))))
         proof = _prove_files(made, folder, drawn, options, progress=progress)
@@ -239,10 +233,10 @@ def _write_and_prove(
         StageRecord("write", written - began),
         StageRecord("verify", verified - written, max(light.rrmsd for light in proof.lights)),
     )
-    return replace(made, making=made.making.with_stages(*last)), proof
+    return replace(made, course=made.course.with_stages(*last)), proof
 
 
-def _prove_files(made: Made, folder: Path, drawn: Pictures, options: ProofOptions, progress: Progress) -> Proof:
+def _prove_files(made: DesignedLens, folder: Path, drawn: Pictures, options: ProofOptions, progress: Progress) -> Proof:
     """Verify the files in a folder and start drawing the pictures of the light; return the proof."""
     progress("verify", 0, 1, "from the written files")
 
@@ -325,7 +319,7 @@ def verify(
             made.scene.lens.require_heights("--against" if against else "--measured")
         with scene_errors():  # reads the cloud first, since the next steps are slow
             cloud, part = clouds.load(measured, made.lens.apertures[1]) if measured else None, None
-        with (options.drawing or Pictures)(made.scene, processes.submit) as drawn:
+        with (options.drawing or Pictures)(made, processes.submit) as drawn:
             with scene_errors(path):
                 proof = _prove_files(made, path, drawn, options, progress=progress)
             proof = replace(proof, checks=(*proof.checks, *checks.unit_checks(path)))
@@ -412,11 +406,11 @@ def examine(path: Path) -> Examined:
     return Examined(path.stem, str(path), words, passed, checks=found.checks, part=rows, placement=placement)
 
 
-def read(folder: Path) -> Made:
+def read(folder: Path) -> DesignedLens:
     """Read the design in a folder, with the stages and history of its making from report.json."""
-    scene, nominal = folders.read_nominal(folder)
-    making, sent = record.making(folder / "report.json"), folders.read_transport(folder, scene)
-    return Made(scene, nominal.lens, nominal.goals, making, transport=sent, stored=nominal.stored, lit=nominal.lit)
+    found = folders.read_nominal(folder)
+    course, sent = record.read_course(folder / "report.json"), folders.read_transport(folder, found.scene)
+    return DesignedLens(**vars(found), course=course, transport=sent)
 
 
 def _name_of(cloud: Cloud, folder: Path) -> str:
@@ -435,42 +429,52 @@ def _name_of(cloud: Cloud, folder: Path) -> str:
 # --- the report -------------------------------------------------------------------------------------------------------
 
 
-def _contents(made: Made, proof: Proof, estimates: tuple[LeftOut, ...]) -> Contents:
+def _contents(made: DesignedLens, proof: Proof, estimates: tuple[LeftOut, ...]) -> Contents:
     """Return the contents of report.json.  estimates: estimates of the neglected effects."""
     scene = made.scene
     alone, goal = scene.single_target_scenes()[proof.worst], made.goals[proof.worst]
-    diagnosed, facts = diagnosis(alone, made.making, proof, goal.picture), circumstances(made.device)
-    return contents_of(made, proof, making=made.making, circumstances=facts, estimates=estimates, diagnosis=diagnosed)
+    diagnosed, facts = diagnosis(alone, made.course, proof, goal.picture), circumstances(made.device)
+    return contents_of(
+        made, proof, course=made.course, circumstances=facts, simulated=[name for name, _ in simulated(scene)],
+        estimates=estimates, diagnosis=diagnosed,
+    )  # fmt: skip
 
 
-def _left_out(made: Made, proof: Proof) -> tuple[LeftOut, ...]:
+def _left_out(made: DesignedLens, proof: Proof) -> tuple[LeftOut, ...]:
     return left_out(made.scene.single_target_scenes()[proof.worst], proof.lens, proof.light.picture)
 
 
-def _order(made: Made, shape: Mapping[str, Any], folder: Path) -> Order:
+def _order(made: DesignedLens, shape: Mapping[str, Any], folder: Path) -> Order:
     """Return the data for ordering the lens of a design in a folder.  shape: shape of the lens as in report.json."""
-    mount, path = made.scene.mount, (folder / folders.PART).absolute()
+    scene, mount, path = made.scene, made.scene.mount, (folder / folders.PART).absolute()
     try:
         job = mount and path.is_file() and processes.submit(prescription.measured, path)
         found = processes.result(job, checks.time_limit(path)) if job else None
     except (BrokenExecutor, ValueError, processes.Overdue):  # the part is damaged, as its check states
         found = None
-    return prescription.order_of(made.scene, made.lens, shape, folder, found=found)
+    stated = scene.part.of(scene.lens)
+    return prescription.order_of(made.lens, shape, folder, stated=stated, mount=mount, found=found)
 
 
 def _sheet(
-    made: Made, proof: Proof | Contents, figures: Sequence[GoalFigures], irradiance: np.ndarray, *, order: Order
+    made: DesignedLens, proof: Proof | Contents, figures: Sequence[GoalFigures], irradiance: np.ndarray, *, order: Order
 ) -> DataSheet:
     """Return the data sheet of a design from its proof or report; irradiance: light on the first target."""
     light: dict[str, Any] = {"target": made.goals[0].picture, "irradiance": irradiance, "figures": figures}
     found: dict[str, Any] = {"shape": proof.shape, "passed": proof.passed, "version": bstcad.__version__}
-    found["photometry"] = proof.photometry if isinstance(proof, Contents) else tuple(photometry(made.scene, proof))
+    lumens, reflection = made.scene.source.luminous_flux, made.scene.loses_reflections
+    found["photometry"] = (
+        proof.photometry
+        if isinstance(proof, Contents)
+        else tuple(photometry(made.goals, proof, lumens, reflection=reflection))
+    )
     return DataSheet(scene=made.scene, designed=made.lens, order=order, **light, **found)
 
 
 def _write_report(
-    made: Made, lens: Lens, contents: Contents, folder: Path, drawn: Pictures, options: ProofOptions, studied: str = ""
-) -> None:
+    made: DesignedLens, lens: Lens, contents: Contents, folder: Path, *, drawn: Pictures, options: ProofOptions,
+    studied: str = "",
+) -> None:  # fmt: skip
     """Write the report as JSON, HTML and JUnit XML, with prescription.txt and figures/.
 
     lens: lens as read from lens.step.  studied: HTML of the report's section on tolerances.
@@ -597,7 +601,7 @@ def _cutting(settings: Mapping[str, Any]) -> Cutting:
     return Cutting(**settings)
 
 
-def _export_of_scene(made: Made, folder: Path) -> Exported:
+def _export_of_scene(made: DesignedLens, folder: Path) -> Exported:
     """Write the files of output.export that are possible for this lens; a remark of the report states the others."""
     return _export(made, made.scene.output.export, folder, strict=False)
 
@@ -622,19 +626,19 @@ def _cutting_of(scene: Scene, kinds: Sequence[str], cutting: Cutting = DEFAULTS)
 
 
 def _export(
-    made: Made, kinds: Sequence[str], folder: Path, *, points: int | None = None, cutting: Cutting = DEFAULTS,
+    made: DesignedLens, kinds: Sequence[str], folder: Path, *, points: int | None = None, cutting: Cutting = DEFAULTS,
     tiling: Tiling = exports.DEFAULT_TILING, strict: bool = True,
 ) -> Exported:  # fmt: skip
     scene, lens, cutting = made.scene, made.lens, _cutting_of(made.scene, kinds, cutting)
-    light = GridLight(scene.light.central, tuple(target.screen for target in scene.targets))
-    far = far_field_of(scene)
+    light = GridLight(made.emitter.central, tuple(goal.screen for goal in made.goals))
     return exports.export(
-        lens, kinds, folder, points=points, label=folders.label(scene), mount=scene.mount, light=light, far=far,
-        cutting=cutting, moulding=scene.moulding, part=scene.part.of(scene.lens), tiling=tiling, strict=strict,
+        lens, kinds, folder, points=points, label=folders.label(scene), mount=scene.mount, light=light,
+        far=made.far_field, cutting=cutting, moulding=scene.moulding, part=scene.part.of(scene.lens), tiling=tiling,
+        strict=strict,
     )  # fmt: skip
 
 
-def _sheet_again(made: Made, folder: Path) -> DataSheet:
+def _sheet_again(made: DesignedLens, folder: Path) -> DataSheet:
     with scene_errors():
         known = record.read(folder / "report.json")
     if known.shape is None or not (folder / "lens.step").is_file():
@@ -662,9 +666,8 @@ def show(folder: Path, png: Path | None) -> None:
 
 def light_path_in(folder: Path) -> RayPath:
     """Return the lens in a folder, rays through it, and its pictures; SceneError if no light reaches the target."""
-    scene, nominal = folders.read_nominal(folder)
-    wanted, irradiances = (goal.picture for goal in nominal.goals), folders.read_irradiances(folder, scene)
-    path = light_path_of(scene, nominal.lens, [*zip(wanted, irradiances, strict=True)])
+    nominal = folders.read_nominal(folder)
+    path = light_path_of(nominal, folders.read_irradiances(folder, nominal.scene))
     if path is None:
         raise SceneError(f"{folder}: no light reaches the target, so there is nothing to show; see report.html")
     return path

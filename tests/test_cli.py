@@ -40,9 +40,6 @@ class FakeCommands(types.ModuleType):
         hooks.progress("stage 1", 2, 2, "RRMSD 0.25")
         return self._report()
 
-    def with_default_net(self, scene, say):
-        return scene
-
     def verify(self, path, progress, against, **asked):
         self.calls.append((path, *against))
         return self._report()
@@ -63,6 +60,7 @@ def commands(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "bstcad.commands", fake)
     monkeypatch.setattr(bstcad, "commands", fake, raising=False)
     monkeypatch.setitem(sys.modules, "bstcad.report.report", report)
+    monkeypatch.setattr("bstcad.planning.net_choice.with_net", lambda scene, say: (scene, None))
     monkeypatch.chdir(tmp_path)
     return fake
 

@@ -91,7 +91,7 @@ def poor(folder, monkeypatch):
 @pytest.fixture(scope="module")
 def proof(small_design):
     """The proof of the small design."""
-    return checks.verify(small_design.folder, folders.read_nominal(small_design.folder)[1], effort=quick_effort())
+    return checks.verify(small_design.folder, folders.read_nominal(small_design.folder), effort=quick_effort())
 
 
 @pytest.fixture

@@ -13,7 +13,6 @@ import bstcad
 from bstcad import commands
 from bstcad.commands import ProofOptions
 from bstcad.designs import pipeline
-from bstcad.figures.photometric_figures import far_field_of
 from bstcad.manufacture.tolerance import tolerancing
 from bstcad.manufacture.tolerance.study import StudySettings
 from bstcad.optics.surfaces.radial import RadialSurface
@@ -103,7 +102,7 @@ def test_a_dome_is_designed_written_and_proved_from_its_files(designed):
         paths = again.export(kind)
         assert {path.name for path in paths} == names and all(path.stat().st_size > 100 for path in paths)
     assert (folder / "datasheet.pdf").stat().st_size > 1000
-    far = far_field_of(again.scene)
+    far = again._made.far_field
     leaving = report.flux["on target"] + report.flux["off target"]
     assert far.table(again.lens, rays=128).lumens == pytest.approx(1000.0 * leaving, rel=5e-3)  # ies, ldt and csv
     behind = far.rays(again.lens, 1 << 14)

@@ -26,6 +26,7 @@ from bstcad.report.units import about
 from bstcad.scene.errors import SceneError
 from bstcad.scene.target import Target
 from bstcad.verify.judges import faces, mitsuba
+from bstcad.verify.nominal import Nominal
 from tests import suite
 from tests.conftest import draws_nothing, quick_effort
 
@@ -229,7 +230,7 @@ def test_light_over_directions_is_stated_in_degrees(scene, tmp_path, monkeypatch
     assert words["Extent"] == "h ±20, v ±40 degrees"
     view = View.of(far)
     assert view.labels == ("h (degrees)", "v (degrees)") and np.ptp(view.tones(design.target, design.target)) == 0
-    shown = light_path_of(far, design.lens, [(design.target, design.target)])
+    shown = light_path_of(Nominal(far, design.lens, far.goals), [design.target])
     assert f"Target 40 × 80 degrees at {place}" in shown.words
 
 

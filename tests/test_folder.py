@@ -128,7 +128,8 @@ class TestReading:
         np.savez_compressed(path, **kept | arrays)
 
     def test_the_nominal_lens_is_the_designed_one(self, folder, small_scene):
-        scene, nominal = folders.read_nominal(folder)
+        nominal = folders.read_nominal(folder)
+        scene = nominal.scene
         assert scene == small_scene == load(folder / "scene.toml")
         with np.load(folder / "design.npz") as data:
             assert np.array_equal(nominal.lens.back.control_points(), data["control_points"])  # to the last bit
@@ -181,15 +182,16 @@ class TestReading:
 
 def test_what_is_written_is_what_is_read(small_design, small_scene, tmp_path):
     """design.npz of another lens: its own net and curvature come back to the last bit."""
-    scene, nominal = folders.read_nominal(small_design.folder)
+    nominal = folders.read_nominal(small_design.folder)
+    scene = nominal.scene
     g = torch.Generator().manual_seed(1)
     back = replace(nominal.lens.back, heights=torch.randn(33, 33, generator=g, dtype=torch.float64))
     lens = nominal.lens.with_back(back).with_front(Sphere(15.0, -0.0123456789))
-    design = folders.Made(scene, lens, nominal.goals)
+    design = folders.DesignedLens(scene, lens, nominal.goals)
     (tmp_path / "scene.toml").write_text(scene.toml())
     light = Light(nominal.goals[0].picture * 2, rrmsd=0.1, standard_error=0.01, rays=64, flux={}, picture_error=0.02)
     folders.write_design(design, [light], tmp_path)
-    again = folders.read_nominal(tmp_path)[1].lens
+    again = folders.read_nominal(tmp_path).lens
     assert np.array_equal(again.back.control_points(), lens.back.control_points())
     assert again.front == lens.front
     with zipfile.ZipFile(tmp_path / "design.npz") as archive:

@@ -80,7 +80,8 @@ def test_all_light_goes_through_the_dome_and_lands(dome):
 
 @suite.in_turn(0, 4)
 def test_the_dome_is_in_the_scene_and_in_the_step_file_of_its_design(dome):
-    scene, nominal = read_nominal(dome.folder)
+    nominal = read_nominal(dome.folder)
+    scene = nominal.scene
     assert scene == dome.scene and nominal.lens.front == dome.scene.lens.front.surface
     assert step_reading.read(dome.folder / "lens.step").front.outline == Circle(8.5)
     again = bstcad.open(dome.folder)
@@ -90,7 +91,7 @@ def test_the_dome_is_in_the_scene_and_in_the_step_file_of_its_design(dome):
 @suite.in_turn(0, 4)
 def test_tolerances_of_a_domed_lens_move_its_dome(dome):
     """A form error is a net in the dome's place, which keeps the outline; a larger lens has a larger outline."""
-    _, nominal = read_nominal(dome.folder)
+    nominal = read_nominal(dome.folder)
     setup = perturbations.Setup(nominal.lens, nominal.channels, nominal.goals[0].screen)
     rough = perturbations.form_error(nominal.lens, 4.0, 0, "front").apply(setup, 0.0).lens
     assert rough.front.is_net and rough.apertures == nominal.lens.apertures
@@ -127,7 +128,8 @@ def test_the_given_front_is_in_every_file(behind_another, small_design):
 @suite.in_turn(1, 4)
 def test_it_reads_back_to_the_last_bit_without_the_earlier_design(behind_another):
     """The folder has a copy of the net."""
-    scene, nominal = read_nominal(behind_another.folder)
+    nominal = read_nominal(behind_another.folder)
+    scene = nominal.scene
     assert scene == behind_another.scene and scene.lens.front.file.shape == (33, 33)
     assert torch.equal(nominal.lens.front.heights, behind_another.scene.lens.front.surface.heights)
     again = bstcad.open(behind_another.folder)
@@ -143,7 +145,7 @@ def test_both_numbers_of_the_conic_are_found(conic):
     step = step_reading.read(conic.folder / "lens.step")
     rim = np.hypot(4.0, 3.0)
     assert sag(step.front, rim, 0.0) == pytest.approx(float(sag(front.surface, rim, 0.0)), abs=1e-12)
-    _, nominal = read_nominal(conic.folder)
+    nominal = read_nominal(conic.folder)
     assert nominal.lens.front == front.surface
     written = json.loads((conic.folder / "report.json").read_text())["prescription"]["front"]
     assert written["kind"] == "conic" and written["conic_constant"] == front.conic_constant
@@ -160,7 +162,8 @@ def test_the_step_file_of_a_toroid_lies_within_a_nanometre_of_it(toroid):
 
 @suite.in_turn(3, 4)
 def test_a_toroid_is_read_again_to_the_last_bit_and_its_sheets_have_both_radii(toroid):
-    scene, nominal = read_nominal(toroid.folder)
+    nominal = read_nominal(toroid.folder)
+    scene = nominal.scene
     assert scene == toroid.scene and nominal.lens.front.is_net
     assert np.array_equal(
         nominal.lens.front.control_points(), np.load(toroid.folder / "design.npz")["front_control_points"]

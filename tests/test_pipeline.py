@@ -50,16 +50,16 @@ def test_a_template_becomes_a_lens(name):
     assert value < RECORDED[name]
     assert efficiency > 0.97
     rounds = tuple(f"stage 2, {tubes}² tubes" for tubes in (128, 171, 256))
-    assert tuple(stage.name for stage in found.making.stages) == (
+    assert tuple(stage.name for stage in found.course.stages) == (
         "loading",
         "stage 1",
         "float32 beside float64",
         *rounds,
     )
-    assert found.making.stages[3].rrmsd < found.making.stages[1].rrmsd
+    assert found.course.stages[3].rrmsd < found.course.stages[1].rrmsd
     assert {stage for stage, *_ in steps} == {"stage 1", "stage 2"}
     assert all(done <= total for _, done, total, _ in steps)
-    assert found.lens.back.heights.dtype == torch.float64 and found.making.skipped_steps == 0
+    assert found.lens.back.heights.dtype == torch.float64 and found.course.skipped_steps == 0
     assert lens_solid(found.lens).isValid()
 
 
@@ -69,10 +69,10 @@ def test_float32_is_compared_when_a_report_asks_for_it():
     both = (pipeline.DesignOptions(compare_later=later) for later in (False, True))
     now, later = (pipeline.design(small("disk", **few), options=options) for options in both)
     assert torch.equal(later.lens.back.heights, now.lens.back.heights)
-    assert later.making.twins is None and pipeline.COMPARISON_STAGE not in [stage.name for stage in later.making.stages]
+    assert later.course.twins is None and pipeline.COMPARISON_STAGE not in [stage.name for stage in later.course.stages]
     told = later.with_report_data()
-    assert told.making.twins == now.making.twins
-    assert [stage.name for stage in told.making.stages] == [stage.name for stage in now.making.stages]
+    assert told.course.twins == now.course.twins
+    assert [stage.name for stage in told.course.stages] == [stage.name for stage in now.course.stages]
     assert told.with_report_data() is told and now.with_report_data() is now
 
 
@@ -85,7 +85,7 @@ def test_float32_comes_close_to_float64():
 def test_max_time_that_is_over_gives_the_best_so_far():
     few = small("disk", **{"tailoring.max_time": "1.0", "tailoring.stage2_iterations": "100000"})
     found = pipeline.design(few, began=time.perf_counter() - 1e6)  # long over
-    assert found.making.stopped == "time" and [s.name for s in found.making.stages] == ["loading", "stage 1"]
+    assert found.course.stopped == "time" and [s.name for s in found.course.stages] == ["loading", "stage 1"]
     assert judged(found)[0] < 0.2
 
 

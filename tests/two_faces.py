@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 
 from bstcad.designs.course import BY_HAND, DesignCourse
-from bstcad.designs.made import Made
+from bstcad.designs.designed_lens import DesignedLens
 from bstcad.scene.scene import load
 
 DISK = "templates/disk.toml"
@@ -52,4 +52,4 @@ def made_of(scene, front=0.06, back=-0.08):
     """The lens by hand; front, back: height of the waves of each face (mm)."""
     flat = scene.flat_lens(scene.lens.back.net)
     lens = flat.with_front(bent(flat.front, front)).with_back(bent(flat.back, back, (3.0, 2.0)))
-    return Made(scene, scene.as_mounted(lens), scene.goals, DesignCourse(stopped=BY_HAND))
+    return DesignedLens(scene, scene.as_mounted(lens), scene.goals, DesignCourse(stopped=BY_HAND))

@@ -28,7 +28,7 @@ MIN_LIT_FRACTION = 0.99  # smallest lit fraction of the area of a back that coun
 
 def of_preview(found: Preview) -> dict[str, Any]:
     """Return the pictures on each target, the lens with its light, and the figures."""
-    path = light_path_of(found.scene, found.lens, found.pictures)
+    path = light_path_of(found, [light for _, light in found.pictures])
     seen = [(*pair, image) for pair, image in zip(found.pictures, found.source_images, strict=True)]
     views = [View.of(found.scene, k) for k in range(len(found.pictures))]
     targets = []

@@ -460,9 +460,9 @@ class Workbench:
         usual = self.workspace.file(name, "figures/irradiance.png")
         try:
             folder = self.workspace.file(name, "design.npz").parent
-            scene, nominal = folders.read_nominal(folder)
-            found = nominal.goals[0].picture, folders.read_irradiances(folder, scene)[0]
-            return Response(dark_triptych(*found, View.of(scene)), media_type="image/png")
+            nominal = folders.read_nominal(folder)
+            found = nominal.goals[0].picture, folders.read_irradiances(folder, nominal.scene)[0]
+            return Response(dark_triptych(*found, View.of(nominal.scene)), media_type="image/png")
         except SentenceError:
             return FileResponse(usual, media_type="image/png")
 

@@ -27,7 +27,7 @@ import numpy as np
 from bstcad.cad import mesh as meshes
 from bstcad.cad.mesh import MIRROR_RGBA, Label
 from bstcad.designs.as_designed import scene_text
-from bstcad.designs.made import Made
+from bstcad.designs.designed_lens import DesignedLens
 from bstcad.optics.lens import face_integrals
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.passes import FRONT
@@ -225,7 +225,7 @@ def hash_of(contents: Mapping[str, bytes]) -> str:
     return digest.hexdigest()
 
 
-def write_geometry(design: Made, folder: Path, submit: Submit = run_here) -> Callable[[], None]:
+def write_geometry(design: DesignedLens, folder: Path, submit: Submit = run_here) -> Callable[[], None]:
     """Write lens.step, lens.stl, part.step if there is a mount, and the scene with the files that it names.
 
     Return the function that writes lens.3mf.  The verification does not read lens.3mf, so a thread can write it later.
@@ -257,14 +257,14 @@ def label(scene: scenes.Scene) -> Label:
     return Label(scene.name, scene.title, scene.lens.material or "glass")
 
 
-def _write_scene(design: Made, folder: Path) -> None:
+def _write_scene(design: DesignedLens, folder: Path) -> None:
     """Write scene.toml, with the designed parameters of the front, and the files that scene.toml names."""
     contents = scene_files(design.scene) | {SCENE: scene_text(design.scene, design.lens).encode()}
     for name, data in contents.items():
         (folder / name).write_bytes(data)
 
 
-def write_design(design: Made, lights: Sequence[Light], folder: Path) -> None:
+def write_design(design: DesignedLens, lights: Sequence[Light], folder: Path) -> None:
     """Write design.npz: the optimised surfaces, the pictures, and the scene's text.
 
     The arrays are those of ARRAYS.  lights: traced light on each target; () if not traced.  The last tailored face is
@@ -295,7 +295,7 @@ def write_design(design: Made, lights: Sequence[Light], folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def kept_if_unwritten(design: Made, folder: Path) -> Iterator[None]:
+def kept_if_unwritten(design: DesignedLens, folder: Path) -> Iterator[None]:
     """Keep a design that cannot be written to `folder` in a folder beside it, or else in the system's temporary folder.
 
     The scene and design.npz are kept, without irradiance.  A note on the error names the folder.
@@ -312,7 +312,7 @@ def kept_if_unwritten(design: Made, folder: Path) -> Iterator[None]:
             shutil.rmtree(path, ignore_errors=True)
 
 
-def _keep(design: Made, folder: Path) -> Path:
+def _keep(design: DesignedLens, folder: Path) -> Path:
     """Write a design to a folder beside `folder`, or else in the system's temporary folder; return its path."""
 
     def write_to(path: Path) -> Path:
@@ -335,9 +335,9 @@ def _spare_folders(folder: Path) -> Iterator[Path]:
         yield folder.with_name(f"{folder.name}-unwritten{'' if k == 1 else f'-{k}'}")
 
 
-def _contains(folder: Path, design: Made) -> bool:
+def _contains(folder: Path, design: DesignedLens) -> bool:
     try:
-        _, nominal = read_nominal(folder)
+        nominal = read_nominal(folder)
     except Exception:  # zipfile and numpy raise various errors for a damaged file
         return False
     return design.is_lens_of(nominal)
@@ -346,8 +346,8 @@ def _contains(folder: Path, design: Made) -> bool:
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
-def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
-    """Return scene and nominal design of a folder.  SceneError if design.npz or scene.toml is missing or damaged."""
+def read_nominal(folder: Path) -> Nominal:
+    """Return the nominal design of a folder.  SceneError if design.npz or scene.toml is missing or damaged."""
     scene = scenes.load(folder / SCENE)
     shapes: dict[str, tuple[int, ...]] = {"control_points": (*as_pair(scene.lens.back.net), 3), "front_curvature": ()}
     if scene.lens.front.is_tailored:
@@ -371,7 +371,7 @@ def read_nominal(folder: Path) -> tuple[scenes.Scene, Nominal]:
         lit.append((found.get(numbered("irradiance", k)), float(found.get(numbered(ERROR, k), math.nan))))
         if not stored[k].sum() > 0 or not goals[k].picture.sum() > 0:
             raise SceneError(f"{folder / DESIGN}: the picture of {goal.key} is all black; {REMEDY}")
-    return scene, Nominal(scene, _lens(scene, found), tuple(goals), stored=tuple(stored), lit=tuple(lit))
+    return Nominal(scene, _lens(scene, found), tuple(goals), stored=tuple(stored), lit=tuple(lit))
 
 
 def read_irradiances(folder: Path, scene: scenes.Scene) -> tuple[np.ndarray, ...]:

@@ -20,13 +20,14 @@ import bstcad
 from bstcad.analysis.shape import thickness_range
 from bstcad.analysis.steepness import Steepness, needed_steepness
 from bstcad.designs.course import CurvePoint, DesignCourse, PrecisionTest, StageRecord
-from bstcad.designs.made import Made
+from bstcad.designs.designed_lens import DesignedLens
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.passes import FRONT
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.surfaces.sides import as_pair
 from bstcad.optics.trace.reach import MAX_EXIT_ANGLE, grazing_of, spread_at, unreached
 from bstcad.runs import processes
+from bstcad.scene.blank import LensBlank
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import Scene
 from bstcad.tailoring import effort as efforts
@@ -110,7 +111,7 @@ class DesignOptions:
     """Options of a design that its scene does not state."""
 
     merit: PictureError | None = None  # function of a picture and the target that stages 2 and 3 minimise; None: RRMSD²
-    compare_later: bool = False  # compare float32 with float64 only when a report needs it (`Made.with_report_data`)
+    compare_later: bool = False  # compare float32 with float64 only when a report needs it (`with_report_data`)
     effort: efforts.TailoringEffort | None = None  # effort beside the scene's settings; None: FULL
     earlier: Earlier | None = None  # earlier lens that stage 2 or 3 refines; None: stage 1 makes a lens
 
@@ -132,7 +133,7 @@ def design(
     options: DesignOptions = DesignOptions(),
     began: float | None = None,
     start: DesignState | None = None,
-) -> Made:
+) -> DesignedLens:
     """Design the lens of a scene: transport map, stage 1, and stage 2, or stage 3 for an extended source.
 
     device: see `device_for`.  hooks: functions that are called during the design.  Once `hooks.interrupted` returns
@@ -184,10 +185,10 @@ def design(
     if sent is not None:
         at_back = sent.plane == AT_FACE
         steep = needed_steepness(source, lens, goals[0], x=sent.x, y=sent.y, origins=sent.source, at_back=at_back)
-    making = _design_course(followed, driver.record, stopped, steep)
+    course = _design_course(followed, driver.record, stopped, steep)
     designed = resolved(scene, lens), scene.as_mounted(lens), goals
-    made = Made(*designed, making=making, device=device, transport=followed.transport)
-    compare = partial(_with_comparison, making, task, after_stage1, stages)
+    made = DesignedLens(*designed, course=course, device=device, transport=followed.transport)
+    compare = partial(_with_comparison, course, task, after_stage1, stages)
     return replace(made, precision_comparison=compare) if later else made
 
 
@@ -324,13 +325,13 @@ def check_front(lens: Lens, scene: Scene) -> None:
         raise SceneError(f"lens.front.optimise: with the front that the target needs, {error}") from None
 
 
-def _with_comparison(making: DesignCourse, task: Task, lens: Lens, before: int) -> DesignCourse:
-    """Return `making` with the comparison of precisions for the lens of stage 1, after the first `before` stages."""
+def _with_comparison(course: DesignCourse, task: Task, lens: Lens, before: int) -> DesignCourse:
+    """Return `course` with the comparison of precisions for the lens of stage 1, after the first `before` stages."""
     began, cpu = time.perf_counter(), time.process_time()
     comparison = cast(PrecisionTest, asdict(compare_precisions(task, lens)))
     stage = StageRecord(COMPARISON_STAGE, time.perf_counter() - began, cpu_seconds=time.process_time() - cpu)
-    stages = (*making.stages[:before], stage, *making.stages[before:])
-    return replace(making, twins=comparison, stages=stages, seconds_total=making.seconds_total + stage.seconds)
+    stages = (*course.stages[:before], stage, *course.stages[before:])
+    return replace(course, twins=comparison, stages=stages, seconds_total=course.seconds_total + stage.seconds)
 
 
 def _design_course(result: Stage1Result, record: DesignRecord, stopped: str, steep: Steepness | None) -> DesignCourse:
@@ -400,7 +401,7 @@ def _stage1(
             lens = place_back(lens, lens.back.z, task.min_thickness, bounds)
         lens = enforce_bounds(lens, bounds)
         check_thickness(lens, scene)
-        rrmsd = require_bounded_light(scene, task.rrmsd(lens))
+        rrmsd = require_bounded_light(scene.lens, task.rrmsd(lens))
         driver.end(f"{BOUNDS_STAGE}, after stage 1", rrmsd)
     precision = None
     if compare and not driver.reason_to_end:
@@ -535,12 +536,12 @@ def require_light(lens: Lens, rrmsd: float) -> float:
     return rrmsd
 
 
-def require_bounded_light(scene: Scene, rrmsd: float) -> float:
+def require_bounded_light(blank: LensBlank, rrmsd: float) -> float:
     """Return the RRMSD of the first lens within its bounds; SceneError if it sends no light to the target."""
     if math.isfinite(rrmsd):
         return rrmsd
-    keys = scene.lens.bounded_by or ("min_thickness",)
-    bounds = " and ".join(f"lens.{key} = {getattr(scene.lens, key):g}" for key in keys)
+    keys = blank.bounded_by or ("min_thickness",)
+    bounds = " and ".join(f"lens.{key} = {getattr(blank, key):g}" for key in keys)
     raise SceneError(f"{bounds}: no lens within these bounds sends light to the target; relax a bound")
 
 

@@ -37,8 +37,8 @@ from bstcad.optics.trace.wavefront_error import WavefrontError
 from bstcad.report.record import Contents
 from bstcad.report.units import number, quantity, tilt_words
 from bstcad.runs.processes import Submit
-from bstcad.scene.scene import Scene
 from bstcad.scene.target import numbered
+from bstcad.verify.nominal import Nominal
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,8 +57,9 @@ Pngs = dict[str, bytes]  # pictures by name
 class Pictures:
     """Jobs that draw the figures and the data sheet of a design; `result` waits for all of them."""
 
-    def __init__(self, scene: Scene, submit: Submit) -> None:
-        self._scene, self._submit = scene, submit
+    def __init__(self, design: Nominal, submit: Submit) -> None:
+        self._design, self._submit = design, submit
+        self._views = _views_of(design)
         self._vtk = ThreadPoolExecutor(1)  # waits for VTK, which draws in its own process
         self._jobs: list[Future] = []
         self._sheet: Future | None = None
@@ -73,7 +74,7 @@ class Pictures:
 
     def begin(self, draw: Callable[..., Pngs], *given: Any, number: int = 0) -> None:
         """Start the job draw(*given, view); number: index of the target that the view shows."""
-        self._jobs.append(self._submit(draw, *given, View.of(self._scene, number)))
+        self._jobs.append(self._submit(draw, *given, self._views[number]))
 
     def solid(self, lens: Lens) -> None:
         """Start the job that draws the 3-D picture."""
@@ -82,12 +83,12 @@ class Pictures:
 
     def lens(self, lens: Lens) -> None:
         """Start the job `draw_lens`, a job `draw_transport` for each target, and the far field if it has a meaning."""
-        source, screens = self._scene.light.central, [target.screen for target in self._scene.targets]
+        source, screens = self._design.emitter.central, [goal.screen for goal in self._design.goals]
         self.begin(draw_lens, source, lens, screens)
         for k, screen in enumerate(screens):
             self.begin(draw_transport, source, lens, screen, number=k)
-        if photometric_figures.has_far_field(self._scene):
-            self.begin(photometric_figures.draw_far_field, photometric_figures.far_field_of(self._scene), lens)
+        if self._design.has_far_field:
+            self.begin(photometric_figures.draw_far_field, self._design.far_field, lens)
 
     def sheet(self, draw: Callable[..., bytes], sheet: Any) -> None:
         """Start the job that draws the data sheet."""
@@ -368,31 +369,38 @@ def convergence(history: Sequence[CurvePoint], stages: Sequence[StageRecord], no
 # --- a lens at work ---------------------------------------------------------------------------------------------------
 
 
-def light_path_of(scene: Scene, lens: Lens, pictures: Sequence[tuple[np.ndarray, np.ndarray]]) -> RayPath | None:
+def light_path_of(design: Nominal, irradiances: Sequence[np.ndarray]) -> RayPath | None:
     """Return lens, rays and pictures for `bstcad show`; None if no light reaches the furthest target.
 
-    pictures: (target, irradiance) of each target of the scene, (rows, columns) each.
+    irradiances: on each target, (rows, columns).
     """
-    source, wanted_screens = scene.light.central, [target.screen for target in scene.targets]
-    screens = [drawn(screen, lens) for screen in wanted_screens]
-    rays, flux = bundle(source, lens, max(screens, key=lambda screen: screen.receiver.throw(0.0)).receiver, RAYS)
+    lens, emitter, views = design.lens, design.emitter, _views_of(design)
+    screens = [drawn(goal.screen, lens) for goal in design.goals]
+    receiver = max(screens, key=lambda screen: screen.receiver.throw(0.0)).receiver
+    rays, flux = bundle(emitter.central, lens, receiver, RAYS)
     if not len(rays):
         return None
     mesh = meshes.lens_mesh(lens, LIGHT_PATH_CELLS)
-    of = "from the centre of the source" if scene.source.extent is not None else "from the source"
+    of = "from the centre of the source" if emitter.extent is not None else "from the source"
+    lit = zip(views, irradiances, design.goals, strict=True)
     return RayPath(
         vertices=mesh.vertices,
         faces=mesh.faces,
         rays=rays,
         flux=MILLIONTHS * flux,
         screens=tuple(map(corners, screens)),
-        pictures=tuple(View.of(scene, k).tones(light, wanted) for k, (wanted, light) in enumerate(pictures)),
+        pictures=tuple(view.tones(light, goal.picture) for view, light, goal in lit),
         lamp=rays[:1, 0] if np.ptp(rays[:, 0], axis=0).max() < 1e-6 else np.empty((0, 3)),
-        seen_along=1 if scene.target.seen_from == "lens" else -1,
+        seen_along=1 if views[0].seen_from == "lens" else -1,
         mirror=not lens.passes.enters,
-        title=scene.title or scene.name,
-        words=f"{_sizes(wanted_screens)}\n{len(rays)} rays {of}, true to scale",
+        title=design.scene.title or design.scene.name,
+        words=f"{_sizes([goal.screen for goal in design.goals])}\n{len(rays)} rays {of}, true to scale",
     )
+
+
+def _views_of(design: Nominal) -> list[View]:
+    """Return the view of each target of a design."""
+    return [View.of(design.scene, number) for number in range(len(design.goals))]
 
 
 def _sizes(screens: Sequence[Screen]) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bstcad.analysis.far_field import RAYS, FarField, grid_of
+from bstcad.analysis.far_field import RAYS, FarField
 from bstcad.figures.drawing import BLUE, GREEN, GREY, VERMILION, footnote, new_figure, png, steps, styled
 from bstcad.figures.light_figures import View, draw_picture
 from bstcad.optics.lens.lens import Lens
@@ -18,12 +18,10 @@ from bstcad.optics.receivers.directions import Directions
 from bstcad.optics.trace.measure import Light
 from bstcad.photometry.intensity import Intensity
 from bstcad.report.units import number, quantity
-from bstcad.scene.target import AngularTarget, numbered
+from bstcad.scene.target import numbered
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from bstcad.scene.scene import Scene
 
 LEVELS = 0.05, 0.1, 0.2, 0.4, 0.6, 0.8  # levels of contour lines, as fractions of the largest value
 LINES = f"Lines: {', '.join(f'{100 * level:g}' for level in LEVELS)} % of the largest value."
@@ -41,25 +39,6 @@ MAX_EDGE = 80.0  # largest angle of a beam edge that a cone diagram shows, degre
 MM2_PER_M2 = 1e6
 MAX_ISOLUX_PIXELS = 160  # number of pixels per side above which an isolux picture is averaged over blocks
 PLANES = (("C0-C180", 0.0, BLUE, "-"), ("C90-C270", 90.0, VERMILION, "--"))  # planes: name, C, colour, line
-
-
-def far_field_of(scene: Scene) -> FarField:
-    """Return the light of a scene for the intensity behind its lens, with the losses of a verification.
-
-    The grid is that of the file of the intensity to be reached, if the first target has one.
-    """
-    target = scene.target
-    wanted = target.intensity if isinstance(target, AngularTarget) else None
-    return FarField(
-        scene.verification_channels(), scene.source.luminous_flux, ghost=scene.ghost, sampler=scene.sampler,
-        grid=None if wanted is None else grid_of(wanted.table),
-    )  # fmt: skip
-
-
-def has_far_field(scene: Scene) -> bool:
-    """Return True for a target over directions or a known luminous flux, if no mirror turns the light back."""
-    angular = any(isinstance(target, AngularTarget) for target in scene.targets)
-    return (angular or scene.source.luminous_flux is not None) and not scene.light_path.is_folded
 
 
 def draw_far_field(far: FarField, lens: Lens, view: View) -> dict[str, bytes]:

@@ -330,7 +330,7 @@ def _generate(scene: Path, folder: Path, point: Settings, limit: float, *, tick:
 
 def judge_run(run: ColdRun, base: Scene, folder: Path, effort: Effort) -> ColdRun:
     """Return `run` with the RRMSD of the lens in `folder` by `effort`: the largest on the targets of `base`."""
-    lens, channels = read_nominal(folder)[1].lens, base.verification_channels()
+    lens, channels = read_nominal(folder).lens, base.verification_channels()
     lights = measure_goals(lens, channels, base.goals, effort, ghost=base.ghost, sampler=base.sampler)
     if not all(light.rrmsd >= 0 for light in lights):
         return run.model_copy(update={"status": FAILED, "reason": "none of its light falls on the target"})

@@ -1,4 +1,4 @@
-"""Estimate the effects that a design neglects, and diagnose a finished design.
+"""List the effects that a design simulates, estimate those that it neglects, and diagnose a finished design.
 
 Before a design the effects are estimated (analysis.neglected_effects) with a coarse lens, made in a second or two by
 two rounds of transport and slope fit; most estimates are accurate within a factor of two.  Reports state estimates for
@@ -24,12 +24,14 @@ from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.passes import BACK, FRONT
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.light.collimated import CollimatedSource
+from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.light.profiles import pair_of
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.surfaces.sides import as_pair
 from bstcad.optics.trace.measure import tubes_picture
-from bstcad.report.record import LeftOut
-from bstcad.scene.effects import Absorption, Effect, Fresnel, Ghost, find_effect, losses, reflection_of
+from bstcad.report.record import LEFT_OUT, LeftOut, extent
+from bstcad.report.units import Rows, tables
+from bstcad.scene.effects import Absorption, Effect, Fresnel, Ghost, find_effect, losses
 from bstcad.scene.real_source import DEFAULT_DIAMETER as DEFAULT_DIAMETER
 from bstcad.scene.real_source import DEFAULT_DIVERGENCE as DEFAULT_DIVERGENCE
 from bstcad.scene.real_source import real_size
@@ -100,6 +102,11 @@ TUBES_PER_PIXEL = 1.0  # flux tubes per pixel, along each side, for the pictures
 FRESNEL_KEYS, LINES_KEYS = '[[effects]] kind = "fresnel"', "source.wavelength = [[nm, weight], …]"  # TOML for scenes
 
 
+def simulated(scene: Scene) -> Rows:
+    """Return the simulated effects: name, and the key of the scene that requests the effect."""
+    return tables("simulated.txt.j2", scene=scene, extent=list(extent(scene.source)), names=LEFT_OUT)["simulated"]
+
+
 def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ...]:
     """Return the neglected effects with the changes that each causes, the largest change of the RRMSD first.
 
@@ -108,15 +115,15 @@ def left_out(scene: Scene, lens: Lens, picture: np.ndarray) -> tuple[LeftOut, ..
     points = math.prod(as_pair(scene.lens.back.net))
     reference = Reference.of(lens, _central_channel(scene), scene.target.screen, picture=picture, control_points=points)
     entries = [*_glass_effects(scene, reference), *_mirror_effects(scene, reference)]
-    entries += _source_size(scene, reference)
-    entries.append(_diffraction(scene, reference))
+    entries += _source_size(scene.source, reference)
+    entries.append(_diffraction(reference))
     entries.append(_entry("stray light", None, "which depends on the finish of the faces"))
     return tuple(sorted(entries, key=lambda entry: -(entry.rrmsd_change or 0.0)))
 
 
-def _diffraction(scene: Scene, reference: Reference) -> LeftOut:
+def _diffraction(reference: Reference) -> LeftOut:
     """Return diffraction at the aperture; over directions with its blur λ / D in degrees."""
-    change, screen, words = reference.diffraction(), scene.target.screen, "at the whole aperture"
+    change, screen, words = reference.diffraction(), reference.screen, "at the whole aperture"
     if change is not None and screen.receiver.unit == "degrees":
         blur = change.blur / math.sqrt(math.prod(screen.per_unit))
         words = f"{words}, λ/D = {blur:.2g} degrees"
@@ -127,11 +134,11 @@ def _glass_effects(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
     if not scene.lens.passes.enters:
         return
     bare = Fresnel(kind="fresnel")
-    if reflection_of(scene.effects) is None:
+    if not scene.loses_reflections:
         yield _entry("fresnel", reference.change([_central_channel(scene, bare)]), simulate_by=FRESNEL_KEYS)
     if find_effect(scene.effects, Absorption) is None:
         yield _absorption(scene, reference)
-    yield _dispersion(scene, reference)
+    yield _dispersion(scene.source, scene.lens.material, reference)
     if scene.lens.passes.reflects:
         yield _entry("ghost", None, "ghosts of a mirror behind glass are not simulated")
     elif find_effect(scene.effects, Ghost) is None:
@@ -161,16 +168,16 @@ def _absorption(scene: Scene, reference: Reference) -> LeftOut:
     return _entry("absorption", reference.change([absorbing]), simulate_by=keys)
 
 
-def _dispersion(scene: Scene, reference: Reference) -> LeftOut:
+def _dispersion(source: Emitter, material: str | None, reference: Reference) -> LeftOut:
     """Return the change by the width of an only line, or by light between several lines.
 
     Several lines may stand for a continuous spectrum.  Their pictures then lie between those of other wavelengths, and
     each has structures that only the sum of all lines does not have.
     """
-    channel, material, lines = reference.channel, scene.lens.material, scene.source.lines
+    channel, lines = reference.channel, source.lines
     if material is None:
         return _entry("dispersion", None, "lens.index names no material", f"lens.material, and {LINES_KEYS}")
-    bands = [band(scene)] if len(lines) == 1 else _bands([nm for nm, _ in lines])
+    bands = [band(source)] if len(lines) == 1 else _bands([nm for nm, _ in lines])
     points = LINE_POINTS if len(lines) == 1 else BAND_POINTS
     finer = [
         ((low + high) / 2 + (high - low) / 2 * place, weight * share)
@@ -209,9 +216,8 @@ def _bands(lines: Sequence[float]) -> list[tuple[float, float]]:
     return [bands[nm] for nm in lines]
 
 
-def band(scene: Scene) -> tuple[float, float]:
+def band(source: Emitter) -> tuple[float, float]:
     """Return the band (low, high), nm, assumed for one wavelength: VISIBLE_BAND for sunlight, else LINE_WIDTH wide."""
-    source = scene.source
     if isinstance(source, CollimatedSource):
         divergences = pair_of(source.divergence or source.real_divergence or 0.0)
         if all(SUN_ANGLES[0] <= divergence <= SUN_ANGLES[1] for divergence in divergences):
@@ -219,8 +225,8 @@ def band(scene: Scene) -> tuple[float, float]:
     return source.main_wavelength - LINE_WIDTH / 2, source.main_wavelength + LINE_WIDTH / 2
 
 
-def _source_size(scene: Scene, reference: Reference) -> Iterator[LeftOut]:
-    if (size := real_size(scene.source)) is not None:
+def _source_size(source: Emitter, reference: Reference) -> Iterator[LeftOut]:
+    if (size := real_size(source)) is not None:
         change = reference.change(size.channels(reference.channel))
         yield _entry("source size", change, size.words, f"source.{size.key}", assumed=size.assumed)
 
@@ -236,16 +242,16 @@ def _entry(kind: str, change: Change | None, detail: str = "", simulate_by: str 
 # --- the diagnosis of a finished design -------------------------------------------------------------------------------
 
 
-def diagnosis(scene: Scene, making: DesignCourse, proof: Proof, target: np.ndarray) -> dict[str, Any]:
+def diagnosis(scene: Scene, course: DesignCourse, proof: Proof, target: np.ndarray) -> dict[str, Any]:
     """Return the entries convergence, remaining_error and bounds of report.json (record.Contents).
 
     scene: scene with only the target of the largest RRMSD in the proof.  target: its picture (rows, columns).
     """
-    sizes = [k for k, stage in enumerate(making.stages) if stage.is_round and stage.stage == "stage 3"]
+    sizes = [k for k, stage in enumerate(course.stages) if stage.is_round and stage.stage == "stage 3"]
     curve = ending(
-        [(point.seconds, point.rrmsd) for point in making.history],
-        [(stage.seconds, stage.rrmsd) for stage in making.stages],
-        since=math.fsum(stage.seconds for stage in making.stages[: max(sizes[2:], default=0)]),  # last round
+        [(point.seconds, point.rrmsd) for point in course.history],
+        [(stage.seconds, stage.rrmsd) for stage in course.stages],
+        since=math.fsum(stage.seconds for stage in course.stages[: max(sizes[2:], default=0)]),  # last round
     )
     reached = {key: at for key, at in (proof.at_bounds or {}).items() if key in scene.lens.bounded_by}
     bounds: dict[str, Any] = {

@@ -13,7 +13,7 @@ tests/benchmarks/test_net_choice.py compares the choice with designs of every ne
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,6 +25,7 @@ from scipy.ndimage import gaussian_filter
 from bstcad.analysis.cost import TILE_PIXELS, ControlCells
 from bstcad.optics.lens.interfaces import cross
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.surfaces.outlines import Outline
 from bstcad.optics.surfaces.sides import Sides, as_pair, coarser, size_text, spread
 from bstcad.optics.trace.tubes import area_of, collect, launch_tubes
 from bstcad.planning.effect_estimates import coarse_lens
@@ -102,14 +103,18 @@ class Choice:
         }
 
 
-def with_net(scene: Scene) -> tuple[Scene, Choice | None]:
-    """Return the scene with a net, and its Choice (None: the scene states it); raise SceneError for an unlit back."""
+def with_net(scene: Scene, say: Callable[[str], None] = lambda line: None) -> tuple[Scene, Choice | None]:
+    """Return the scene with a net, and its Choice (None: the scene states it); raise SceneError for an unlit back.
+
+    All commands that take a scene without a net choose it here.  say: receives the line on a choice.
+    """
     if scene.lens.back.control_points is not None:
         return scene, None
     levels = scene.tailoring.levels
     if levels is not None:  # the last level states the net
         return scene.changed({NET_KEY: levels[-1]}), None
     choice = choose_net(scene)
+    say(choice.line)
     return scene.changed({NET_KEY: choice.net}), choice
 
 
@@ -120,7 +125,7 @@ def choose_net(scene: Scene) -> Choice:
 
 
 def _choose_for_target(scene: Scene) -> Choice:
-    scenes = [scene.changed({NET_KEY: net}) for net in candidate_nets(scene)]
+    scenes = [scene.changed({NET_KEY: net}) for net in candidate_nets(scene.lens.outline)]
     lens = coarse_lens(scenes[0])
     light, image = area_cells(scenes[0], lens), blur_rrmsd(scenes[0], lens)
     pixels = light.target.size
@@ -134,7 +139,7 @@ def _choose_for_target(scene: Scene) -> Choice:
             likely = max(likely, candidates[-1].rrmsd / MAX_FURTHER_GAIN)
         seconds = typical_seconds(each).total
         candidates.append(Candidate(each.lens.back.net, likely, seconds, memory_gb(each), seam_shift=seam_shift(each)))
-    possible, limit = _affordable(scene, candidates)
+    possible, limit = _affordable(candidates, scene.tailoring.max_time, scene.lens.tool_radius)
     first = 0
     while any(_is_worthwhile(possible[first], other) for other in possible[first + 1 :]):
         first += 1
@@ -159,9 +164,10 @@ def _is_worthwhile(coarse: Candidate, fine: Candidate) -> bool:
     return not any(less <= gain and longer >= time for gain, time in MIN_GAINS)
 
 
-def _affordable(scene: Scene, candidates: list[Candidate]) -> tuple[tuple[Candidate, ...], str]:
+def _affordable(
+    candidates: list[Candidate], max_time: float | None, radius: float | None
+) -> tuple[tuple[Candidate, ...], str]:
     """Return the candidates that tool, time and memory allow (or the coarsest), and, in words, what excludes others."""
-    max_time, radius = scene.tailoring.max_time, scene.lens.tool_radius
     available = MEMORY_FRACTION * psutil.virtual_memory().total / 1e9
     bounds = (
         (f"more have no effect with lens.tool_radius = {radius}", lambda each: each.seam_shift >= MIN_SEAM_SHIFT),
@@ -189,9 +195,9 @@ def seam_shift(scene: Scene) -> float:
     return throw * math.sqrt(math.prod(scene.lens.cells)) * math.sqrt(math.prod(target.screen.per_unit))
 
 
-def candidate_nets(scene: Scene) -> list[Sides]:
+def candidate_nets(outline: Outline) -> list[Sides]:
     """Return the candidate nets from coarse to fine; for an oblong lens they have square cells."""
-    half_x, half_y = scene.lens.outline.half_extent
+    half_x, half_y = outline.half_extent
     if max(half_x, half_y) <= MAX_SQUARE_ASPECT * min(half_x, half_y):
         return list(SQUARE_NETS)
     return [coarser(spread(points, half_x, half_y), MAX_CONTROL_POINTS) for points in SQUARE_NETS]

@@ -19,13 +19,14 @@ from bstcad.optics.receivers.goal import worst
 from bstcad.optics.surfaces.sides import as_pair, scaled
 from bstcad.optics.trace.reach import unreached
 from bstcad.planning.cold_run import round_numbers
-from bstcad.planning.effect_estimates import coarse_lens, left_out
+from bstcad.planning.effect_estimates import coarse_lens, left_out, simulated
 from bstcad.planning.net_choice import rrmsd_ratio
 from bstcad.planning.prediction import PILOT_QUALITIES, QUALITIES, REMAINING_BLUR, predict, replace_net, run_pilot
-from bstcad.report.record import simulated, too_steep
+from bstcad.report.record import too_steep
 from bstcad.report.units import paragraphs
 from bstcad.runs.processes import Tick
 from bstcad.scene.errors import SceneError, line_of, toml_positions
+from bstcad.scene.quality import Tailoring
 from bstcad.scene.scene import Scene
 from bstcad.scene.schema import MAX_CONTROL_POINTS
 from bstcad.verify.nominal import DEFAULT_RRMSD_LIMIT
@@ -173,7 +174,7 @@ def predict_qualities(scene: Scene, lenses: Sequence[Lens], tick: Tick = lambda:
     except SceneError as refusal:
         return entries | {"not_predicted": f"a small version of this scene was refused: {refusal}"}
     predicted, steep = predict(scene, pilots), pilots[PILOT_QUALITIES[-1]].steep
-    entries |= {"predicted": predicted, "notes": [*too_steep(steep), *_limit_notes(scene, predicted)]}
+    entries |= {"predicted": predicted, "notes": [*too_steep(steep), *_limit_notes(scene.tailoring, predicted)]}
     net = scaled(scene.lens.back.net, 2)
     if max(as_pair(net)) <= MAX_CONTROL_POINTS:
         finer = replace_net(scene, net)
@@ -182,9 +183,9 @@ def predict_qualities(scene: Scene, lenses: Sequence[Lens], tick: Tick = lambda:
     return entries
 
 
-def _limit_notes(scene: Scene, predicted: Mapping[str, Mapping[str, tuple[float, float, float]]]) -> Iterator[str]:
+def _limit_notes(limits: Tailoring, predicted: Mapping[str, Mapping[str, tuple[float, float, float]]]) -> Iterator[str]:
     """Yield remarks on limits of the scene that the predictions ignore."""
-    max_time, accuracy = scene.tailoring.max_time, scene.tailoring.accuracy
+    max_time, accuracy = limits.max_time, limits.accuracy
     if max_time is not None and (exceeding := [q for q, each in predicted.items() if each["seconds"][1] > max_time]):
         yield f"tailoring.max_time = {max_time:g} would end a {' or '.join(exceeding)} design early, with more error."
     if accuracy is not None and (early := [q for q, each in predicted.items() if each["rrmsd"][1] < accuracy]):

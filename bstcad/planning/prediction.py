@@ -96,10 +96,10 @@ def run_pilot(scene: Scene, quality: str, tick: Tick = lambda: None) -> Pilot:
     pairs = zip(scene.single_target_scenes(), small.single_target_scenes(), strict=True)
     blurs = [blur_rrmsd(one, finished.lens) - blur_rrmsd(few, finished.lens) for one, few in pairs] if finer else [0.0]
     times = dict.fromkeys(("first", "search", "rest"), 0.0)
-    for stage in finished.making.stages:
+    for stage in finished.course.stages:
         part = "search" if stage.stage in SEARCH_STAGES else "first"
         times["rest" if stage.name == "loading" or stage.is_coarse else part] += stage.seconds
-    transport: Mapping[str, Any] = finished.making.transport or {}
+    transport: Mapping[str, Any] = finished.course.transport or {}
     steep = Steepness(transport["steep_share"], transport["steepest_deg"])
     lost = max(map(detail, (goal.picture for goal in scene.goals), sides)) if finer else 0.0
     lacks = {"detail": lost, "blur": max(0.0, *blurs)}

@@ -18,7 +18,7 @@ import torch
 from bstcad.analysis.light import Blur, blur
 from bstcad.analysis.shape import describe
 from bstcad.designs import pipeline
-from bstcad.designs.made import Made
+from bstcad.designs.designed_lens import DesignedLens
 from bstcad.manufacture.tolerance.as_made import AsMade, as_made
 from bstcad.manufacture.tolerance.lit_by import LitBy, lit_by
 from bstcad.optics.lens.lens import Lens
@@ -33,6 +33,7 @@ from bstcad.tailoring.driver import Hooks, Progress
 from bstcad.tailoring.effort import PREVIEW
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.source_image import ExtendedSource
+from bstcad.verify.nominal import Nominal
 
 COARSE_NET = 33  # control points per side in the first rounds of stage 1
 TRANSPORT_CELLS = 48  # cells per side of the transport map
@@ -67,11 +68,9 @@ class Outdated(Exception):
 
 
 @dataclass(frozen=True, eq=False)
-class Preview:
-    """Lens of a reduced design, its light, and their figures."""
+class Preview(Nominal):
+    """Reduced design of a scene, its light, and their figures."""
 
-    scene: Scene  # reduced scene
-    lens: Lens
     pictures: tuple[tuple[np.ndarray, np.ndarray], ...]  # (target, irradiance) per target, each (rows, columns)
     flux: dict[str, float]  # ledger of the light: fractions that sum to 1
     shape: dict[str, float | None]  # shape of the lens, by the keys of report.json
@@ -87,16 +86,11 @@ class Preview:
 
     def as_made(self, grade: str | None = None, layer_height: float | None = None) -> AsMade:
         """Return the pictures of the lens as made by a grade (None: that of the scene); see tolerance.as_made."""
-        return as_made(self.scene, self.lens, _with_pictures(self), grade=grade, layer_height=layer_height)
+        return as_made(self, grade, layer_height)
 
     def lit_by(self, light: str, distance: float | None = None) -> LitBy:
         """Return the pictures of the lens in another light; see tolerance.lit_by."""
-        return lit_by(self.scene, self.lens, _with_pictures(self), name=light, distance=distance)
-
-
-def _with_pictures(found: Preview) -> list[Goal]:
-    """Return the goals of a preview with its targets."""
-    return [replace(goal, picture=of) for goal, (of, _) in zip(found.scene.goals, found.pictures, strict=True)]
+        return lit_by(self, light, distance)
 
 
 def preview(scene: Scene, size: PreviewSize = QUICK, outdated: Callable[[], bool] = lambda: False) -> Preview:
@@ -148,7 +142,7 @@ def reduced_scene(scene: Scene, size: PreviewSize) -> Scene:
     return scene.changed(changes)
 
 
-def _evaluate(scene: Scene, made: Made) -> Preview:
+def _evaluate(scene: Scene, made: DesignedLens) -> Preview:
     """Return the preview of a lens: figures, and its light by flux tubes that its design did not use."""
     pictures, channels, lens = [], scene.channels(), made.lens
     for goal in made.goals:
@@ -159,8 +153,9 @@ def _evaluate(scene: Scene, made: Made) -> Preview:
     images = [blur(channels, lens, target.screen, target.irradiance(), n=IMAGE_POINTS) for target in scene.targets]
     shape, lit = describe(lens, SHAPE_POINTS), _lit_fraction(scene, lens)
     return Preview(
-        scene, lens, tuple(pictures), flux=light.flux, shape=shape, source_images=tuple(images), lit_fraction=lit
-    )
+        scene, lens, made.goals, tuple(pictures), flux=light.flux, shape=shape, source_images=tuple(images),
+        lit_fraction=lit,
+    )  # fmt: skip
 
 
 def _lit_fraction(scene: Scene, lens: Lens) -> float:

@@ -41,6 +41,7 @@ from bstcad.runs.cluster import Answer, Machines
 from bstcad.scene.errors import SceneError
 from bstcad.scene.quality import PRESETS
 from bstcad.scene.scene import Scene
+from bstcad.scene.target import Target
 from bstcad.tailoring.driver import Progress, no_progress
 
 # --- knobs ------------------------------------------------------------------------------------------------------------
@@ -407,7 +408,7 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
         versions=sample.versions if sample else {},
         reference={
             "rays": sorted({run.rays for run in runs if run.rays}),
-            "what": REFERENCE_TEXT.format(cold_run.REFERENCE_EFFORT.accuracy, _judged_on(scene)),
+            "what": REFERENCE_TEXT.format(cold_run.REFERENCE_EFFORT.accuracy, _judged_on(scene.targets)),
         },
         calibration=Calibration.of(unit),
         runs=tuple(map(described, runs)),
@@ -424,10 +425,10 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
     )
 
 
-def _judged_on(scene: Scene) -> str:
+def _judged_on(targets: Sequence[Target]) -> str:
     """Return, in words, the target pixels on which RRMSDs are measured, such as "64 x 48"."""
-    sizes = " and ".join("{} x {}".format(*target.columns_rows) for target in scene.targets)
-    return f"the target with the largest RRMSD, of {sizes}" if len(scene.targets) > 1 else sizes
+    sizes = " and ".join("{} x {}".format(*target.columns_rows) for target in targets)
+    return f"the target with the largest RRMSD, of {sizes}" if len(targets) > 1 else sizes
 
 
 def knob_points(knob: Knob, runs: Mapping[Settings, ColdRun], timed: bool = True) -> tuple[KnobPoint, ...]:

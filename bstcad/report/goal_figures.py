@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -18,9 +18,7 @@ from bstcad.optics.receivers.goal import Goal, suffix_of, words_of
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.trace.measure import RESOLVED, CellError, Light
 from bstcad.optics.trace.wavefront_error import WavefrontError
-from bstcad.scene.effects import reflection_of
-from bstcad.scene.scene import Scene
-from bstcad.scene.target import drawing
+from bstcad.scene.target import Target, drawing
 from bstcad.verify.checks import Proof
 from bstcad.verify.light_limits import PER_LX
 
@@ -179,11 +177,13 @@ class Photometry:
         return "pixel" if self.peak_cell == 1 else f"cell of {self.peak_cell:g} pixels"
 
 
-def photometry(scene: Scene, proof: Proof) -> Iterator[Photometry]:
-    """Yield the absolute figures of the light on each target; none if the flux of the source is not known."""
-    lumens = scene.source.luminous_flux
-    for key, target, light in zip(scene.target_keys, scene.targets, proof.lights, strict=True) if lumens else ():
-        screen, on_target = target.screen, lumens * light.on_screen
+def photometry(goals: Sequence[Goal], proof: Proof, lumens: float | None, *, reflection: bool) -> Iterator[Photometry]:
+    """Yield the absolute figures of the light on each goal; none if the flux of the source is not known.
+
+    lumens: luminous flux of the source.  reflection: True if the light lost by reflection is simulated.
+    """
+    for goal, light in zip(goals, proof.lights, strict=True) if lumens else ():
+        screen, on_target = goal.screen, lumens * light.on_screen
         unit = screen.receiver.photometric_unit
         mean = peak = error = luminance = None
         if unit is not None and light.picture.any():
@@ -196,8 +196,8 @@ def photometry(scene: Scene, proof: Proof) -> Iterator[Photometry]:
             peak, error = whole * light.peak, whole * light.peak_error
             luminance = _luminance(proof, screen, peak, at=(row, column)) if unit == "cd" else None
         yield Photometry(
-            key, lumens, on_target, unit, mean=mean, peak=peak, output_ratio=light.leaving, luminance=luminance,
-            reflection=reflection_of(scene.effects) is not None, peak_error=error, peak_cell=light.peak_cell,
+            goal.key, lumens, on_target, unit, mean=mean, peak=peak, output_ratio=light.leaving, luminance=luminance,
+            reflection=reflection, peak_error=error, peak_cell=light.peak_cell,
         )  # fmt: skip
 
 
@@ -210,9 +210,9 @@ def _luminance(proof: Proof, screen: Screen, peak: float, at: tuple[int, int]) -
     return peak / area * PER_LX if area > 0 else None
 
 
-def flat_tops(scene: Scene, proof: Proof) -> Iterator[FlatTop]:
-    """Yield the figures of each target with a flat profile, if light falls on it."""
-    for key, target, light in zip(scene.target_keys, scene.targets, proof.lights, strict=True):
+def flat_tops(targets: Mapping[str, Target], lights: Sequence[Light]) -> Iterator[FlatTop]:
+    """Yield the figures of each target with a flat profile, if light falls on it; targets: by key."""
+    for (key, target), light in zip(targets.items(), lights, strict=True):
         if target.profile is not None and target.profile.shape != "gaussian" and light.picture.any():
             pixel = tuple(side / n for side, n in zip(target.size, target.columns_rows, strict=True))
             inside = drawing(target).light  # covered fraction of each pixel, for a shape with an edge

@@ -30,7 +30,7 @@ from bstcad.optics.surfaces.bspline import DEGREE, BSplineSurface
 from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.report.units import Rows, paragraphs, tables
 from bstcad.scene.fronts import FIT_TOLERANCE
-from bstcad.scene.mount import as_cut
+from bstcad.scene.mount import Mount, Part, as_cut
 from bstcad.scene.scene import Scene
 from bstcad.scene.schema import FileContent
 
@@ -184,18 +184,23 @@ class Order:
     mass: float | None  # mass (g)
 
 
-def order_of(scene: Scene, lens: Lens, shape: Mapping[str, Any], folder: Path, found: Measures | None = None) -> Order:
+def order_of(
+    lens: Lens, shape: Mapping[str, Any], folder: Path, *, stated: Part, mount: Mount | None,
+    found: Measures | None = None,
+) -> Order:  # fmt: skip
     """Return the order of a design in a folder.
 
-    shape: facts of the lens inside its mount's rim, as in report.json, and the volume of lens.step.  found: measures of
-    part.step; None: there is no part.step.
+    shape: facts of the lens inside its mount's rim, as in report.json, and the volume of lens.step.  stated: [part] of
+    the scene, with defaults from the lens (`Part.of`).  mount: of the scene.  found: measures of part.step; None: there
+    is no part.step.
     """
-    mount, stated = scene.mount if found else None, scene.part.of(scene.lens)
+    cut, unbuilt = as_cut(lens, mount), mount is not None and not found
+    mount = mount if found else None
     low, high, volume = found or (*_corners(lens, None), shape["volume"])
     path, front = folder / (PART if mount else LENS), lens.front_vertex
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    radii = filter(None, (shape["radius_min_concave"], _front_radius(as_cut(lens, scene.mount))))
+    radii = filter(None, (shape["radius_min_concave"], _front_radius(cut)))
     return Order(
         file=path.name,
         sha256=digest,
@@ -214,7 +219,7 @@ def order_of(scene: Scene, lens: Lens, shape: Mapping[str, Any], folder: Path, f
         thickness_tolerance=stated.thickness_tolerance,
         roughness=stated.roughness,
         coating=stated.coating,
-        unbuilt=scene.mount is not None and mount is None,
+        unbuilt=unbuilt,
         size=tuple(above - below for below, above in zip(low, high, strict=True)),
         mass=None if volume is None or stated.density is None else volume * stated.density / 1000,
     )

@@ -39,6 +39,7 @@ from bstcad.designs.course import (
 )
 from bstcad.manufacture.measured.form_error import MAP_FILES
 from bstcad.manufacture.measured.made_part import MadePart
+from bstcad.optics.lens.lens import Lens
 from bstcad.optics.receivers.goal import Goal, worst
 from bstcad.optics.receivers.irradiance import Screen, rrmsd_of_pictures
 from bstcad.optics.receivers.receivers import LevelPlane
@@ -53,10 +54,11 @@ from bstcad.report.goal_figures import (
     photometry,
 )
 from bstcad.report.prescription import Order, prescription
-from bstcad.report.units import DIGITS, Remark, Rows, number, paragraphs, percent, tables
+from bstcad.report.units import DIGITS, Remark, number, paragraphs, percent
 from bstcad.report.units import remarks as written
 from bstcad.runs import files
-from bstcad.scene.scene import Scene
+from bstcad.scene.blank import LensBlank
+from bstcad.scene.quality import Tailoring
 from bstcad.verify.checks import Proof
 from bstcad.verify.judges.comparison import Judge
 from bstcad.verify.light_limits import LightValue
@@ -207,7 +209,7 @@ class Contents:
         return self.goals[worst(goal.rrmsd for goal in self.goals)]
 
     @property
-    def making(self) -> DesignCourse:
+    def course(self) -> DesignCourse:
         """Course of the design."""
         return DesignCourse(**{entry.name: getattr(self, entry.name) for entry in fields(DesignCourse)})
 
@@ -259,18 +261,20 @@ def contents_of(
     design: Nominal,
     proof: Proof,
     *,
-    making: DesignCourse,
+    course: DesignCourse,
     circumstances: Mapping[str, Any],
+    simulated: Sequence[str],
     estimates: tuple[LeftOut, ...],
     diagnosis: Mapping[str, Any],
 ) -> Contents:
     """Return the contents of report.json.
 
-    circumstances: present version, machine and versions of libraries; those known in `making` have priority.
-    estimates: effects that are not simulated.  diagnosis: convergence, remaining_error and bounds.
+    circumstances: present version, machine and versions of libraries; those known in `course` have priority.
+    simulated: names of the simulated effects.  estimates: effects that are not simulated.  diagnosis: convergence,
+    remaining_error and bounds.
     """
-    scene, goals = design.scene, design.goals
-    known = {key: value for key, value in vars(making).items() if value is not None}
+    scene, goals, source = design.scene, design.goals, design.scene.source
+    known = {key: value for key, value in vars(course).items() if value is not None}
     goal, light, figures = goals[proof.worst], proof.light, figures_of(goals, proof.lights)
     stated = figures[proof.worst]
     contents = Contents(
@@ -287,13 +291,13 @@ def contents_of(
         checks=proof.checks,
         prescription=prescription(scene, design.lens, proof.shape),
         effects={
-            "simulated": tuple(what for what, _ in simulated(scene)),
+            "simulated": tuple(simulated),
             "left_out": tuple(LEFT_OUT[entry.kind] for entry in estimates),
         },
         seed=scene.tailoring.seed,
         rrmsd_whole=light.rrmsd_whole,
-        unreachable=_unreached(scene, goal),
-        etendue=_least_etendue(scene, proof, goals),
+        unreachable=_unreached(goal, design.lens),
+        etendue=_least_etendue(design.emitter, proof.lens, goals),
         optic=scene.optic,
         quality=scene.tailoring.quality,
         rrmsd_asked=scene.accept.rrmsd,
@@ -301,28 +305,32 @@ def contents_of(
         shape=proof.shape,
         stability=proof.stability,
         blur=proof.blur,
-        finest_detail=_finest_detail(scene, proof, goal.screen, estimates, least=stated.right_down_to or 0.0),
+        finest_detail=_finest_detail(source, proof, goal.screen, estimates, least=stated.right_down_to or 0.0),
         picture=scene.picture_remarks(),
         lines=tuple(
             LineFigures(k.wavelength, k.share, rrmsd_of_pictures(goal.picture, k.picture)) for k in proof.lines
         ),
         estimates=estimates,
-        flat_tops=tuple(flat_tops(scene, proof)),
+        flat_tops=tuple(flat_tops(dict(zip(scene.target_keys, scene.targets, strict=True)), proof.lights)),
         wavefront=proof.wavefront and WavefrontFigures.of(proof.wavefront),
-        photometry=tuple(photometry(scene, proof)),
+        photometry=tuple(photometry(goals, proof, source.luminous_flux, reflection=scene.loses_reflections)),
         values=proof.values,
     )
-    return _with_remarks(contents, *remarks(contents, scene, goals, [each.picture for each in proof.lights]))
+    found = remarks(
+        contents, goals, [each.picture for each in proof.lights], blank=scene.lens, source=source,
+        asked=scene.tailoring, mesh_tolerance=None if scene.output.mesh_tolerance else scene.mesh_tolerance,
+    )  # fmt: skip
+    return _with_remarks(contents, *found)
 
 
-def _unreached(scene: Scene, goal: Goal) -> dict[str, float | None] | None:
+def _unreached(goal: Goal, lens: Lens) -> dict[str, float | None] | None:
     if goal.reachable is None:
         return None
-    return unreached(goal.whole, goal.reachable, scene.lens.passes.largest_deflection(scene.index))
+    return unreached(goal.whole, goal.reachable, lens.passes.largest_deflection(lens.index))
 
 
-def _least_etendue(scene: Scene, proof: Proof, goals: Sequence[Goal]) -> Etendue | None:
-    found = (etendue(scene.light, proof.lens, goal) for goal in goals)
+def _least_etendue(source: Emitter, lens: Lens, goals: Sequence[Goal]) -> Etendue | None:
+    found = (etendue(source, lens, goal) for goal in goals)
     return min((each for each in found if each is not None), key=lambda each: each.fits, default=None)
 
 
@@ -356,25 +364,20 @@ def _with_remarks(contents: Contents, *more: Remark) -> Contents:
 
 
 def _finest_detail(
-    scene: Scene, proof: Proof, screen: Screen, estimates: tuple[LeftOut, ...], least: float
+    source: Emitter, proof: Proof, screen: Screen, estimates: tuple[LeftOut, ...], least: float
 ) -> FinestDetail | None:
-    """Return the finest detail by the source's size in the scene, else in `estimates`; None: no size is known.
+    """Return the finest detail by the size of the source, else in `estimates`; None: no size is known.
 
     least: as in `finest_detail`.
     """
     if proof.blur:
-        of = ", ".join(f"source.{key} = {size}" for key, size in extent(scene.source))
+        of = ", ".join(f"source.{key} = {size}" for key, size in extent(source))
         return finest_detail(proof.blur.pixels, proof.lens, screen, of, least=least)
     for entry in estimates:
         if entry.kind == "source size" and entry.blur_pixels is not None:
             known = {"of": entry.detail, "assumed": entry.assumed}
             return finest_detail(entry.blur_pixels, proof.lens, screen, **known, least=least)
     return None
-
-
-def simulated(scene: Scene) -> Rows:
-    """Return the simulated effects: name, and the key of the scene that requests the effect."""
-    return tables("simulated.txt.j2", scene=scene, extent=list(extent(scene.source)), names=LEFT_OUT)["simulated"]
 
 
 def extent(source: Emitter) -> Iterator[tuple[str, str]]:
@@ -388,14 +391,21 @@ def extent(source: Emitter) -> Iterator[tuple[str, str]]:
 # A remark states, with a figure, an unfulfilled request of the scene, a loss or a doubt, even if no check judges it.
 
 
-def remarks(report: Contents, scene: Scene, goals: Sequence[Goal], irradiances: Sequence[np.ndarray]) -> list[Remark]:
-    """Return remarks, the most important first; irradiances: one per goal, normalised to the sum of its picture."""
+def remarks(
+    report: Contents, goals: Sequence[Goal], irradiances: Sequence[np.ndarray], *, blank: LensBlank, source: Emitter,
+    asked: Tailoring, mesh_tolerance: float | None,
+) -> list[Remark]:  # fmt: skip
+    """Return remarks, the most important first.
+
+    irradiances: one per goal, normalised to the sum of its picture.  blank, asked: [lens] and [tailoring] of the scene.
+    mesh_tolerance: usual tolerance of the mesh (mm); None: the scene states one, which a check judges.
+    """
     allowed = DEFAULT_RRMSD_LIMIT if report.rrmsd_asked is None else report.rrmsd_asked
     pairs = list(zip(goals, irradiances, strict=True))
     dark = {goal.words: unlit(goal.picture, found, goal.screen) for goal, found in pairs}
     bright = {goal.words: lifted(goal.picture, found) for goal, found in pairs}
-    given = {"report": report, "scene": scene, "allowed": allowed, "names": LEFT_OUT}
-    return written("remarks.txt.j2", "remarks", unlit=dark, lifted=bright, **given)
+    given = {"report": report, "blank": blank, "source": source, "asked": asked, "mesh_tolerance": mesh_tolerance}
+    return written("remarks.txt.j2", "remarks", allowed=allowed, names=LEFT_OUT, unlit=dark, lifted=bright, **given)
 
 
 def too_steep(found: Steepness) -> list[str]:
@@ -417,10 +427,10 @@ def read(path: Path) -> Contents:
     return read_as(Contents, path, "run bstcad verify to write it again")
 
 
-def making(path: Path) -> DesignCourse:
+def read_course(path: Path) -> DesignCourse:
     """Read the course of the design from a report.json; an empty record if the file is missing or damaged."""
     try:
-        return read(path).making
+        return read(path).course
     except ValueError:
         return DesignCourse()
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_serializer
 
 from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.key import Key
 from bstcad.scene.schema import COORDINATES, LENGTHS, Record
 from bstcad.scene.target import MAX_TARGETS, Target
@@ -178,7 +179,7 @@ def _radius_complaints(key: str, radius: float | None, target: Target) -> Iterat
     """Yield a complaint about a disc that is smaller than a pixel of the target, or larger than the target."""
     if radius is not None and radius > (most := math.hypot(*target.size)):
         yield f"{key}.radius: {radius:g} {target.unit} is more than the target's diagonal, {most:.3g}; make it smaller"
-    if radius is not None and radius < (least := MIN_RADIUS * pixel_size(target)):
+    if radius is not None and radius < (least := MIN_RADIUS * pixel_size(target.screen)):
         small = f"{radius:g} {target.unit} is less than {MIN_RADIUS:g} pixels, {least:.3g} {target.unit}"
         yield f"{key}.radius: {small}; make it larger, or set more target.pixels"
 
@@ -189,7 +190,7 @@ def _cut_off_complaints(cut_off: CutOff, target: Target) -> Iterator[str]:
     if not left <= cut_off.at <= right:
         beside = f"{cut_off.at:g} is outside of the target, {left:g} to {right:g} {target.unit}"
         yield f"accept.cut_off.at: {beside}; move the line, or widen target.x"
-    pixel, step = (high - low) / target.columns_rows[1], step_of(cut_off, target)
+    pixel, step = (high - low) / target.columns_rows[1], step_of(cut_off, target.screen)
     if step < pixel * (1 - 1e-9):
         coarse = f"a step of {step:g} {target.unit} is less than a pixel of {pixel:.3g} {target.unit}"
         yield f"accept.cut_off.step: {coarse}; set more target.pixels, or a larger step"
@@ -197,13 +198,14 @@ def _cut_off_complaints(cut_off: CutOff, target: Target) -> Iterator[str]:
         yield f"accept.cut_off.step: {step:g} {target.unit} is more than half of the target; make it smaller"
 
 
-def pixel_size(target: Target) -> float:
-    """Return the longer side of a target's pixels, in its unit."""
-    return max(side / n for side, n in zip(target.size, target.columns_rows, strict=True))
+def pixel_size(screen: Screen) -> float:
+    """Return the longer side of a screen's pixels, in its unit."""
+    (left, right), (low, high) = screen.x, screen.y
+    return max((right - left) / screen.columns, (high - low) / screen.rows)
 
 
-def step_of(cut_off: CutOff, target: Target) -> float:
-    """Return the step of a cut-off in the target's unit."""
+def step_of(cut_off: CutOff, screen: Screen) -> float:
+    """Return the step of a cut-off in the screen's unit."""
     if cut_off.step is not None:
         return cut_off.step
-    return CUT_OFF_STEP if target.unit == "degrees" else target.size[1] / target.columns_rows[1]
+    return CUT_OFF_STEP if screen.receiver.unit == "degrees" else (screen.y[1] - screen.y[0]) / screen.rows

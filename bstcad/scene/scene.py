@@ -380,6 +380,11 @@ class Scene(Record):
         return effects.ghost(self.effects)
 
     @property
+    def loses_reflections(self) -> bool:
+        """True if the light that Fresnel reflection takes is simulated."""
+        return effects.reflection_of(self.effects) is not None
+
+    @property
     def limits_light(self) -> bool:
         """True if [accept] or tailoring.accuracy limits the light."""
         return self.accept.limits_light or self.tailoring.accuracy is not None

@@ -138,7 +138,7 @@ def verify(
     made_lens, of_aperture, why = (lens, [], "") if read_part is None else _mounted_lens(read_part, lens, nominal, path)
     on_lens(made_lens)
     lights, lines = zip(*_measure_targets(made_lens, nominal, effort, on_light), strict=True)
-    values = light_values(nominal.scene, nominal.goals, lights, lens=made_lens, channels=nominal.channels)
+    values = light_values(nominal.scene.accept, nominal.goals, lights, lens=made_lens, far=nominal.far_field)
     stored: Sequence[tuple[np.ndarray | None, float]] = nominal.lit or [(None, math.nan)] * len(lights)
     of_stored = [
         _stored_light_check(goal, light, *of) for goal, light, of in zip(nominal.goals, lights, stored, strict=True)

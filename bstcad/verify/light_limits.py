@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from bstcad.analysis.far_field import ANGLE_STEP, PLANE_STEP, RAYS, SEED, FarField
 from bstcad.analysis.light_values import GLARE_ANGLES, Estimate, LightSets, glare
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.light.channels import Channel
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.trace.measure import SETS, Light
-from bstcad.scene.accept import CutOff, PointLimit, Uniformity, pixel_size, step_of
-from bstcad.scene.scene import Scene
+from bstcad.scene.accept import Accept, CutOff, PointLimit, Uniformity, pixel_size, step_of
 from bstcad.verify.verdict import Check
 
 PER_LX = 1e6  # lx per lm/mm², and mm² per m²
@@ -63,10 +61,12 @@ class LightValue:
 
 
 def light_values(
-    scene: Scene, goals: Sequence[Goal], lights: Sequence[Light], *, lens: Lens, channels: Sequence[Channel]
+    accept: Accept, goals: Sequence[Goal], lights: Sequence[Light], *, lens: Lens, far: FarField
 ) -> tuple[LightValue, ...]:
-    """Return the values that [accept] of the scene limits, on the light of its goals behind the lens."""
-    accept = scene.accept
+    """Return the values that [accept] limits.
+
+    lights: the light on each goal behind the lens.  far: light of the source for the intensity behind the lens.
+    """
     numbers = {point.target for point in accept.point}
     numbers |= {table.target for table in (accept.uniformity, accept.cut_off) if table is not None}
     sets = {}
@@ -76,20 +76,18 @@ def light_values(
         pictures = [each.numpy() for each in light.sets]
         sets[k] = LightSets.of(goal.screen, pictures, light.on_screen, target=wanted)
     found = [
-        _point_value(scene, point, f"{k + 1}", on=sets[point.target], of=goals[point.target].suffix)
+        _point_value(point, f"{k + 1}", sets[point.target], goals[point.target], lumens=far.lumens)
         for k, point in enumerate(accept.point)
     ]
     if accept.uniformity is not None:
         number = accept.uniformity.target
-        found += _uniformity_values(scene, accept.uniformity, sets[number], of=goals[number].suffix)
+        found += _uniformity_values(accept.uniformity, sets[number], goals[number])
     if accept.cut_off is not None:
         number = accept.cut_off.target
-        found.append(_cut_off_value(scene, accept.cut_off, sets[number], of=goals[number].suffix))
+        found.append(_cut_off_value(accept.cut_off, sets[number], goals[number]))
     if accept.glare is not None:
-        fields = (
-            FarField(tuple(channels), ghost=scene.ghost, sampler=scene.sampler, seed=SEED + k * SETS)
-            for k in range(GLARE_TABLES)
-        )
+        per_kilolumen = replace(far, lumens=None, grid=None)
+        fields = (replace(per_kilolumen, seed=SEED + k * SETS) for k in range(GLARE_TABLES))
         largest = glare([field.table(lens, RAYS // 3) for field in fields])
         found += [
             LightValue.of(
@@ -102,41 +100,42 @@ def light_values(
     return tuple(found)
 
 
-def _point_value(scene: Scene, point: PointLimit, number: str, on: LightSets, of: str) -> LightValue:
-    """Return the value at a test point; number: its number, from 1, which stands for a name."""
-    target = scene.targets[point.target]
-    radius = pixel_size(target) if point.radius is None else point.radius
+def _point_value(point: PointLimit, number: str, on: LightSets, goal: Goal, *, lumens: float | None) -> LightValue:
+    """Return the value at a test point; number: its number, from 1, which stands for a name.
+
+    lumens: luminous flux of the source; None: not known, and the scene was refused if the point needs it.
+    """
+    screen, unit = goal.screen, goal.screen.receiver.unit
+    radius = pixel_size(screen) if point.radius is None else point.radius
     estimate = on.mean(point.at, radius, relative=point.unit == "relative")
-    unit = ""
+    unit_of_value = ""
     if point.unit != "relative":
         assert estimate is not None  # only relative means may not exist
-        assert scene.source.luminous_flux is not None  # otherwise the scene was refused
-        scale, unit = scene.source.luminous_flux * (PER_LX if point.unit == "lx" else 1.0), point.unit
+        assert lumens is not None
+        scale, unit_of_value = lumens * (PER_LX if point.unit == "lx" else 1.0), point.unit
         estimate = Estimate(scale * estimate.value, scale * estimate.standard_error)
     x, y = point.at
     what = QUANTITIES[point.unit]
     name = (
-        f"test point {point.name or number} at ({x:g}, {y:g}) {target.unit}: mean over a radius of {radius:.3g} "
-        f"{target.unit}, {what}{of}"
+        f"test point {point.name or number} at ({x:g}, {y:g}) {unit}: mean over a radius of {radius:.3g} "
+        f"{unit}, {what}{goal.suffix}"
     )
-    return LightValue.of(name, estimate, point.least, point.most, unit=unit, id="point")
+    return LightValue.of(name, estimate, point.least, point.most, unit=unit_of_value, id="point")
 
 
-def _uniformity_values(scene: Scene, limits: Uniformity, on: LightSets, of: str) -> Iterator[LightValue]:
+def _uniformity_values(limits: Uniformity, on: LightSets, goal: Goal) -> Iterator[LightValue]:
     """Yield the values of uniformity that have a limit."""
-    target = scene.targets[limits.target]
-    radius = pixel_size(target) if limits.radius is None else limits.radius
+    radius = pixel_size(goal.screen) if limits.radius is None else limits.radius
     to_mean, to_max = on.ratios(radius) or (None, None)
-    over = f"of the even part, means over a radius of {radius:.3g} {target.unit}{of}"
+    over = f"of the even part, means over a radius of {radius:.3g} {goal.screen.receiver.unit}{goal.suffix}"
     if limits.min_to_mean is not None:
         yield LightValue.of(f"uniformity, smallest / mean {over}", to_mean, limits.min_to_mean, id="uniformity")
     if limits.min_to_max is not None:
         yield LightValue.of(f"uniformity, smallest / largest {over}", to_max, limits.min_to_max, id="uniformity")
 
 
-def _cut_off_value(scene: Scene, limits: CutOff, on: LightSets, of: str) -> LightValue:
+def _cut_off_value(limits: CutOff, on: LightSets, goal: Goal) -> LightValue:
     """Return the sharpness of a cut-off."""
-    target = scene.targets[limits.target]
-    step = step_of(limits, target)
-    name = f"sharpness of the cut-off along x = {limits.at:g} {target.unit}, step of {step:.3g} {target.unit}{of}"
+    step, unit = step_of(limits, goal.screen), goal.screen.receiver.unit
+    name = f"sharpness of the cut-off along x = {limits.at:g} {unit}, step of {step:.3g} {unit}{goal.suffix}"
     return LightValue.of(name, on.sharpness(limits.at, step), limits.least, limits.most, id="cut-off")

@@ -8,12 +8,15 @@ from functools import cached_property
 
 import numpy as np
 
+from bstcad.analysis.far_field import FarField, grid_of
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
+from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.trace.measure import FULL, Effort, Light, measure_goals
 from bstcad.scene.real_source import image_diameters, real_size
 from bstcad.scene.scene import Scene
+from bstcad.scene.target import AngularTarget
 
 DEFAULT_RRMSD_LIMIT = 0.25  # limit of the RRMSD in remarks, plans and tolerance studies if accept.rrmsd is not set
 DRAFT_ACCURACY = 0.01  # relative standard error of the RRMSD at which ray tracing ends, for draft quality
@@ -36,6 +39,27 @@ class Nominal:
     def channels(self) -> tuple[Channel, ...]:
         """Channels of the scene's light; their points on an extended source are not the points used in tailoring."""
         return self.scene.verification_channels()
+
+    @cached_property
+    def far_field(self) -> FarField:
+        """Light of the scene for the intensity behind the lens, on the grid of an intensity as the first target."""
+        scene, target = self.scene, self.scene.target
+        wanted = target.intensity if isinstance(target, AngularTarget) else None
+        return FarField(
+            self.channels, scene.source.luminous_flux, ghost=scene.ghost, sampler=scene.sampler,
+            grid=None if wanted is None else grid_of(wanted.table),
+        )  # fmt: skip
+
+    @property
+    def has_far_field(self) -> bool:
+        """True for a target over directions or a known luminous flux, if no mirror turns the light back."""
+        angular = any(isinstance(target, AngularTarget) for target in self.scene.targets)
+        return (angular or self.scene.source.luminous_flux is not None) and not self.scene.light_path.is_folded
+
+    @property
+    def emitter(self) -> Emitter:
+        """Source of the scene, for a dome by the points of a sphere about its centre."""
+        return self.scene.light
 
     @property
     def heaviest(self) -> Channel:

@@ -96,7 +96,7 @@ def test_a_photo_is_a_verified_lens_in_four_requests(own, light, size, tmp_path)
     if light == "laser":  # the lens of a design without the workbench, to the last bit
         alone = pipeline.design(load(own.folder / name / "scene.toml"))
         assert np.array_equal(
-            folders.read_nominal(own.folder / name)[1].lens.back.control_points(), alone.lens.back.control_points()
+            folders.read_nominal(own.folder / name).lens.back.control_points(), alone.lens.back.control_points()
         )
     again = own.ask(f"/api/design/{name}/edit", {}).json["name"]  # and its scene, with the comments that it had
     assert "# the wall with the picture" in own.workspace.opened(again).text

@@ -27,7 +27,7 @@ LARGER = (
 
 
 def control_points(folder):
-    return folders.read_nominal(folder)[1].lens.back.control_points()
+    return folders.read_nominal(folder).lens.back.control_points()
 
 
 @pytest.fixture(scope="module")

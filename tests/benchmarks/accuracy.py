@@ -141,7 +141,7 @@ def designed(scene: str, quality: str, settings: Sequence[str] = ()) -> Record:
     with tempfile.TemporaryDirectory() as place:
         run = generate(scene, Path(place) / scene, f"tailoring.quality={quality}", *settings)
         report = run.report()
-        lens = read_nominal(Path(place) / scene)[1].lens
+        lens = read_nominal(Path(place) / scene).lens
         coarse = {"rrmsd_coarse": judged(lens, COARSE)["rrmsd"]} if scene == PEER else {}
     half, half_noise = stated_by_cell(report).get(HALF, (None, None))
     shape, machine = report["shape"], report["machine"]

@@ -29,8 +29,8 @@ from skimage.data import astronaut
 
 from bstcad.cad import mesh as meshes
 from bstcad.cad import step_reading, step_writing
+from bstcad.designs.designed_lens import DesignedLens
 from bstcad.designs.folder import write_geometry
-from bstcad.designs.made import Made
 from bstcad.designs.pipeline import design
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
@@ -188,9 +188,9 @@ def _evaluation(m: int = NET, n: int = TUBES, pixels: int = PIXELS, lines: int =
     return lambda: variable.adjoint(problem([lens.back.heights + variable.heights(c)])[1][0])
 
 
-def _made(m: int, pixels: int = PIXELS) -> Made:
+def _made(m: int, pixels: int = PIXELS) -> DesignedLens:
     scene = _scene(m, pixels)
-    return Made(scene, lens_of(m), scene.goals)
+    return DesignedLens(scene, lens_of(m), scene.goals)
 
 
 def _in_a_folder(work: Callable[[Path], Any]) -> None:

@@ -26,7 +26,8 @@ def finer_targets(folder: Path) -> list[dict[int, np.ndarray]]:
 
     A photograph that an outline or the reach of the lens cuts is drawn, too, since the cut is sharp at every scale.
     """
-    scene, nominal = read_nominal(folder)
+    nominal = read_nominal(folder)
+    scene = nominal.scene
     return [
         {} if target.photo is not None and target.outline is None and goal.reachable is None
         else {k: goal.on_cells(k).picture for k in (2, 4)}

@@ -76,7 +76,7 @@ def designed(name: str, sun: Path | None) -> dict[str, Any]:
         report, judged = run.report(), judge(run.folder, finer_targets=finer_targets(run.folder)[0])
         with np.load(run.folder / "design.npz") as kept:
             target = kept["target"].astype(float)
-        seen = View.of(read_nominal(run.folder)[0])
+        seen = View.of(read_nominal(run.folder).scene)
     files.put(PICTURES / f"{name}.png", side_by_side(seen.picture(target), seen.picture(judged.picture)))
     half, half_error = judged.by_cell[HALF]
     return {

@@ -43,7 +43,7 @@ def switched_on(scene, kind):
     if kind == "absorption":
         return scene.model_copy(update={"effects": (*scene.effects, Absorption(kind="absorption"))}).channels()
     if kind == "dispersion":
-        low, high = band(scene)
+        low, high = band(scene.source)
         lines = low + (high - low) * (np.arange(LINES) + 0.5) / LINES
         return [replace(channel, weight=channel.weight / LINES,
                         index=media.refractive_index(scene.lens.material, line))

@@ -31,7 +31,8 @@ LANDING, PATH = 1e-9, 1e-6  # mm: batoid against bstcad
 def made(request, tmp_path_factory):
     """(name, scene, lens, report) of a template, made by the command and read back from its folder."""
     run = generate(request.param, tmp_path_factory.mktemp(request.param) / "made")
-    scene, nominal = folders.read_nominal(run.folder)
+    nominal = folders.read_nominal(run.folder)
+    scene = nominal.scene
     return request.param, scene, nominal.lens, run.report()
 
 

@@ -136,10 +136,10 @@ def ordered(scene, lens, shape):
     with tempfile.TemporaryDirectory() as place:
         said, folder = scene.part.of(scene.lens), Path(place)
         (folder / "lens.step").write_bytes(b"ISO-10303-21;")  # of which nothing but its digest is asked
-        if scene.mount is None:
-            return order_of(scene, lens, shape, folder, None)
-        mounting.write_if_it_fits(lens, scene.mount, folder / "part.step", scene.name, said)
-        return order_of(scene, lens, shape, folder, measured(folder / "part.step"))
+        if scene.mount is not None:
+            mounting.write_if_it_fits(lens, scene.mount, folder / "part.step", scene.name, said)
+        found = scene.mount and measured(folder / "part.step")
+        return order_of(lens, shape, folder, stated=said, mount=scene.mount, found=found)
 
 
 @functools.cache

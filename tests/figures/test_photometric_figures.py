@@ -14,6 +14,7 @@ from bstcad.figures.light_figures import View
 from bstcad.optics.receivers.directions import Directions
 from bstcad.optics.trace.measure import Light
 from bstcad.photometry.intensity import Intensity
+from bstcad.verify.nominal import Nominal
 
 AROUND, ALONG = np.arange(0.0, 360.0, 5.0), np.arange(0.0, 91.0, 1.0)
 C, GAMMA = np.radians(AROUND)[:, None], np.radians(ALONG)[None]
@@ -106,5 +107,5 @@ def test_a_lamp_of_known_flux_has_a_cone_diagram(lumens, expected):
 def test_scenes_over_directions_or_with_lumens_have_a_far_field():
     disk = bstcad.load("templates/disk.toml")
     angular = {"target": {"kind": "intensity", "x": [-9.0, 9.0], "y": [-9.0, 9.0], "pixels": 16, "uniform": True}}
-    found = [figures.has_far_field(disk.changed(each)) for each in ({}, {"source.lumens": 100.0}, angular)]
-    assert found == [False, True, True]
+    scenes = [disk.changed(each) for each in ({}, {"source.lumens": 100.0}, angular)]
+    assert [Nominal(scene, None, scene.goals).has_far_field for scene in scenes] == [False, True, True]

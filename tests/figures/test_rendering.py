@@ -25,6 +25,7 @@ from bstcad.figures.figure_jobs import Pictures
 from bstcad.optics.lens import face_integrals
 from bstcad.optics.surfaces.bspline import BSplineSurface
 from bstcad.optics.surfaces.surfaces import Recess
+from bstcad.verify.nominal import Nominal
 
 CUBE = trimesh.creation.box((24.0, 24.0, 10.0))
 OUTLINES = (Rectangle(8.0, 6.0), Circle(4.0))
@@ -58,7 +59,10 @@ def test_an_interrupted_report_waits_for_no_picture(small_scene, monkeypatch, tm
     slow.chmod(0o755)
     monkeypatch.setattr(rendering.sys, "executable", str(slow))
     found = []
-    with pytest.raises(KeyboardInterrupt), Pictures(small_scene, submit=None) as drawn:
+    with (
+        pytest.raises(KeyboardInterrupt),
+        Pictures(Nominal(small_scene, None, small_scene.goals), submit=None) as drawn,
+    ):
         job = drawn._vtk.submit(lambda: found.append(rendering.lens_picture(BOX)))
         while not rendering._drawing and not job.done():
             time.sleep(0.01)

@@ -204,7 +204,7 @@ def test_a_gradient_that_is_not_finite_is_counted_and_left_out(small_scene, smal
 
     monkeypatch.setattr(stage2.Problem, "__call__", sometimes)
     found = design(small_scene, device="cpu")
-    assert found.making.skipped_steps == 2 and small_design.report["skipped_steps"] == 0
+    assert found.course.skipped_steps == 2 and small_design.report["skipped_steps"] == 0
     assert bool(torch.isfinite(found.lens.back.heights).all())
-    ratio = found.making.history[-1].rrmsd / small_design.report["history"][-1]["rrmsd"]
+    ratio = found.course.history[-1].rrmsd / small_design.report["history"][-1]["rrmsd"]
     holds("RRMSD with two gradients that are not finite, divided by the RRMSD without them", ratio, 1.5)

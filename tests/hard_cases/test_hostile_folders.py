@@ -185,12 +185,12 @@ def test_an_earlier_report_that_does_not_fit_is_not_believed(quick_folder, holds
     path = quick_folder / "report.json"
     for text in REPORTS.values():
         path.write_text(text())
-        assert record.making(path) == DesignCourse()
+        assert record.read_course(path) == DesignCourse()
         with pytest.raises(ValueError, match="report.json: cannot be read .*; run bstcad verify"):
             record.read(path)
     path.write_text(REPORTS["huge"]())
     with spending("a huge report.json", 300.0, holds):
-        record.making(path)
+        record.read_course(path)
     path.write_text(REPORTS["passed"]())
     found, kept = commands.verify(quick_folder).facts, [field.name for field in dataclasses.fields(DesignCourse)]
     assert {name for name in kept if found.get(name)} == {"machine", "versions"}
@@ -282,7 +282,7 @@ def test_no_name_leads_out_of_the_folder(tmp_path, monkeypatch, holds):
             scene = load(DISK, changes)
         place = tmp_path / f"out{number}"
         with folders.replacing(place / scene.name) as building:
-            folders.write_geometry(folders.Made(scene, scene.flat_lens(9), scene.goals), building)()
+            folders.write_geometry(folders.DesignedLens(scene, scene.flat_lens(9), scene.goals), building)()
         made = {path.relative_to(place) for path in place.rglob("*") if path.is_file()}
         assert {path.parts[0] for path in made} == {scene.name} and all(len(path.parts) == 2 for path in made)
         copied = {path.name for path in made} - {"lens.step", "lens.stl", "lens.3mf", "scene.toml"}

@@ -49,7 +49,7 @@ def folder(small_design, tmp_path, monkeypatch):
 def others(small_design, tmp_path_factory):
     """STEP texts of other things, and texts of no kind."""
     path = tmp_path_factory.mktemp("others") / "x.step"
-    lens, box = lens_solid(read_nominal(small_design.folder)[1].lens), cadquery.Workplane().box(8, 6, 10)
+    lens, box = lens_solid(read_nominal(small_design.folder).lens), cadquery.Workplane().box(8, 6, 10)
     shapes = {
         "the lens 1 µm aside": lens.translate(cadquery.Vector(1e-3, 0, 0)),
         "the lens turned": lens.rotate(cadquery.Vector(0, 0, 0), cadquery.Vector(0, 0, 1), 90),

@@ -134,7 +134,7 @@ def read_sweep(path):
 def read_rounds(path):
     """The rounds of a design, as the next round and the production page read them."""
     folder = path.parents[2]
-    return rounds._last(folder, folders.read_nominal(folder)[1].lens), production.rounds_in(folder)
+    return rounds._last(folder, folders.read_nominal(folder).lens), production.rounds_in(folder)
 
 
 def round_in(path):

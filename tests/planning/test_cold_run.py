@@ -62,7 +62,7 @@ def test_a_run_with_a_damaged_report_fails_and_says_so(tiny, monkeypatch):
 
 def test_a_lens_tailored_to_other_pixels_is_judged_on_those_of_the_base(small_design):
     """The judge takes the lens from the run's folder, and light and pixels from the base."""
-    run, (scene, _) = ColdRun(settings=(), status=DONE), folders.read_nominal(small_design.folder)
+    run, scene = ColdRun(settings=(), status=DONE), folders.read_nominal(small_design.folder).scene
     effort = Effort(512)  # of its proof: the noise of half as many rays a side is a third of its RRMSD
     full = judge_run(run, scene, small_design.folder, effort)
     coarse = judge_run(run, scene.changed({"target.pixels": [32, 24]}), small_design.folder, effort)
@@ -72,7 +72,7 @@ def test_a_lens_tailored_to_other_pixels_is_judged_on_those_of_the_base(small_de
 
 
 def test_of_several_targets_the_worst_counts(small_design):
-    run, (scene, _) = ColdRun(settings=(), status=DONE), folders.read_nominal(small_design.folder)
+    run, scene = ColdRun(settings=(), status=DONE), folders.read_nominal(small_design.folder).scene
     own = scene.target.model_dump(mode="json", exclude_none=True)
     both = [own, own | {"z": scene.target.z + 40.0}]  # for the second of which nobody designed the lens
     alone, second, worst = (

@@ -40,19 +40,19 @@ def of(found):
     light = measure(found.lens, scene.channels(), target.screen, found.goals[0].picture, Effort(96))
     proven = SimpleNamespace(picture=light.picture, efficiency=0.9)
     proof = SimpleNamespace(lens=found.lens, light=proven, at_bounds=None)
-    return diagnosis(scene, found.making, proof, found.goals[0].picture), found.making
+    return diagnosis(scene, found.course, proof, found.goals[0].picture), found.course
 
 
 @pytest.mark.parametrize("name", suite.in_turns(SCENES, 3))
 def test_every_kind_of_design_has_one(name):
-    found, making = of(pipeline.design(load(DISK, TINY | SCENES[name])))
+    found, course = of(pipeline.design(load(DISK, TINY | SCENES[name])))
     assert sum(part["error"] for part in found["remaining_error"]["parts"]) == pytest.approx(1)
     assert sum(octave["error"] for octave in found["remaining_error"]["octaves"]) == pytest.approx(1)
     assert found["remaining_error"]["outside"] == pytest.approx(0.1)
     assert 0 <= found["convergence"]["last_tenth"] <= 1 and found["convergence"]["rrmsd"] > 0
     json.dumps(found, allow_nan=False)
-    assert making.stages[0].cpu_seconds is None
-    assert all(0 <= stage.cpu_seconds < math.inf for stage in making.stages[1:])
+    assert course.stages[0].cpu_seconds is None
+    assert all(0 <= stage.cpu_seconds < math.inf for stage in course.stages[1:])
 
 
 def test_sunlight_parts_over_all_that_is_seen():

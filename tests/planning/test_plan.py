@@ -8,9 +8,9 @@ import pytest
 
 from bstcad import cli
 from bstcad.planning import plan as plans
+from bstcad.planning.effect_estimates import simulated
 from bstcad.planning.plan import plan, predict_qualities
 from bstcad.planning.prediction import PILOT_QUALITIES, QUALITIES, run_pilot
-from bstcad.report.record import simulated
 from bstcad.scene.errors import toml_positions
 from bstcad.scene.scene import load
 from tests import suite

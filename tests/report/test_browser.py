@@ -71,7 +71,8 @@ def browser():
 def path(small_design, tmp_path_factory):
     """The report of the small design, with a picture of its lens, a made part and another program's judgement."""
     folder, path = small_design.folder, tmp_path_factory.mktemp("page") / "report.html"
-    scene, nominal = folders.read_nominal(folder)
+    nominal = folders.read_nominal(folder)
+    scene = nominal.scene
     drawn = io.BytesIO()
     Image.new("RGBA", (40, 30), "#d3d9e0").save(drawn, "PNG")
     pictures = {picture.stem: picture.read_bytes() for picture in (folder / "figures").iterdir()}
@@ -265,7 +266,7 @@ PATIENCE = 5000  # ms until a picture is decoded and drawn, at most
 @pytest.fixture(scope="module")
 def at_work(small_design):
     """The lens of the small design and its light, on a wider wall, white where x and y are large, and seen along +z."""
-    _, nominal = folders.read_nominal(small_design.folder)
+    nominal = folders.read_nominal(small_design.folder)
     path = commands.light_path_in(small_design.folder)
     picture = np.zeros((64, 64), np.uint8)
     picture[:32, 32:] = 255

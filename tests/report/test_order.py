@@ -31,7 +31,8 @@ STATED = {
 def sent(scene, folder, found=None):
     lens = lens_of(scene)
     (folder / "lens.step").write_bytes(b"lens")
-    return order.order_of(scene, lens, describe(lens, 65) | {"volume": 1000.0}, folder, found)
+    shape, stated = describe(lens, 65) | {"volume": 1000.0}, scene.part.of(scene.lens)
+    return order.order_of(lens, shape, folder, stated=stated, mount=scene.mount, found=found)
 
 
 def test_a_bare_lens_is_lens_step_with_what_the_scene_states(tmp_path):

@@ -16,9 +16,10 @@ from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.optics.trace.measure import Light
+from bstcad.planning.effect_estimates import simulated
 from bstcad.report import report as reports
 from bstcad.report.goal_figures import photometry
-from bstcad.report.record import of_json, plain, simulated
+from bstcad.report.record import of_json, plain
 from bstcad.scene.scene import load
 from bstcad.verify.light_limits import LightValue
 from tests.lenses import net
@@ -39,7 +40,8 @@ def absolute(scene):
     peak = float((picture / scene.target.screen.cell_sizes).max() / picture.sum())
     light = Light(picture, 0.1, 0.0, rays=1, flux=flux, on_screen=ON_TARGET, peak=peak)
     lens = Lens.between(Plane(15.0), net(z=20.0), Circle(8.0), 1.5)
-    [found] = photometry(scene, SimpleNamespace(lights=(light,), lens=lens))
+    lumens, reflection = scene.source.luminous_flux, scene.loses_reflections
+    [found] = photometry(scene.goals, SimpleNamespace(lights=(light,), lens=lens), lumens, reflection=reflection)
     return found
 
 
@@ -49,7 +51,7 @@ def test_a_disc_has_the_lux_of_its_lumens(disk):
     assert found.peak == pytest.approx(LUMENS * ON_TARGET / area, rel=1e-3) and found.unit == "lx"
     assert found.mean == pytest.approx(LUMENS * ON_TARGET / whole) and found.lumens == LUMENS * ON_TARGET
     assert found.output_ratio == LEAVING and found.reflection and found.luminance is None
-    assert list(photometry(disk.changed({"source.lumens": None}), SimpleNamespace(lights=(None,)))) == []
+    assert list(photometry(disk.goals, SimpleNamespace(lights=(None,)), None, reflection=False)) == []
     assert not absolute(disk.changed({"effects": []})).reflection
 
 

@@ -59,7 +59,7 @@ def test_radius_and_vertices_agree_with_the_step_file_everywhere(small_design):
     lens = step_reading.lens(step_reading.read(small_design.folder / "lens.step"), 1.5)
     assert written["back"]["vertex"][2] == pytest.approx(prescriptions.vertex(lens), abs=1e-9)
     assert written["net"]["control_points"] == [33, 33] and written["net"]["degree"] == 2
-    assert written["material"] == "PMMA" and written["index"] == read_nominal(small_design.folder)[1].lens.index
+    assert written["material"] == "PMMA" and written["index"] == read_nominal(small_design.folder).lens.index
     assert written["mass"] == pytest.approx(1.19e-3 * small_design.report["shape"]["volume"], rel=1e-9)
 
 
@@ -102,7 +102,8 @@ def test_a_back_that_moved_says_where_it_stands(free, tmp_path):
 
 
 def test_a_plane_has_no_radius_and_an_index_no_mass(small_design):
-    scene, nominal = read_nominal(small_design.folder)
+    nominal = read_nominal(small_design.folder)
+    scene = nominal.scene
     lens = nominal.lens.between(Plane(15.0), nominal.lens.back, nominal.lens.outline, 1.7)
     bare = scene.changed({"lens.front": Plane(15.0), "lens.material": None, "lens.index": 1.7})
     record = prescriptions.prescription(bare, lens, describe(lens) | {"volume": 500.0})
@@ -113,7 +114,8 @@ def test_a_plane_has_no_radius_and_an_index_no_mass(small_design):
 
 @pytest.mark.parametrize(("material", "mass"), [("N-LAK33A", 2.11), ("other/Optorez1330/Sultanova", None)])
 def test_the_mass_is_known_where_the_density_is(small_design, material, mass):
-    scene, nominal = read_nominal(small_design.folder)
+    nominal = read_nominal(small_design.folder)
+    scene = nominal.scene
     other = scene.model_copy(update={"lens": scene.lens.model_copy(update={"material": material})})
     record = prescriptions.prescription(other, nominal.lens, describe(nominal.lens) | {"volume": 500.0})
     assert record["mass"] == (mass and pytest.approx(mass, abs=0.01))

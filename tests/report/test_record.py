@@ -36,8 +36,8 @@ def test_a_file_of_before_is_read_and_written_again_to_the_last_character(tmp_pa
 def test_a_written_report_is_kept_whole(small_design):
     path = small_design.folder / "report.json"
     found = record.read(path)
-    assert found.facts() == json.loads(path.read_text()) and found.making == record.making(path)
-    assert found.history and found.stages and found.making.twins == found.twins
+    assert found.facts() == json.loads(path.read_text()) and found.course == record.read_course(path)
+    assert found.history and found.stages and found.course.twins == found.twins
 
 
 def test_figures_on_cells_are_kept_for_the_worst_target_and_for_each(small_design):
@@ -80,7 +80,7 @@ def test_a_report_with_an_entry_that_does_not_fit_is_refused_in_one_sentence(tmp
     with pytest.raises(ValueError, match="report.json: cannot be read .*; run bstcad verify") as refused:
         record.read(path)
     assert str(refused.value).isprintable() and len(str(refused.value)) < 400
-    assert record.making(path) == DesignCourse()
+    assert record.read_course(path) == DesignCourse()
 
 
 def _with(key, text):

@@ -103,7 +103,7 @@ def scene():
 
 
 def said(scene, changes=None, target=None, found=None, cells=()):
-    facts = copy.deepcopy(FACTS)
+    facts = copy.deepcopy(FACTS) | {"rrmsd_asked": scene.accept.rrmsd}
     for key, value in (changes or {}).items():
         table, _, name = key.partition(".")
         if name:
@@ -114,7 +114,10 @@ def said(scene, changes=None, target=None, found=None, cells=()):
     figures = {key: facts[key] for key in ("rrmsd", "efficiency") if key in facts}
     contents = replace(CONTENTS, **facts, goals=(replace(CONTENTS.goals[0], **figures, rrmsd_by_cell=cells),))
     goal = Goal("target", Screen(500.0, (-200.0, 200.0), (-200.0, 200.0), 8), target)
-    return remarks(contents, scene, [goal], [target if found is None else found])
+    return remarks(
+        contents, [goal], [target if found is None else found], blank=scene.lens, source=scene.source,
+        asked=scene.tailoring, mesh_tolerance=None if scene.output.mesh_tolerance else scene.mesh_tolerance,
+    )  # fmt: skip
 
 
 def on_cells(pixel, half, blurred=None):

@@ -16,7 +16,7 @@ from bstcad.optics.receivers.receivers import LevelPlane, TiltedPlane
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Plane, Recess, Sphere
 from bstcad.optics.trace.trace import ghost_light
-from bstcad.report.record import simulated
+from bstcad.planning.effect_estimates import simulated
 from bstcad.scene.accept import Accept
 from bstcad.scene.beam import Collimated
 from bstcad.scene.blank import Back, LensBlank

@@ -172,16 +172,17 @@ def test_both_nets_of_a_design_come_back_to_the_last_bit(disk, points, only_fron
     lens = scene.flat_lens(17)
     lens = lens.with_heights(0.1 * torch.randn(net.shape, generator=g, dtype=torch.float64) for net in lens.nets)
     lens = lens.with_front(replace(lens.front, z=15.0 + moved))  # as it is moved clear of the back
-    design = folders.Made(resolved(scene, lens), lens, scene.goals)
+    design = folders.DesignedLens(resolved(scene, lens), lens, scene.goals)
     assert design.scene == scene and "optimise = true" in scene.toml()  # from which it is designed again
     for name, data in folders.scene_files(design.scene).items():
         (tmp_path / name).write_bytes(data)
     folders.write_design(design, (), tmp_path)
-    again, nominal = folders.read_nominal(tmp_path)
+    nominal = folders.read_nominal(tmp_path)
+    again = nominal.scene
     assert again == scene and nominal.lens.tailored_numbers == lens.tailored_numbers
     for one, other in ((lens.front, nominal.lens.front), (lens.back, nominal.lens.back)):
         assert np.array_equal(one.control_points(), other.control_points())
-    read = folders.Made(again, nominal.lens, nominal.goals)
+    read = folders.DesignedLens(again, nominal.lens, nominal.goals)
     assert design.is_lens_of(read)
     heights = nominal.lens.front.heights.clone()
     heights[3, 3] += 1e-9

@@ -48,7 +48,7 @@ def rrmsd(made):
 
 def names(made):
     """The rounds of stage 2."""
-    return [stage.name for stage in made.making.stages if stage.name.startswith("stage 2")]
+    return [stage.name for stage in made.course.stages if stage.name.startswith("stage 2")]
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_a_stage_hands_on_its_best_lens(monkeypatch):
 
     monkeypatch.setitem(pipeline.PROCEDURES, "least-squares", ("stage 1", stage1.steps, steps))
     made = design(near().changed({"target.image": None, "target.text": "T"}), device="cpu", options=LATER)
-    judged = {stage.name: stage.rrmsd for stage in made.making.stages}
+    judged = {stage.name: stage.rrmsd for stage in made.course.stages}
     on_few, on_all = (judged[name] for name in names(made)[-1:-3:-1])
     assert on_few > 1.2 * on_all  # else there is nothing to see here
     assert judged[BEST_LENS_STAGE] < 1.05 * on_all

@@ -85,8 +85,8 @@ def test_the_gradient_for_a_back_alone_is_that_of_finite_differences():
 def test_a_tool_of_50_mm_fits_and_the_picture_stays(free, bound):
     lens = bound.lens
     assert steepest(free.lens)[1] > 1.2 / 50 and steepest(lens)[1] <= 1 / 50
-    judged = {stage.name: stage.rrmsd for stage in bound.making.stages}
-    without = free.making.stages[-1].rrmsd
+    judged = {stage.name: stage.rrmsd for stage in bound.course.stages}
+    without = free.course.stages[-1].rrmsd
     assert max(judged["bounds on the back"], without) < 0.0115  # 0.0103, and 0.0078; stage 1 leaves 0.046
 
 

@@ -125,10 +125,10 @@ def test_a_design_goes_on_from_wherever_it_was_left(name, tmp_path):
         again = design(scene, device="cpu", start=checkpoint.read(path, DesignState)[1])
         assert all(map(torch.equal, heights_of(again), heights_of(whole))), path
         assert again.lens.front.is_net or again.lens.front == whole.lens.front
-        assert [point.rrmsd for point in again.making.history] == [point.rrmsd for point in whole.making.history]
-        assert [(s.name, s.rrmsd) for s in again.making.stages] == [(s.name, s.rrmsd) for s in whole.making.stages]
+        assert [point.rrmsd for point in again.course.history] == [point.rrmsd for point in whole.course.history]
+        assert [(s.name, s.rrmsd) for s in again.course.stages] == [(s.name, s.rrmsd) for s in whole.course.stages]
         for entry in ("stopped", "skipped_steps", "twins", "transport"):
-            assert getattr(again.making, entry) == getattr(whole.making, entry)
+            assert getattr(again.course, entry) == getattr(whole.course, entry)
         assert again.transport.plane == whole.transport.plane == ("entrance" if name == "paper" else "back")
         assert np.array_equal(again.transport.source, whole.transport.source)
 
@@ -150,9 +150,9 @@ def test_an_interrupt_anywhere_gives_a_lens_and_loses_nothing():
             assert not kept
             continue
         lenses += 1
-        assert found.making.stopped == "interrupt" and bool(torch.isfinite(found.lens.back.heights).all())
+        assert found.course.stopped == "interrupt" and bool(torch.isfinite(found.lens.back.heights).all())
         assert found.lens.back.m == whole.lens.back.m
         again = design(scene, device="cpu", start=kept[-1] if kept else None)
         assert torch.equal(again.lens.back.heights, whole.lens.back.heights)
-        assert again.making.stopped == whole.making.stopped
+        assert again.course.stopped == whole.course.stopped
     assert lenses > 2 and early < 3

@@ -101,7 +101,7 @@ def test_the_size_of_the_source_is_made_up_for(compensated):
 def test_it_tells_what_each_size_costs(compensated):
     """Stage 2 is replaced; the rays between the stages see the source's points, which no tailoring sees."""
     found, rrmsd = compensated
-    stages = [stage for stage in found.making.stages if stage.name.startswith("stage ")]
+    stages = [stage for stage in found.course.stages if stage.name.startswith("stage ")]
     assert [stage.name for stage in stages] == [
         "stage 1", *["stage 3, 64² tubes"] * 5,
     ]  # fmt: skip
@@ -144,7 +144,7 @@ def test_no_more_tubes_than_the_net_and_the_pixels_ask_for():
 
 @pytest.fixture(scope="module")
 def found():
-    return design(load(DISK, TWINS), device="cpu").making.twins
+    return design(load(DISK, TWINS), device="cpu").course.twins
 
 
 @suite.in_turn(1, 2)
@@ -176,5 +176,5 @@ def test_a_coarser_arithmetic_shows(monkeypatch, found):
         return call(problem, [h.half().float() if h.dtype == torch.float32 else h for h in heights])
 
     monkeypatch.setattr(stage2.Problem, "__call__", coarse)
-    again = design(load(DISK, TWINS), device="cpu").making.twins
+    again = design(load(DISK, TWINS), device="cpu").course.twins
     assert again["gradient"] > 3 * found["gradient"]

@@ -50,7 +50,7 @@ def folder(small_design, tmp_path):
 @pytest.fixture
 def nominal(small_design, few):
     """The small design on 16 x 12 pixels, with a target that it misses by 8 %: resolved by few rays."""
-    found = read_nominal(small_design.folder)[1]
+    found = read_nominal(small_design.folder)
     [goal] = found.goals
     target = goal.picture.reshape(12, 4, 16, 4).sum((1, 3))
     target *= 1 + 0.08 * (-1.0) ** np.add.outer(np.arange(12), np.arange(16))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from bstcad.analysis.far_field import FarField
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.trace.measure import Light
 from bstcad.report.record import Contents, of_json, plain
@@ -30,7 +31,8 @@ def values(scene, noise=0.0, tilt=0.0):
     sets = tuple(torch.from_numpy(even * (1 + noise * chance.normal(size=even.shape))) for _ in range(8))
     light = Light(even, 0.1, 0.0, rays=1, flux={}, sets=sets, on_screen=ON_TARGET)
     goal = Goal("target", goal.screen, goal.screen.cell_sizes / goal.screen.cell_sizes.sum())
-    return light_values(scene, [goal], [light], lens=None, channels=())
+    far = FarField((), scene.source.luminous_flux)
+    return light_values(scene.accept, [goal], [light], lens=None, far=far)
 
 
 def with_point(disk, **point):

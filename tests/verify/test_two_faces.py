@@ -14,7 +14,7 @@ from bstcad import commands
 from bstcad.analysis.shape import describe, survey
 from bstcad.commands import ProofOptions
 from bstcad.designs import folder as folders
-from bstcad.report import prescription, report
+from bstcad.report import report
 from bstcad.step_text import part21
 from bstcad.verify import checks, step_checks, text_checks
 from bstcad.verify.nominal import Nominal
@@ -60,7 +60,7 @@ def test_each_light_is_that_of_its_own_screen(two):
     """Traced one by one, as if there were no other; the second target is wider, further away and of other pixels."""
     light, other = two.proof.lights
     assert two.proof.light is max(light, other, key=lambda each: each.rrmsd) and two.proof.wavefront is None
-    nominal = folders.read_nominal(two.folder)[1]
+    nominal = folders.read_nominal(two.folder)
     effort = replace(nominal.effort(quick_effort()), seed=nominal.scene.tailoring.seed + checks.VERIFY_SEED)
     for goal, found in zip(nominal.goals, two.proof.lights, strict=True):
         alone = bstcad.measure(two.proof.lens, nominal.channels, goal.screen, goal.picture, effort=effort)
@@ -71,7 +71,7 @@ def test_each_light_is_that_of_its_own_screen(two):
 def test_accept_holds_for_each_target(two):
     """A limit between the two figures fails the worse one alone."""
     low, high = sorted(light.rrmsd for light in two.proof.lights)
-    nominal = folders.read_nominal(two.folder)[1]
+    nominal = folders.read_nominal(two.folder)
     between = replace(nominal, scene=nominal.scene.changed({"accept.rrmsd": (low + high) / 2}))
     proof = checks.verify(two.folder, between, effort=quick_effort())
     assert not proof.passed
@@ -80,7 +80,7 @@ def test_accept_holds_for_each_target(two):
 
 
 def test_a_target_without_light_is_named(two):
-    nominal = folders.read_nominal(two.folder)[1]
+    nominal = folders.read_nominal(two.folder)
     first, second = nominal.goals
     dark = replace(second, screen=replace(second.screen, x=(500.0, 510.0)))
     with pytest.raises(ValueError, match=r"none of its light falls on target\[1\]"):
@@ -167,7 +167,7 @@ def test_a_mounted_lens_has_both_nets_in_its_part(tmp_path):
 
 def test_the_margin_to_total_reflection_is_of_light_in_the_glass(two):
     """Nets that are free move no ray: the figure is that of the same faces with a fixed front."""
-    nominal = folders.read_nominal(two.folder)[1]
+    nominal = folders.read_nominal(two.folder)
     free, fixed = (
         checks.margins(nominal.channels, replace(nominal.lens, tailored=shaped), nominal.goals[0].screen, 0, n=64)
         for shaped in ((0, 1), None)
@@ -194,7 +194,8 @@ def test_the_design_holds_every_target_and_reads_back(two):
     for face in ("front", "back"):
         net, designed = (getattr(lens, face).control_points() for lens in (opened.lens, two.made.lens))
         assert np.array_equal(net, designed)
-    scene, nominal = folders.read_nominal(two.folder)
+    nominal = folders.read_nominal(two.folder)
+    scene = nominal.scene
     assert scene == two.made.scene and [goal.weight for goal in nominal.goals] == [1.0, 2.5]
     assert [goal.key for goal in nominal.goals] == ["target[0]", "target[1]"]
 
@@ -206,7 +207,7 @@ def test_what_light_cannot_reach_of_a_further_target_is_kept(two, tmp_path):
     made = replace(two.made, goals=(first, second.restricted(part)))
     folders._write_scene(made, tmp_path)
     folders.write_design(made, (), tmp_path)
-    _, nominal = folders.read_nominal(tmp_path)
+    nominal = folders.read_nominal(tmp_path)
     first, goal = nominal.goals
     assert np.array_equal(goal.reachable, part) and not goal.picture[:, :4].any() and goal.whole[:, :4].all()
     assert first.reachable is None and goal.picture.sum() == pytest.approx(goal.whole.sum())
@@ -257,7 +258,7 @@ def test_prescription_and_data_sheet_have_both_nets(two):
     assert [name for name, _ in front] == [name for name, _ in back]
     assert dict(front)["Form"] == "B-spline of degree 2, 33 × 33"
     assert "RRMSD" in dict(purpose)["target[1]"] and body
-    order = prescription.order_of(two.made.scene, two.made.lens, two.facts["shape"], two.folder)
+    order = commands._order(two.made, two.facts["shape"], two.folder)
     assert order.freeform == ("back", "front") and "8.06 mm before the vertex of the front" in order.datum
     radii = two.facts["shape"]["radius_min_concave"], two.facts["shape"]["front_radius_min_concave"]
     assert order.tool_radius == pytest.approx(min(radii), rel=1e-9)

@@ -68,7 +68,7 @@ def test_without_a_limit_both_values_are_stated(one):
 
 @suite.in_turn(0, 3)
 def test_a_wavefront_beyond_its_limit_fails(one):
-    nominal, rms = folders.read_nominal(one.folder)[1], one.proof.wavefront.without_tilt.rms
+    nominal, rms = folders.read_nominal(one.folder), one.proof.wavefront.without_tilt.rms
     assert nominal.scene.wavefront == one.made.scene.wavefront
     _, found = judged(one.proof.lens, nominal, wavefront=0.99 * rms)
     assert not found[RMS].passed and found[FLOOR].passed and found[FLOOR].limit == pytest.approx(0.099 * rms)
@@ -78,14 +78,14 @@ def test_a_wavefront_beyond_its_limit_fails(one):
 
 @suite.in_turn(0, 3)
 def test_a_limit_that_rounding_hides_fails_by_the_floor(one):
-    nominal, floor = folders.read_nominal(one.folder)[1], one.proof.wavefront.floor
+    nominal, floor = folders.read_nominal(one.folder), one.proof.wavefront.floor
     _, found = judged(one.proof.lens, nominal, wavefront=5 * floor)
     assert not found[FLOOR].passed and found[FLOOR].limit == 0.5 * floor
 
 
 @suite.in_turn(0, 3)
 def test_a_wave_that_no_light_meets_fails_and_has_no_figures(one):
-    nominal, beside = folders.read_nominal(one.folder)[1], ZernikeWave((0.0,), 1.0, z=60.0, centre=(500.0, 0.0))
+    nominal, beside = folders.read_nominal(one.folder), ZernikeWave((0.0,), 1.0, z=60.0, centre=(500.0, 0.0))
     nominal = replace(nominal, scene=nominal.scene.model_copy(update={"wavefront": beside}))
     error, found = judged(one.proof.lens, nominal)
     assert error is None and found.keys() == {RMS} and not found[RMS].passed
@@ -151,4 +151,4 @@ def test_a_scene_without_a_wave_has_nothing_of_it(small_design):
     assert [check["name"] for check in small_design.report["checks"] if "wavefront" in check["name"]] == []
     page = (small_design.folder / "report.html").read_text(encoding="utf-8")
     assert "Wavefront" not in page and not (small_design.folder / "figures" / "wavefront.png").exists()
-    assert folders.read_nominal(small_design.folder)[1].scene.wavefront is None
+    assert folders.read_nominal(small_design.folder).scene.wavefront is None

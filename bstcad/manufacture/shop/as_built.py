@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bstcad.designs.made import Made
+from bstcad.designs.designed_lens import DesignedLens
 from bstcad.designs.pipeline import DesignOptions, Earlier, design
 from bstcad.manufacture.measured.cloud import load as load_cloud
 from bstcad.manufacture.measured.compensation import measured_form
@@ -25,6 +25,7 @@ from bstcad.optics.surfaces.bspline import BSplineSurface, interpolating_net, is
 from bstcad.optics.surfaces.outlines import Outline
 from bstcad.optics.surfaces.surfaces import Plane, sag
 from bstcad.scene.blank import INDEX_OFFSETS
+from bstcad.scene.dome_back import RadialBack
 from bstcad.scene.errors import SceneError
 from bstcad.scene.fronts import FIT_SIZES, FileNet, NetFront, fit_net, net_extent
 from bstcad.scene.scene import Scene
@@ -68,7 +69,7 @@ class AsBuilt:
 class Retailored:
     """A back that was tailored anew."""
 
-    made: Made
+    made: DesignedLens
     design: float  # RRMSD of the earlier design
     before: float  # RRMSD of the earlier back on the blank as built
 
@@ -80,21 +81,22 @@ class Retailored:
         )
 
 
-def retailor(made: Made, built: AsBuilt, hooks: Hooks = NO_HOOKS) -> Retailored:
+def retailor(made: DesignedLens, built: AsBuilt, hooks: Hooks = NO_HOOKS) -> Retailored:
     """Return the design for a blank as built, from an earlier design; SceneError if a value does not suit the scene."""
     scene, shift = as_built(made, built)
     old = replace(made.lens.plain(), index=made.heaviest.index, losses=None)
-    earlier = Earlier(old, _moved(made.lens, scene, shift), made.transport)
+    flat = scene.flat_lens(scene.lens.back.net)
+    earlier = Earlier(old, _moved(made.lens, flat, shift, scene.lens.dome), made.transport)
     options = DesignOptions(compare_later=True, earlier=earlier)
     found = design(scene, device=made.device, hooks=hooks, options=options)
-    before = earlier.parameters.apply_to(scene.flat_lens(scene.lens.back.net))
+    before = earlier.parameters.apply_to(flat)
     states = (made, made.lens), (found, scene.as_mounted(replace(before.plain(), index=scene.index)))
     rays = efforts.FULL.between_stages(made.goals, RAYS)
     rrmsds = (max(light.rrmsd for light in of.lights(lens, of.goals, rays)) for of, lens in states)
     return Retailored(found, *rrmsds)
 
 
-def as_built(made: Made, built: AsBuilt) -> tuple[Scene, float]:
+def as_built(made: DesignedLens, built: AsBuilt) -> tuple[Scene, float]:
     """Return (scene of the blank as built, shift (mm) of the back's vertex relative to the earlier design)."""
     scene, lens = made.scene, made.lens
     changes: dict[str, Any] = {}
@@ -121,7 +123,7 @@ def as_built(made: Made, built: AsBuilt) -> tuple[Scene, float]:
         raise SceneError(f"{OPTION}: {error}") from None
 
 
-def _front(made: Made, given: float | Path) -> dict[str, Any]:
+def _front(made: DesignedLens, given: float | Path) -> dict[str, Any]:
     """Return the change of the scene for a front of a curvature (1/mm), or as measured points show it."""
     front = made.scene.lens.front
     if isinstance(given, Path):
@@ -132,7 +134,7 @@ def _front(made: Made, given: float | Path) -> dict[str, Any]:
     return {"lens.front.curvature": given}
 
 
-def _measured_front(made: Made, path: Path) -> NetFront:
+def _measured_front(made: DesignedLens, path: Path) -> NetFront:
     """Return the front as a net: the nominal front plus the form error in a cloud of its points.
 
     The rigid motion of the cloud is removed, since the position of the front in the part defines the part's axes.
@@ -163,9 +165,12 @@ def _sampled(nominal: BSplineSurface, form: Any, outline: Outline, side: int) ->
     return BSplineSurface(0.0, net, (-half_x, half_x), (-half_y, half_y))
 
 
-def _moved(lens: Lens, scene: Scene, shift: float) -> Parameters:
-    """Return the parameters of a lens, its back moved by a shift (mm), for the blank of a scene."""
-    old, flat, dome = Parameters.of(lens), scene.flat_lens(scene.lens.back.net), scene.lens.dome
+def _moved(lens: Lens, flat: Lens, shift: float, dome: RadialBack | None) -> Parameters:
+    """Return the parameters of a lens, its back moved by a shift (mm), for the lens `flat` before tailoring.
+
+    dome: back of the scene if it is a dome.
+    """
+    old = Parameters.of(lens)
     faces = [face.name for face in lens.tailored_faces]
     nets = {face: old.nets[lens.tailored_numbers.index(lens.number_of(face))] for face in faces}
     if BACK in nets and dome is None:

@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from bstcad.designs.made import Made
+from bstcad.designs.designed_lens import DesignedLens
 from bstcad.optics.surfaces.bspline import BSplineSurface, interpolating_net
 from bstcad.optics.trace.measure import tubes_picture
 
@@ -40,7 +40,7 @@ def polynomials(shape: tuple[int, ...]) -> np.ndarray:
     return np.stack([np.multiply.outer(u[:, i], v[:, j]) for i, j in orders])
 
 
-def jacobian(made: Made, net: BSplineSurface, columns: np.ndarray) -> np.ndarray:
+def jacobian(made: DesignedLens, net: BSplineSurface, columns: np.ndarray) -> np.ndarray:
     """Return J (pixels, k): changes of the pictures per mm of each of `columns` (k, m, n), relative to their targets.
 
     Pictures of all goals, each relative to the root of the sum of squares of its target, are joined in one vector.
@@ -58,7 +58,7 @@ def jacobian(made: Made, net: BSplineSurface, columns: np.ndarray) -> np.ndarray
     return np.stack([(pictures(STEP * each) - pictures(-STEP * each)) / (2 * STEP) for each in columns], axis=1)
 
 
-def staying(made: Made, deviation: np.ndarray, inside: np.ndarray, rrmsd: float) -> np.ndarray:
+def staying(made: DesignedLens, deviation: np.ndarray, inside: np.ndarray, rrmsd: float) -> np.ndarray:
     """Return the part (m, n) of a deviation (m, n) of the back, in mm, that may stay in its low orders.
 
     inside: True (m, n) at the points inside the outline.  rrmsd: RRMSD of the design.

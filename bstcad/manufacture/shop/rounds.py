@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from bstcad.designs import folder as folders
-from bstcad.designs.made import Made
+from bstcad.designs.designed_lens import DesignedLens
 from bstcad.figures.shop_figures import correction_figure
 from bstcad.manufacture.measured import compensation
 from bstcad.manufacture.measured.cloud import Cloud
@@ -71,7 +71,7 @@ class Compensated:
 
 
 def compensate(
-    made: Made,
+    made: DesignedLens,
     folder: Path,
     clouds: Sequence[Path],
     settings: CompensationSettings,
@@ -138,7 +138,7 @@ def _last(folder: Path, lens: Lens) -> tuple[BSplineSurface, list[Statistics], s
     return cut, before, used
 
 
-def _figures(made: Made, found: CompensationRound, clouds: Sequence[Cloud], effort: Effort) -> dict[str, Any]:
+def _figures(made: DesignedLens, found: CompensationRound, clouds: Sequence[Cloud], effort: Effort) -> dict[str, Any]:
     """Return the contents of compensation.json."""
     lens, goal = made.lens, made.goals[0]
     back, cheap = lens.back_net, replace(made.effort(effort), witness=False)

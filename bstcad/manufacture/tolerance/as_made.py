@@ -28,8 +28,8 @@ from bstcad.optics.receivers.irradiance import rrmsd_of_pictures
 from bstcad.optics.trace.finish import Finish, finished_pictures
 from bstcad.optics.trace.unfolding import per_radian
 from bstcad.scene.quality import FORM, NONE, Tolerance, settings_of
-from bstcad.scene.scene import Scene
 from bstcad.tailoring.source_image import BlurOperator, ExtendedSource, blurred, blurs, with_border
+from bstcad.verify.nominal import Nominal
 
 TUBES_PER_PIXEL = 2.5  # flux tubes per pixel along each axis
 MAX_TUBES = 640  # largest number of tubes per side
@@ -101,20 +101,17 @@ def contrast(target: np.ndarray, picture: np.ndarray) -> float | None:
     return float(np.sum((picture - picture.mean()) * wanted)) / size
 
 
-def as_made(
-    scene: Scene, lens: Lens, goals: Sequence[Goal], grade: str | None = None, layer_height: float | None = None
-) -> AsMade:
-    """Predict the pictures of a lens as made.
+def as_made(design: Nominal, grade: str | None = None, layer_height: float | None = None) -> AsMade:
+    """Predict the pictures of a design as made, with the [[tolerance]] tables of its scene.
 
-    scene: scene of the lens, with its [[tolerance]] tables.  goals: targets with their pictures.  grade: grade that
-    replaces that of the scene.  layer_height: height of the layers (mm) that replaces that of the grade.
-    SceneError if the grade is unknown.
+    grade: grade that replaces that of the scene.  layer_height: height of the layers (mm) that replaces that of the
+    grade.  SceneError if the grade is unknown.
     """
-    table = graded_table(scene.tolerance, grade)
+    table, lens, goals = graded_table(design.scene.tolerance, grade), design.lens, design.goals
     if layer_height is not None:
         table = (*table, Tolerance(layer_height=layer_height))
     name, finish = base_grade(table), finish_of(table)
-    light = SceneLight.of(scene, lens, goals)
+    light = SceneLight.of(design)
     formed = _with_form_error(lens, light, table)
     plain = replace(finish, layer_height=None, ripple=0.0, smoothing_length=0.0, roughness=0.0)
     marks = replace(finish, roughness=0.0)
@@ -126,7 +123,7 @@ def as_made(
         ROUGHNESS: light.pictures(lens, rough),
         FORM_ERROR: light.pictures(formed, plain),
     }
-    scatter = Scatter.of(lens, finish, scene.source.main_wavelength)
+    scatter = Scatter.of(lens, finish, design.emitter.main_wavelength)
     found = []
     for k, goal in enumerate(goals):
         before, after = designed[k], made[k]
@@ -160,13 +157,15 @@ class SceneLight:
     blurs: tuple[tuple[BlurOperator, ...], ...]  # blurs by the extended source, by goal and channel; (): a point source
 
     @classmethod
-    def of(cls, scene: Scene, lens: Lens, goals: Sequence[Goal]) -> SceneLight:
-        """Return the light of a scene; lens: designed lens, whose images of the source blur the pictures."""
+    def of(cls, design: Nominal) -> SceneLight:
+        """Return the light of a design's scene; images of the source by the designed lens blur the pictures."""
+        scene, goals = design.scene, design.goals
         sampler = scene.sampler  # None: a point source or a parallel beam
         if scene.source.extent is None or sampler is None:
-            return cls(scene.channels(), tuple(goals), ())
-        source = ExtendedSource(scene.light, scene.with_source_scaled(0.0).channels(), sampler)
-        return cls(source.centre, tuple(goals), tuple(blurs(source, lens.plain(), goal.screen) for goal in goals))
+            return cls(scene.channels(), goals, ())
+        source = ExtendedSource(design.emitter, scene.with_source_scaled(0.0).channels(), sampler)
+        lens = design.lens.plain()
+        return cls(source.centre, goals, tuple(blurs(source, lens, goal.screen) for goal in goals))
 
     def pictures(self, lens: Lens, finish: Finish) -> list[np.ndarray]:
         """Return flux per pixel (rows, columns) / flux of the source, on each target, for a lens with a finish."""

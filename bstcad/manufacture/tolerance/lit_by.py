@@ -6,19 +6,17 @@ flux tubes of its centre, blurred by its image (tailoring/source_image.py).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bstcad.manufacture.tolerance.as_made import SceneLight, scaled
-from bstcad.optics.lens.lens import Lens
-from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import rrmsd_of_pictures
 from bstcad.optics.trace.finish import Finish
 from bstcad.scene.errors import SceneError, nearest
 from bstcad.scene.scene import Scene
+from bstcad.verify.nominal import Nominal
 
 
 class Lamp(NamedTuple):
@@ -70,17 +68,18 @@ class LitBy:
         return {"light": self.name, "words": self.words, "distance": self.distance, "goals": goals}
 
 
-def lit_by(scene: Scene, lens: Lens, goals: Sequence[Goal], name: str, distance: float | None = None) -> LitBy:
-    """Return the pictures of a lens in the light of this name (LIGHTS).
+def lit_by(design: Nominal, name: str, distance: float | None = None) -> LitBy:
+    """Return the pictures of a design in the light of this name (LIGHTS).
 
-    goals: targets with their pictures.  distance: from the light to the lens (mm); None: that of the light.
-    SceneError for an unknown light, or one that does not go with the scene.
+    distance: from the light to the lens (mm); None: that of the light.  SceneError for an unknown light, or one that
+    does not go with the scene.
     """
-    other, distance = scene_lit_by(scene, name, distance)
-    before, after = (SceneLight.of(each, lens, goals).pictures(lens, Finish()) for each in (scene, other))
+    scene, distance = scene_lit_by(design.scene, name, distance)
+    lights = (SceneLight.of(each) for each in (design, replace(design, scene=scene)))
+    before, after = (light.pictures(design.lens, Finish()) for light in lights)
     found = tuple(
         GoalLit(goal.key, goal.picture, scaled(one, goal.picture.sum()), scaled(two, goal.picture.sum()))
-        for goal, one, two in zip(goals, before, after, strict=True)
+        for goal, one, two in zip(design.goals, before, after, strict=True)
     )
     where = "" if distance is None else f", {distance:.4g} mm away"
     return LitBy(name, LIGHTS[name].words + where, distance, found)

@@ -30,11 +30,11 @@ from bstcad.manufacture.tolerance.study import (
     estimate_yield,
 )
 from bstcad.manufacture.tolerance.tolerances import Grade, Inverse, TargetStudy, Tolerances, Trial, WavefrontStudy
+from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.trace.measure import Effort, measure
 from bstcad.runs import files
 from bstcad.scene.errors import SceneError
-from bstcad.scene.scene import Scene
-from bstcad.scene.target import Target
+from bstcad.scene.quality import Tolerance
 from bstcad.verify.nominal import DEFAULT_RRMSD_LIMIT, Nominal
 
 TRACED_SOURCE_POINTS = 64  # number of points that sample an extended source
@@ -43,12 +43,13 @@ TRACED_SOURCE_POINTS = 64  # number of points that sample an extended source
 def tolerance(folder: Path, settings: StudySettings) -> Tolerances:
     """Study the design in a folder with the [[tolerance]] tables of its scene; return the record of tolerance.json."""
     with folders.amending(folder) as amended:
-        scene, nominal = read_nominal(folder)
+        nominal = read_nominal(folder)
+        scene = nominal.scene
         if scene.ghost is not None:
             raise SceneError(
                 "[[effects]] ghost: tolerances do not include ghosts yet; remove this table from scene.toml"
             )
-        pictures, limit = _pictures(scene, nominal, settings), scene.accept.rrmsd or DEFAULT_RRMSD_LIMIT
+        pictures, limit = _pictures(nominal, settings), scene.accept.rrmsd or DEFAULT_RRMSD_LIMIT
         goals: list[tuple[str, TracedGoal, float, float]]  # key of the limit, goal, limit, figure of the design
         goals = [("accept.rrmsd", each, limit, _rrmsd(nominal, each)) for each in pictures]
         if scene.wavefront is not None:
@@ -63,10 +64,10 @@ def tolerance(folder: Path, settings: StudySettings) -> Tolerances:
                 )
         results = [studies.study(goal, allowed, designed, settings) for _, goal, allowed, designed in goals]
         study = studies.worst_of(results[: len(pictures)])
-        record = _record(scene, settings, study, results)
+        record = _record(nominal, settings, study, results)
         settings.progress("report", 0, 1, "")
         tolerances.write(record, amended / "tolerance.json")
-        images = _draw_figures(scene, pictures[0], study, own=results[0])
+        images = _draw_figures(View.of(scene), nominal.goals[0].suffix, pictures[0], study, own=results[0])
         figures = files.folder_in_place(amended / "figures")
         for name, picture in images.items():
             files.put(figures / f"{name}.png", picture)
@@ -80,18 +81,19 @@ def tolerance(folder: Path, settings: StudySettings) -> Tolerances:
 
 def write_trial(folder: Path, number: int, path: Path, settings: StudySettings) -> tuple[tuple[Kind, float], ...]:
     """Write the lens of one trial as a STEP file, in the frame of the lens; return (kind, amount) of all its errors."""
-    scene, nominal = read_nominal(folder)
-    pictures = _pictures(scene, nominal, settings)[0]
+    nominal = read_nominal(folder)
+    pictures = _pictures(nominal, settings)[0]
     [amounts] = trials(pictures.perturbations, settings.seed, [number])
     lens = perturb(pictures.setup, pictures.perturbations, amounts).lens
-    step_writing.write_lens(lens, path, f"{scene.name}, trial {number}")
+    step_writing.write_lens(lens, path, f"{nominal.scene.name}, trial {number}")
     return tuple((p.kind, float(a)) for p, a in zip(pictures.perturbations, amounts, strict=True))
 
 
-def _pictures(scene: Scene, nominal: Nominal, settings: StudySettings) -> tuple[TargetPictures, ...]:
+def _pictures(nominal: Nominal, settings: StudySettings) -> tuple[TargetPictures, ...]:
     """Return the pictures of each target, all with the same errors; the screens move together."""
+    scene = nominal.scene
     channels = scene.channels(TRACED_SOURCE_POINTS) if scene.source.extent else scene.channels()
-    setup = Setup(nominal.lens, channels, scene.target.screen)
+    setup = Setup(nominal.lens, channels, nominal.goals[0].screen)
     errors = perturbations(setup, graded_table(scene.tolerance, settings.grade), scene.lens.material)
     setups = [(replace(setup, screen=goal.screen), goal.picture) for goal in nominal.goals]
     return tuple(TargetPictures(each, errors, picture, settings.tubes) for each, picture in setups)
@@ -103,18 +105,18 @@ def _rrmsd(nominal: Nominal, pictures: TargetPictures) -> float:
     return measure(lens, channels, screen, pictures.target, effort=effort, sampler=sampler).rrmsd
 
 
-def _grade(scene: Scene, grade: str | None) -> Grade:
-    """Return the grade of the errors; its words state whether the scene's tolerances override it for some of them."""
-    name = base_grade(graded_table(scene.tolerance, grade))
+def _grade(stated: Sequence[Tolerance], grade: str | None) -> Grade:
+    """Return the grade of the errors; its words state whether the stated tolerances override it for some of them."""
+    name = base_grade(graded_table(stated, grade))
     words = GRADES[name].words if name in GRADES else "nothing"
-    if any(entry.name for entry in scene.tolerance):
+    if any(entry.name for entry in stated):
         words = f"{words}, except for the tolerances in the scene" if name in GRADES else "as stated in the scene"
     return Grade(name, words)
 
 
-def _record(scene: Scene, settings: StudySettings, study: Study, goals: Sequence[Study]) -> Tolerances:
+def _record(nominal: Nominal, settings: StudySettings, study: Study, goals: Sequence[Study]) -> Tolerances:
     """Return the record; study: worst target; goals: studies of each target, then of the wavefront if stated."""
-    count = len(scene.targets)
+    count = len(nominal.goals)
     each, wave = goals[:count], goals[count] if len(goals) > count else None
     change = wave.change_of if wave else lambda error: None
     names = [error.kind.name for error in study.perturbations]
@@ -124,9 +126,9 @@ def _record(scene: Scene, settings: StudySettings, study: Study, goals: Sequence
         loosened, achieved = studies.loosest_limits(goals[0], settings.wanted, goals[1:])
         inverse = Inverse(settings.wanted, achieved, {error.kind.name: error.limit for error in loosened})
     return Tolerances(
-        name=scene.name,
+        name=nominal.scene.name,
         version=bstcad.__version__,
-        grade=_grade(scene, settings.grade),
+        grade=_grade(nominal.scene.tolerance, settings.grade),
         seed=study.seed,
         tubes=settings.tubes,
         limit=study.limit,
@@ -136,14 +138,14 @@ def _record(scene: Scene, settings: StudySettings, study: Study, goals: Sequence
         sensitivities=tuple(replace(s, wavefront_change=change(s.name)) for s in study.sensitivities),
         worst=tuple(Trial(k, float(study.full[k]), dict(zip(names, amounts, strict=True))) for k, amounts in worst),
         inverse=inverse,
-        targets=tuple(map(_of_target, scene.target_keys, scene.targets, each)) if count > 1 else None,
+        targets=tuple(map(_of_target, nominal.goals, each)) if count > 1 else None,
         wavefront=_of_wavefront(wave) if wave else None,
     )
 
 
-def _of_target(key: str, target: Target, study: Study) -> TargetStudy:
-    where, figures = target.screen.receiver.position_text(), _shared_figures(study, [study])
-    return TargetStudy(key=key, where=where, **figures, sensitivities=study.sensitivities)
+def _of_target(goal: Goal, study: Study) -> TargetStudy:
+    where, figures = goal.screen.receiver.position_text(), _shared_figures(study, [study])
+    return TargetStudy(key=goal.key, where=where, **figures, sensitivities=study.sensitivities)
 
 
 def _shared_figures(study: Study, goals: Sequence[Study]) -> dict[str, Any]:
@@ -183,13 +185,15 @@ def _disagreement(study: Study) -> tolerances.Disagreement:
     return {"median": float(np.median(difference)), "95 %": float(np.percentile(difference, 95))}
 
 
-def _draw_figures(scene: Scene, pictures: TargetPictures, study: Study, own: Study) -> dict[str, bytes]:
-    """Draw the figures of the report's section for the first target, whose study is `own`; study: the worst target."""
+def _draw_figures(view: View, suffix: str, pictures: TargetPictures, study: Study, *, own: Study) -> dict[str, bytes]:
+    """Draw the figures of the report's section for the first target, whose study is `own`; study: the worst target.
+
+    suffix: of the names of the first target's figures.
+    """
     numbers = study.worst[:MAX_WORST_TRIALS]
     amounts = trials(study.perturbations, study.seed, numbers)
     worst = [(k, float(own.full[k]), pictures.light(z)) for k, z in zip(numbers, amounts, strict=True)]
     nominal = pictures.light([0.0] * len(study.perturbations))
     rrmsds = histogram(study.rrmsd, study.limit, linear=study.linear, full=study.full, adjusted=study.adjusted)
-    suffix = f", {scene.target_keys[0]}" if len(scene.targets) > 1 else ""
-    images = rrmsds, worst_trials(own.rrmsd, nominal, worst, View.of(scene), of=suffix)
+    images = rrmsds, worst_trials(own.rrmsd, nominal, worst, view, of=suffix)
     return dict(zip(tolerances.FIGURES, map(png, images), strict=True))

@@ -407,9 +407,12 @@ def _as_numbers(interface: Interface) -> tuple[Tensor, RadialFace]:
     assert isinstance(surface, RadialSurface)
     faces, _ = kernel_arguments.faces(interface, None, 1, surface.z)
     tolerance = radial.ROOT_TOLERANCE * torch.finfo(torch.float64).eps * surface.radius
-    search = surface.radius, tolerance, radial.MAX_STEP * surface.radius, radial.MIN_COSINE, radial.NEWTON_STEPS
+    search = floats(
+        radius=surface.radius, tolerance=tolerance, max_step=radial.MAX_STEP * surface.radius,
+        min_cosine=radial.MIN_COSINE, newton_steps=radial.NEWTON_STEPS,
+    )  # fmt: skip
     points = torch.stack([(surface.radius + surface.heights.double()) * d for d in surface.directions])
-    return points, RadialFace._make([faces, *floats(search)])
+    return points, RadialFace(faces=faces, **search)
 
 
 # --- the whole path ---------------------------------------------------------------------------------------------------

@@ -49,9 +49,14 @@ MAX_TABLE_ERROR_RATIO = 0.5  # largest ratio of a table's error to the coarser t
 
 def rules() -> Rules:
     """Return the current constants of the plain torch form."""
-    steps = (interfaces.NEWTON_STEPS, interfaces.APPROACH_STEPS)
-    search = (interfaces.SIDE_EXIT_COSINE, interfaces.MIN_NEWTON_DERIVATIVE, interfaces.TANGENCY_TOLERANCE)
-    return Rules(*floats([*steps, *search, interfaces.MIN_COS_REFRACTION, surfaces.MIN_COS2, rays.MIN_AXIAL_COSINE]))
+    return Rules(
+        **floats(
+            newton_steps=interfaces.NEWTON_STEPS, approach_steps=interfaces.APPROACH_STEPS,
+            side_exit=interfaces.SIDE_EXIT_COSINE, min_derivative=interfaces.MIN_NEWTON_DERIVATIVE,
+            tangency=interfaces.TANGENCY_TOLERANCE, min_cos=interfaces.MIN_COS_REFRACTION, min_cos2=surfaces.MIN_COS2,
+            grazing=rays.MIN_AXIAL_COSINE,
+        )
+    )  # fmt: skip
 
 
 def faces(
@@ -63,14 +68,27 @@ def faces(
     z -> -z; the caller reflects heights and rays (crossing.reflect_z).  start: `Rays.z`, or z of the first vertex (mm).
     """
     surface, law = interface.net, interface.law
-    conic = (front.surface.curvature, front.surface.conic_constant) if front else (0.0, 0.0)
-    limits = [limit for i in (front or interface, interface) for limit in i.outline.limits]
-    corner, per_mm = (surface.x[0], surface.y[0]), (1 / pitch for pitch in surface.pitch)
-    bounds, throw = interfaces.net_bounds(surface, torch.float64, sense), plane.middle[2] if plane is not None else 0.0
-    face = floats([*conic, law.eta, front.law.eta if front else 1.0, *limits, sense * (surface.z - start)])
-    net = floats([*corner, *per_mm, *bounds, sense * (throw - surface.z)])
-    fates = [Status.MISSED_FRONT, interface.status_if_missed, law.status_if_blocked, Status.TURNED_BACK]
-    numbers = Faces._make([int(law.reverses), *face, *surface.shape, *net, rules(), Fates(*floats(fates))])
+    (front_x, front_y, front_r2), (limit_x, limit_y, limit_r2) = (
+        each.outline.limits for each in (front or interface, interface)
+    )
+    (m, n), throw = surface.shape, 0.0 if plane is None else plane.middle[2]
+    fates = floats(
+        missed_front=Status.MISSED_FRONT, missed_back=interface.status_if_missed, reflected=law.status_if_blocked,
+        turned=Status.TURNED_BACK,
+    )  # fmt: skip
+    numbers = Faces(
+        reflects=int(law.reverses), m=m, n=n, rules=rules(), fates=Fates(**fates),
+        **floats(
+            curvature=front.surface.curvature if front else 0.0,
+            conic_constant=front.surface.conic_constant if front else 0.0,
+            eta=law.eta, front_eta=front.law.eta if front else 1.0,
+            front_x=front_x, front_y=front_y, front_r2=front_r2,
+            limit_x=limit_x, limit_y=limit_y, limit_r2=limit_r2,
+            gap=sense * (surface.z - start), throw=sense * (throw - surface.z),
+            x=surface.x[0], y=surface.y[0], per_x=1 / surface.pitch[0], per_y=1 / surface.pitch[1],
+            **interfaces.net_bounds(surface, torch.float64, sense)._asdict(),
+        ),
+    )  # fmt: skip
     if plane is None or plane.is_level:
         return numbers, None
     return numbers, _tilted(plane, sense, -sense if law.reverses else sense)
@@ -78,12 +96,18 @@ def faces(
 
 def front_face(before: Sequence[Interface], sense: int) -> records.FrontFace:
     """Return the face in front of a net as numbers; before: this face, or nothing."""
-    numbers, fates = [0.0, 0.0, *3 * [math.inf], 1.0], [Status.MISSED_FRONT] * 4
+    everywhere = {"front_x": math.inf, "front_y": math.inf, "front_r2": math.inf}
+    numbers = floats(curvature=0.0, conic_constant=0.0, eta=1.0, **everywhere)
+    missed = reflected = turned = Status.MISSED_FRONT
     for face in before:
-        form = floats([sense * face.surface.curvature, face.surface.conic_constant])
-        numbers = [*form, *face.outline.limits, face.law.eta]
-        fates = [*2 * [face.status_if_missed], face.law.status_if_blocked, Status.TURNED_BACK]
-    return records.FrontFace._make([len(before), *floats(numbers), rules(), Fates(*floats(fates))])
+        x, y, r2 = face.outline.limits
+        numbers = floats(
+            curvature=sense * face.surface.curvature, conic_constant=face.surface.conic_constant, eta=face.law.eta,
+            front_x=x, front_y=y, front_r2=r2,
+        )  # fmt: skip
+        missed, reflected, turned = face.status_if_missed, face.law.status_if_blocked, Status.TURNED_BACK
+    fates = floats(missed_front=missed, missed_back=missed, reflected=reflected, turned=turned)
+    return records.FrontFace(present=len(before), rules=rules(), fates=Fates(**fates), **numbers)
 
 
 def screens(interface: Interface, planes: Sequence[Receiver], sense: int) -> Screens:
@@ -152,9 +176,11 @@ def _table_of_light(source: Emitter, window: Rectangle, z: float) -> Beam | None
         errors = [(midpoint_values(net) - known) / scale for net, known, scale in triples]
         error = max(max(np.sqrt(np.mean(part**2)), np.abs(part).max() / PEAK_TO_RMS) for part in errors)
         if error <= 1.0:
-            size = window.width, window.height
-            corner = [*(-s / 2 for s in size), *((side - 1) / s for s in size)]
-            table = LightTable._make([side, side, *corner, *(net.ravel() for net in nets)])
+            irradiance, slope_x, slope_y = (net.ravel() for net in nets)
+            table = LightTable(
+                m=side, n=side, x=-window.width / 2, y=-window.height / 2, per_x=(side - 1) / window.width,
+                per_y=(side - 1) / window.height, irradiance=irradiance, slope_x=slope_x, slope_y=slope_y,
+            )  # fmt: skip
             return Beam(start=float(starts), tilted=1, table=table)
         if not error < MAX_TABLE_ERROR_RATIO * last:
             return None
@@ -167,11 +193,13 @@ def _tilted(receiver: Receiver, before: int, behind: int) -> records.TiltedScree
     if (
         receiver.goniometer
     ):  # the coordinates of the direction, whose z component is `before` times that in the kernels' frame
-        return records.TiltedScreen._make([*floats([0.0, 0.0, 0.0, 0.0, before, *6 * [0.0]]), receiver.goniometer])
+        numbers = dict.fromkeys(records.TiltedScreen._fields[:-1], 0.0) | {"n_z": float(before)}
+        return records.TiltedScreen(**numbers, goniometer=receiver.goniometer)
     assert receiver.axes is not None  # no kernel traces to other receivers
-    along_x, along_y, normal = ((*axis[:2], before * axis[2]) for axis in receiver.axes)
-    numbers = floats([*receiver.middle[:2], *(behind * n for n in normal), *along_x, *along_y])
-    return records.TiltedScreen._make([*numbers, 0])
+    (x_x, x_y, x_z), (y_x, y_y, y_z), normal = ((*axis[:2], before * axis[2]) for axis in receiver.axes)
+    (x, y, _), (n_x, n_y, n_z) = receiver.middle, (behind * n for n in normal)
+    numbers = floats(x=x, y=y, n_x=n_x, n_y=n_y, n_z=n_z, x_x=x_x, x_y=x_y, x_z=x_z, y_x=y_x, y_y=y_y, y_z=y_z)
+    return records.TiltedScreen(**numbers, goniometer=0)
 
 
 def cells(window: Rectangle, n: int, seed: int) -> RayCells:
@@ -185,4 +213,5 @@ def cells(window: Rectangle, n: int, seed: int) -> RayCells:
 
 def pixels(screen: Screen) -> Pixels:
     """Return the screen as numbers."""
-    return Pixels(*floats([*screen.x, *screen.y, *screen.per_unit]))
+    (left, right), (bottom, top), (per_x, per_y) = screen.x, screen.y, screen.per_unit
+    return Pixels(**floats(left=left, right=right, bottom=bottom, top=top, per_x=per_x, per_y=per_y))

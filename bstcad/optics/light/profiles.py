@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bstcad.optics.numerics.records import NO_NET, Frame3, NetTable, Pattern
+from bstcad.optics.numerics.records import NO_NET, Frame3, NetTable, Pattern, floats
 from bstcad.optics.numerics.reductions import elementary
 from bstcad.optics.surfaces.bspline import evaluate
 from bstcad.optics.surfaces.outlines import Circle, Outline
@@ -159,12 +159,13 @@ class Profile:
         w_u, w_v = self.widths
         table = NO_NET
         if (net := self.net) is not None:
-            m, n_v = net.values.shape
-            ends = [float(end) for end in (*net.u, *net.v)]
-            table = NetTable._make([m, n_v, *ends, *net.per_unit, net.values.numpy().ravel()])
+            (m, n_v), (per_u, per_v) = net.values.shape, net.per_unit
+            ends = floats(u_min=net.u[0], u_max=net.u[1], v_min=net.v[0], v_max=net.v[1])
+            table = NetTable(m=m, n=n_v, per_u=per_u, per_v=per_v, values=net.values.numpy().ravel(), **ends)
         axis = Frame3(sense * n[0], sense * n[1], n[2])
-        numbers = 1 / w_u, 1 / w_v, float(self.order / 2), float(self.inner**2)
-        return Pattern._make([1, u_axis, v_axis, axis, *numbers, int(self.stereographic), table])
+        numbers = floats(fall_u=1 / w_u, fall_v=1 / w_v, power=self.order / 2, inner2=self.inner**2)
+        shape = int(self.stereographic)
+        return Pattern(present=1, x=u_axis, y=v_axis, axis=axis, stereographic=shape, net=table, **numbers)
 
 
 @functools.lru_cache(maxsize=64)

@@ -7,16 +7,15 @@ kernels depends (compiling.py).  Emitters create their own Beam; kernel_argument
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from torch import Tensor
 
 
-def floats(values: Sequence[float | Tensor]) -> tuple[float, ...]:
-    """Convert numbers to floats, since a kernel is compiled again for every combination of types."""
-    return tuple(float(v) for v in values)
+def floats(**values: float | Tensor) -> dict[str, float]:
+    """Convert fields of a record to floats, since a kernel is compiled again for every combination of types."""
+    return {name: float(value) for name, value in values.items()}
 
 
 class LightTable(NamedTuple):
@@ -58,7 +57,7 @@ class NetTable(NamedTuple):
     values: np.ndarray  # (m n,)
 
 
-NO_NET = NetTable._make([0, 0, *6 * (0.0,), np.zeros(0)])
+NO_NET = NetTable(m=0, n=0, u_min=0.0, u_max=0.0, v_min=0.0, v_max=0.0, per_u=0.0, per_v=0.0, values=np.zeros(0))
 
 
 class Pattern(NamedTuple):
@@ -80,7 +79,9 @@ class Pattern(NamedTuple):
 
 
 _UNIT = Frame3(0.0, 0.0, 1.0)
-NO_PATTERN = Pattern._make([0, _UNIT, _UNIT, _UNIT, 0.0, 0.0, 1.0, 0.0, 0, NO_NET])
+NO_PATTERN = Pattern(
+    present=0, x=_UNIT, y=_UNIT, axis=_UNIT, fall_u=0.0, fall_v=0.0, power=1.0, inner2=0.0, stereographic=0, net=NO_NET
+)
 
 
 class Beam(NamedTuple):

@@ -32,7 +32,7 @@ MAPS = ("x3p", "sdf", "text.sdf", *BY_SURFACE_TOPOGRAPHY)
 @pytest.fixture(scope="module")
 def lens(small_design):
     """The small lens with a relief that has no symmetry: its own light is a disc."""
-    return with_form_error(folders.read_nominal(small_design.folder)[1].lens, 0.01, 1.0)
+    return with_form_error(folders.read_nominal(small_design.folder).lens, 0.01, 1.0)
 
 
 @pytest.fixture(scope="module")

@@ -35,7 +35,7 @@ PART = "made part: "
 
 @pytest.fixture(scope="module")
 def nominal(small_design):
-    return folders.read_nominal(small_design.folder)[1]
+    return folders.read_nominal(small_design.folder)
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ DUST, SLIPS = (1.0,), (-1.0, 1.0)
 
 @pytest.fixture(scope="module")
 def nominal(small_design):
-    return folders.read_nominal(small_design.folder)[1]
+    return folders.read_nominal(small_design.folder)
 
 
 @pytest.fixture(scope="module")

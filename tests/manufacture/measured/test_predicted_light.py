@@ -18,7 +18,7 @@ EFFORT = replace(quick_effort(), witness=False)
 
 @pytest.fixture(scope="module")
 def nominal(small_design):
-    return folders.read_nominal(small_design.folder)[1]
+    return folders.read_nominal(small_design.folder)
 
 
 def figures(nominal, seeds, noise):

@@ -69,7 +69,7 @@ class Shop:
 
 @pytest.fixture(scope="module")
 def lens(small_design):
-    return folders.read_nominal(small_design.folder)[1].lens.plain()
+    return folders.read_nominal(small_design.folder).lens.plain()
 
 
 def rounds(shop, count, settings=CompensationSettings(), parts=1):  # noqa: B008

@@ -14,7 +14,7 @@ from tests.conftest import quick_effort
 
 @pytest.fixture(scope="session")
 def setup(small_design):
-    _, nominal = read_nominal(small_design.folder)
+    nominal = read_nominal(small_design.folder)
     return Setup(nominal.lens, nominal.channels, nominal.goals[0].screen)
 
 

@@ -51,7 +51,7 @@ LIGHT = {
 @pytest.fixture(scope="module")
 def setups(small_design):
     """Light that falls within the lens: none of its rim changes with what the lens cuts."""
-    _, nominal = read_nominal(small_design.folder)
+    nominal = read_nominal(small_design.folder)
     (channel, *_), line = nominal.channels, nominal.channels[0].source.wavelength
     cone = PointSource((0.5, 0.0, -60.0), profile="uniform", half_angle=2.0, wavelength=line)
     beam = CollimatedSource(Circle(2.5), z=0.0, wavelength=line, centre=(0.31, 0.17))

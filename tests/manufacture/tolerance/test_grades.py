@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -87,9 +88,9 @@ def test_a_form_error_of_the_front_moves_light_and_is_made(small_design, setup, 
     nominal = setup.picture(257)
     moved = [np.linalg.norm(kind.apply(setup, 1e-4).picture(257) - nominal) for kind in (front, back)]
     assert 0.2 < moved[0] / moved[1] < 3
-    scene, read = read_nominal(small_design.folder)
-    scene = scene.model_copy(update={"tolerance": SAID})
-    monkeypatch.setattr(tolerancing, "read_nominal", lambda folder: (scene, read))
+    read = read_nominal(small_design.folder)
+    stated = replace(read, scene=read.scene.model_copy(update={"tolerance": SAID}))
+    monkeypatch.setattr(tolerancing, "read_nominal", lambda folder: stated)
     path = small_design.folder / "trial.step"
     try:
         written = tolerancing.write_trial(small_design.folder, 1, path, StudySettings())

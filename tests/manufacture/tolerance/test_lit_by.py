@@ -10,6 +10,7 @@ from bstcad import cli
 from bstcad.manufacture.tolerance.lit_by import LIGHTS, lit_by, scene_lit_by
 from bstcad.optics.trace.measure import Effort, measure
 from bstcad.scene.errors import SceneError
+from bstcad.verify.nominal import Nominal
 from tests import suite
 
 PLATE = {
@@ -67,9 +68,9 @@ def test_what_does_not_go_is_a_sentence(plate):
 def test_a_mirror_is_lit_from_above():
     mirror = {"lens.material": None, "lens.back.reflect": True, "source.z": 100.0, "source.aperture.width": 38.0}
     scene = bstcad.load("templates/disk.toml").changed(PLATE).changed(mirror)
-    lens = scene.as_mounted(scene.flat_lens(33))
+    flat = Nominal(scene, scene.as_mounted(scene.flat_lens(33)), scene.goals)
     for name in LIGHTS:
-        [goal] = lit_by(scene, lens, scene.goals, name).goals
+        [goal] = lit_by(flat, name).goals
         assert goal.lit.any(), name
 
 

@@ -30,7 +30,7 @@ OFF = (
 def folder_of(small_design, place, change):
     """A copy of the small design whose scene is changed."""
     folder = shutil.copytree(small_design.folder, place)
-    scene = read_nominal(folder)[0].changed({"tolerance": OFF} | change)
+    scene = read_nominal(folder).scene.changed({"tolerance": OFF} | change)
     for name, data in scene_files(scene).items():
         (folder / name).write_bytes(data)
     with np.load(folder / "design.npz") as arrays:
@@ -43,7 +43,7 @@ def folder_of(small_design, place, change):
 @pytest.fixture(scope="module")
 def goals(small_design):
     """Two planes with limits that some lenses miss, and a wave with another."""
-    target = read_nominal(small_design.folder)[0].target
+    target = read_nominal(small_design.folder).scene.target
     nearer = target.model_copy(update={"z": target.z - 6.0})
     wave = {"kind": "sphere", "focus": [0.0, 0.0, 400.0], "z": 60.0}
     return {"target": [target, nearer], "wavefront": wave}

@@ -34,7 +34,7 @@ TUBES, FEW_TUBES, FULL = 257, 129, 40
 
 @pytest.fixture(scope="module")
 def pictures(small_design, setup):
-    _, nominal = read_nominal(small_design.folder)
+    nominal = read_nominal(small_design.folder)
     return TargetPictures(setup, perturbations(setup, graded_table(()), "PMMA"), nominal.goals[0].picture, TUBES)
 
 
@@ -193,7 +193,7 @@ def test_the_command_writes_what_it_found_and_a_trial_as_a_part(small_design, st
     lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
     assert lines["lens.tilt_x"].endswith(" deg") and lines["lens.thickness"].endswith(" mm")
     made = step_reading.read(folder / "trial-4.step")
-    _, nominal = read_nominal(folder)
+    nominal = read_nominal(folder)
     assert 0 < np.abs(made.control_points - nominal.lens.back.control_points()).max() < 1.0
 
 

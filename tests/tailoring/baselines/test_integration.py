@@ -190,8 +190,8 @@ def test_a_back_that_would_meet_the_front_begins_further_off():
 def test_a_design_by_it_has_its_stage_and_no_other():
     wanted = scene.load("templates/disk.toml", SMALL | {"source.diameter": "0.5"})
     found = pipeline.design(wanted, device="cpu")
-    assert [stage.name for stage in found.making.stages[:3]] == ["loading", "transport", "integration"]
-    assert not any(stage.name.startswith(("stage 1", "stage 2", "stage 3")) for stage in found.making.stages)
-    assert found.lens.back.m == 65 and found.making.stages[2].rrmsd < 1.0
+    assert [stage.name for stage in found.course.stages[:3]] == ["loading", "transport", "integration"]
+    assert not any(stage.name.startswith(("stage 1", "stage 2", "stage 3")) for stage in found.course.stages)
+    assert found.lens.back.m == 65 and found.course.stages[2].rrmsd < 1.0
     single = pipeline.design(wanted.changed({"tailoring.precision": "float32"}), device="cpu")
     torch.testing.assert_close(single.lens.back.heights, found.lens.back.heights, rtol=0, atol=2e-6)  # a digit of it

@@ -15,19 +15,19 @@ from bstcad.verify.nominal import Nominal
 
 
 @dataclass(frozen=True)
-class Made(Nominal):
+class DesignedLens(Nominal):
     """Designed lens as a folder stores it: on the CPU, with goals restricted to the pixels that light can reach."""
 
-    making: DesignCourse = DesignCourse()  # stages, history and machine, for the report
+    course: DesignCourse = DesignCourse()  # stages, history and machine, for the report
     device: str = "cpu"  # device on which the lens was designed: "cpu" or "cuda"
     transport: TransportMap | None = None  # transport map of stage 1; None: the user's own lens, or not stored
-    # Function that returns `making` with the comparison of float32 and float64 for the report; None: nothing to add.
+    # Function that returns `course` with the comparison of float32 and float64 for the report; None: nothing to add.
     precision_comparison: Callable[[], DesignCourse] | None = None
 
-    def with_report_data(self) -> Made:
+    def with_report_data(self) -> DesignedLens:
         """Return this design with the comparison of float32 and float64 that the report prints."""
         compare = self.precision_comparison
-        return self if compare is None else replace(self, making=compare(), precision_comparison=None)
+        return self if compare is None else replace(self, course=compare(), precision_comparison=None)
 
     def is_lens_of(self, other: Nominal) -> bool:
         """Return True if lens (to the last bit), source and targets are equal to those of another design."""
