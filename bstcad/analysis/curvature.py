@@ -17,7 +17,8 @@ from torch import Tensor
 
 from bstcad.optics.surfaces.bspline import QUARTERS, BSplineSurface, Spans, near_outline, span_points
 from bstcad.optics.surfaces.outlines import Outline
-from bstcad.optics.surfaces.radial import RadialSurface, dot
+from bstcad.optics.surfaces.radial import RadialSurface
+from bstcad.optics.surfaces.rays import dot
 from bstcad.optics.surfaces.surfaces import cross, points_on
 
 SPANS_AT_A_TIME = 1 << 14  # number of spans whose curvatures are in memory together

@@ -24,8 +24,8 @@ from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.passes import BACK
 from bstcad.optics.surfaces.bspline import QUARTERS, BSplineSurface, require_net, span_points, weights
 from bstcad.optics.surfaces.outlines import EVERYWHERE, Outline
-from bstcad.optics.surfaces.radial import dot, require_radial
-from bstcad.optics.surfaces.rays import Rays, Status
+from bstcad.optics.surfaces.radial import require_radial
+from bstcad.optics.surfaces.rays import Rays, Status, dot
 from bstcad.optics.surfaces.sampling import sample_rim
 from bstcad.optics.surfaces.surfaces import points_on, sag
 

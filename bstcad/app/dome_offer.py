@@ -58,11 +58,11 @@ def _to_dome(data: Table) -> dict[str, Any]:
     if is_mirror(data) or not (are_numbers(lamp, front, back) and lamp < front < back):
         return {}
     radius, net = back - lamp, value_at("lens.back.control_points", data)
-    inner = _rounded(min(front - lamp, FRONT_RATIO * radius))
-    sphere = {"kind": "sphere", "z": _rounded(lamp + inner), "curvature": -1 / inner}
+    inner = rounded(min(front - lamp, FRONT_RATIO * radius))
+    sphere = {"kind": "sphere", "z": rounded(lamp + inner), "curvature": -1 / inner}
     return {
         "lens.back.centre": [0.0, 0.0, float(lamp)] if lamp else None,
-        "lens.back.radius": _rounded(radius),
+        "lens.back.radius": rounded(radius),
         "lens.back.half_angle": half_angle(data),
         "lens.back.control_points": net if type(net) is int and net >= MIN_DOME_POINTS else None,
         "lens.front": sphere,
@@ -77,9 +77,9 @@ def _to_heights(data: Table) -> dict[str, Any]:
     radius, front = dome.get("radius"), value_at("lens.front.z", data)
     if not isinstance(centre, list) or len(centre) != 3 or not are_numbers(*centre, angle, radius, front):
         return {}
-    width = _rounded(2 * radius * math.sin(math.radians(angle)))
+    width = rounded(2 * radius * math.sin(math.radians(angle)))
     return {
-        "lens.back.z": _rounded(centre[2] + radius),
+        "lens.back.z": rounded(centre[2] + radius),
         "lens.back.control_points": dome.get("control_points"),
         "lens.front": {"kind": "plane", "z": front},
         "lens.outline": {"shape": "circle", "diameter": width},
@@ -159,7 +159,7 @@ def _index(data: Table) -> float:
     return index if are_numbers(index) and index > 1 else USUAL_INDEX
 
 
-def _rounded(value: float) -> float:
+def rounded(value: float) -> float:
     """Return a length without the rounding errors of a sum: ten significant digits."""
     return float(f"{value:.10g}")
 

@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from bstcad.app.dome_offer import BACK_KIND, changes_of_kind
+from bstcad.app.dome_offer import BACK_KIND, changes_of_kind, rounded
 from bstcad.app.form import LOCKED_SIDES, form
 from bstcad.app.kinds import are_numbers, extent, lamp_z, table_at, value_at
 from bstcad.app.scene_text import changed, is_same, tables
@@ -86,7 +86,7 @@ def with_followers(data: Mapping[str, Any], key: str, value: Any, locked: bool =
     if key == BACK_PLANE and are_numbers(value) and are_numbers(before := value_at(key, data)):
         targets = data.get("target")
         names = [f"target[{k}].z" for k in range(len(targets))] if isinstance(targets, list) else ["target.z"]
-        changes |= {name: _rounded(z + value - before) for name in names if are_numbers(z := value_at(name, data))}
+        changes |= {name: rounded(z + value - before) for name in names if are_numbers(z := value_at(name, data))}
     if key in (FRONT_Z, FRONT_CURVATURE):
         return changes | _sphere_about_lamp(data, key, value)
     if key == BACK_KIND:
@@ -105,7 +105,7 @@ def _sphere_about_lamp(data: Mapping[str, Any], key: str, value: Any) -> dict[st
         return {}
     if key == FRONT_Z:
         return {FRONT_CURVATURE: -1 / (value - lamp)} if value > lamp else {}
-    return {FRONT_Z: _rounded(lamp - 1 / value)} if value < 0 else {}
+    return {FRONT_Z: rounded(lamp - 1 / value)} if value < 0 else {}
 
 
 def _other_side(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
@@ -114,11 +114,11 @@ def _other_side(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]
     other = f"{parent}.{LOCKED_SIDES.get(name, '')}"
     was, its = value_at(key, data), value_at(other, data)
     if are_numbers(value, was, its) and was and value > 0:
-        return {other: _rounded(its * value / was)}
+        return {other: rounded(its * value / was)}
     if not (_is_range(value) and _is_range(was) and _is_range(its)):
         return {}
     ratio, middle = (value[1] - value[0]) / (was[1] - was[0]), (its[0] + its[1]) / 2
-    return {other: [_rounded(middle + ratio * (end - middle)) for end in its]}
+    return {other: [rounded(middle + ratio * (end - middle)) for end in its]}
 
 
 def _profile_widths(data: Mapping[str, Any], profile: Any) -> dict[str, Any]:
@@ -147,7 +147,7 @@ def _width(data: Mapping[str, Any], source: Mapping[str, Any], name: str) -> flo
     if name == "radius_1e2":
         return max(sizes) / 2
     if name == "inner_radius":
-        return _rounded(DARK_CENTRE * min(sizes) / 2)
+        return rounded(DARK_CENTRE * min(sizes) / 2)
     position, front = source.get("position"), value_at("lens.front.z", data)
     start = position[-1] if isinstance(position, list) and position else 0.0
     if not are_numbers(start, front) or front == start:
@@ -157,11 +157,6 @@ def _width(data: Mapping[str, Any], source: Mapping[str, Any], name: str) -> flo
 
 def _is_range(value: Any) -> bool:
     return isinstance(value, list | tuple) and len(value) == 2 and are_numbers(*value) and value[1] > value[0]
-
-
-def _rounded(value: float) -> float:
-    """Return a number without the rounding errors of a sum: ten significant digits."""
-    return float(f"{value:.10g}")
 
 
 # ---- choices that a scene cannot have --------------------------------------------------------------------------------

@@ -49,15 +49,12 @@ PRIVATE_FIELDS = {"allowed_seconds", "history", "machine", "versions", "version"
 
 
 class KnobPoint(StoredRecord):
-    """Value of a knob (varied setting): medians of time and error over its seeds, and the range of the error."""
+    """Value of a knob (varied setting), with the time and the error of its run."""
 
     label: str  # value of the knob in words
     settings: StoredSettings  # settings of the run
-    seconds: float | None  # median time (s); null: times are not comparable
-    rrmsd: float  # median RRMSD by the reference
-    lowest: float  # lowest RRMSD of all seeds
-    highest: float  # highest RRMSD of all seeds
-    seeds: int  # number of seeds that were run
+    seconds: float | None  # time (s); null: times are not comparable
+    rrmsd: float  # RRMSD by the reference
 
 
 class TableKnob(StoredRecord):
@@ -114,7 +111,6 @@ class TradeoffTable(StoredRecord):
     front: tuple[StoredSettings, ...]  # settings of the runs on the Pareto front, the fastest first
     front_halving: float | None  # factor of the time that halves the error along the front
     presets: tuple[Preset, ...]  # quality presets that were run
-    seeds: dict[str, bool | None]  # true if another seed gives another lens, by method; null: not measured
     history: tuple[HistoryPoint, ...]  # convergence of the run of the base scene
 
     @property
@@ -254,17 +250,13 @@ def draw_runs(axes: Axes, table: TradeoffTable) -> None:
 
 
 def _draw_knob(axes: Axes, knob: TableKnob) -> None:
-    """Draw the points of a knob in their order, with bars for the range of the seeds."""
+    """Draw the points of a knob in their order."""
     colour, marker, line = KNOB_STYLES[knob.key]
     ends, places = " to ".join(dict.fromkeys((knob.places[0].label, knob.places[-1].label))), knob.places
     style: dict[str, Any] = {"color": colour, "marker": marker, "ls": line, "ms": 5, "lw": 1.2, "zorder": 3}
     style |= {"mec": colour, "mew": 1.4} if marker == "x" else {"mec": "white", "mew": 0.5}
     points = [(p.seconds, p.rrmsd) for p in places if p.seconds is not None]
     axes.plot(*zip(*points, strict=True), label=f"{knob.title}: {ends}", **style)
-    if repeated := [p for p in places if p.seeds > 1]:
-        bars = [[p.rrmsd - p.lowest for p in repeated], [p.highest - p.rrmsd for p in repeated]]
-        times, errors = [p.seconds for p in repeated if p.seconds is not None], [p.rrmsd for p in repeated]
-        axes.errorbar(times, errors, bars, fmt="none", ecolor=colour, lw=1.0, capsize=2, zorder=3)
 
 
 def _draw_presets(axes: Axes, table: TradeoffTable) -> None:

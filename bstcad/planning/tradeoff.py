@@ -67,11 +67,6 @@ class Knob:
     combines: bool = False  # True if the knob varies two other knobs together
 
 
-def other_seed(seed: int, point: Settings) -> Settings:
-    """Return the settings `point`, but with the seed of the scene, `seed`, plus one."""
-    return sorted_settings({**dict(point), "tailoring.seed": seed + 1})
-
-
 def describe(point: Settings) -> str:
     """Describe settings in words, such as "rays = 512, rounds = 2"."""
     changes = (f"{key.removeprefix('tailoring.')} = {format_value(value)}" for key, value in point)
@@ -182,11 +177,11 @@ def _joint_points(*varied: tuple[str, Any, Sequence[float]]) -> Points:
 # --- order of the runs ------------------------------------------------------------------------------------------------
 
 
-def run_order(seed: int, knobs: Sequence[Knob]) -> list[Settings]:
+def run_order(knobs: Sequence[Knob]) -> list[Settings]:
     """Return all runs, the most important first, so that any budget gives the most useful runs.
 
-    First come the preset draft, the base and the preset standard, then neighbours of the base, fast runs with another
-    seed and the preset fine, then further points, and last the preset paper.
+    First come the preset draft, the base and the preset standard, then neighbours of the base and the preset fine, then
+    further points, and last the preset paper.
     """
     presets = knobs[0].points
     single = [knob for knob in knobs[1:] if not knob.combines]
@@ -196,8 +191,7 @@ def run_order(seed: int, knobs: Sequence[Knob]) -> list[Settings]:
     def neighbours(varied: Iterable[Knob], *distances: int) -> list[Settings]:
         return [point for steps in distances for knob in varied for point in _neighbour(knob, steps) if point != paper]
 
-    repeated = [other for _, other in _probes(seed, knobs).values()]
-    order = [presets.get("draft", ()), (), presets.get("standard", ()), *neighbours(single, -1), *repeated]
+    order = [presets.get("draft", ()), (), presets.get("standard", ()), *neighbours(single, -1)]
     order += [*neighbours(joint, -1), *neighbours(single, +1), presets.get("fine", ()), *neighbours(joint, +1)]
     order += [*neighbours(single, -2, -3, -4), *neighbours(knobs[1:], 2, -2, 3, -3, 4, -4), paper]
     return list(dict.fromkeys(order))
@@ -211,22 +205,6 @@ def _neighbour(knob: Knob, steps: int) -> list[Settings]:
     points = list(knob.points.values())
     start = points.index(()) if () in points else 1 if steps == -1 else 0 if steps > 0 else -1
     return points[start + steps : start + steps + 1] if start + steps >= 0 else []
-
-
-def _probes(seed: int, knobs: Sequence[Knob]) -> dict[str, tuple[Settings, Settings]]:
-    """Return for each method the settings of a fast run, and these settings with another seed."""
-    by_key = {knob.key: knob.points for knob in knobs}
-    quick = {"least-squares": by_key["quality"].get("draft"), "adam": next(iter(by_key.get("adam", {}).values()), None)}
-    return {method: (point, other_seed(seed, point)) for method, point in quick.items() if point is not None}
-
-
-def seed_matters(seed: int, knobs: Sequence[Knob], runs: Mapping[Settings, ColdRun]) -> dict[str, bool | None]:
-    """Return for each method True if another seed gives another lens; None: not measured."""
-    nets = {
-        method: [runs[point].net for point in pair if point in runs and runs[point].done]
-        for method, pair in _probes(seed, knobs).items()
-    }
-    return {method: pair[0] != pair[1] if len(pair) == 2 else None for method, pair in nets.items()}
 
 
 # --- the sweep --------------------------------------------------------------------------------------------------------
@@ -299,7 +277,7 @@ class _Sweep:
     def __init__(self, base: Scene, budget: float, folder: Path, progress: Progress) -> None:
         self._base, self._budget, self._folder, self._progress = base, budget, folder, progress
         self._knobs = knobs(base)
-        self._order, self._work = run_order(base.tailoring.seed, self._knobs), cache(partial(predicted_work, base))
+        self._order, self._work = run_order(self._knobs), cache(partial(predicted_work, base))
         self._under_way: dict[Settings, tuple[float, float]] = {}  # (start time, predicted seconds) of current runs
         self._file = folder / "runs" / f"{environment.version()}.json"
         self.runs: dict[Settings, ColdRun] = {}  # runs that have ended
@@ -402,7 +380,7 @@ def predicted_work(scene: Scene, point: Settings) -> tuple[bool, float]:
 
 def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: float = math.inf) -> TradeoffTable:
     """Return the table of a sweep.  runs: ended runs, then runs not done, both in order of importance; budget in s."""
-    own, seed, best = scene.lens.back.net, scene.tailoring.seed, pareto_front(runs)
+    own, best = scene.lens.back.net, pareto_front(runs)
     comparable = {run.settings: run for run in runs if run.comparable}
     selected = comparable or {run.settings: run for run in runs if run.done}
     sample = selected.get(()) or next(iter(selected.values()), None)  # states the machine of all runs
@@ -435,7 +413,7 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
         calibration=Calibration.of(unit),
         runs=tuple(map(described, runs)),
         knobs=tuple(
-            TableKnob(key=knob.key, title=knob.title, places=knob_points(seed, knob, selected, timed=bool(comparable)))
+            TableKnob(key=knob.key, title=knob.title, places=knob_points(knob, selected, timed=bool(comparable)))
             for knob in knobs
         ),
         front=on_front,
@@ -443,7 +421,6 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
         presets=tuple(
             Preset(name=name, seconds=t if comparable else None, rrmsd=e) for name, (t, e) in presets.items()
         ),
-        seeds=seed_matters(seed, knobs, {run.settings: run for run in runs}),
         history=comparable[()].history if () in comparable else (),
     )
 
@@ -454,30 +431,24 @@ def _judged_on(targets: Sequence[Target]) -> str:
     return f"the target with the largest RRMSD, of {sizes}" if len(targets) > 1 else sizes
 
 
-def knob_points(seed: int, knob: Knob, runs: Mapping[Settings, ColdRun], timed: bool = True) -> tuple[KnobPoint, ...]:
-    """Return the points of a knob that were run, as medians over the seeds; timed: True if times are comparable."""
-    averages = []
-    for label, point in knob.points.items():
-        if done := [runs[each] for each in (point, other_seed(seed, point)) if each in runs and runs[each].done]:
-            times, errors = zip(*(run.time_and_error for run in done), strict=True)
-            seconds = statistics.median(times) if timed else None
-            middle: dict[str, Any] = {"seconds": seconds, "rrmsd": statistics.median(errors)}
-            extent: dict[str, Any] = {"lowest": min(errors), "highest": max(errors), "seeds": len(done)}
-            averages.append(KnobPoint(label=label, settings=point, **middle, **extent))
-    return tuple(averages)
+def knob_points(knob: Knob, runs: Mapping[Settings, ColdRun], timed: bool = True) -> tuple[KnobPoint, ...]:
+    """Return the points of a knob that were run; timed: True if times are comparable."""
+    found = ((label, runs[point]) for label, point in knob.points.items() if point in runs and runs[point].done)
+    times = ((label, run, run.time_and_error) for label, run in found)
+    return tuple(
+        KnobPoint(label=label, settings=run.settings, seconds=seconds if timed else None, rrmsd=rrmsd)
+        for label, run, (seconds, rrmsd) in times
+    )
 
 
 def _knob_keys(knobs: Sequence[Knob], point: Settings) -> tuple[str, ...]:
-    """Return the keys of the knobs with a point at these settings, with any seed; ("base",) for the base scene."""
-    without = tuple(entry for entry in point if entry[0] != "tailoring.seed")
-    return tuple(knob.key for knob in knobs if without in knob.points.values()) if without else ("base",)
+    """Return the keys of the knobs with a point at these settings; ("base",) for the base scene."""
+    return tuple(knob.key for knob in knobs if point in knob.points.values()) if point else ("base",)
 
 
 def _labels(scene: Scene, knobs: Sequence[Knob]) -> dict[Settings, str]:
     labels: dict[Settings, str] = {(): f"{scene.tailoring.quality} (the unchanged scene)"}
     for knob in knobs:
         for label, point in knob.points.items():
-            name = label if knob.key == "quality" else f"{knob.title}: {label}"
-            labels.setdefault(point, name)
-            labels.setdefault(other_seed(scene.tailoring.seed, point), f"{name}, seed {scene.tailoring.seed + 1}")
+            labels.setdefault(point, label if knob.key == "quality" else f"{knob.title}: {label}")
     return labels

@@ -38,7 +38,7 @@ from torch import Tensor
 from bstcad.optics.light.wavefront import SphericalWave, Wave
 from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.receivers.receivers import Receiver
-from bstcad.optics.surfaces.rays import Vector
+from bstcad.optics.surfaces.rays import Vector, dot
 from bstcad.optics.surfaces.surfaces import Surface
 from bstcad.runs.files import SceneError
 from bstcad.tailoring.driver import Task
@@ -83,8 +83,8 @@ class LightBehind:
         """Return the coordinates x and y (mm) on a plane of the points where the rays cross it, each (c + 1, r + 1)."""
         (e_x, e_y, normal), (x, y) = _frame(receiver), receiver.origin
         off = np.array(receiver.middle).reshape(3, 1, 1) - self.position
-        off = _dot(normal, off) / _dot(normal, self.direction) * self.direction - off
-        return _dot(e_x, off) + x, _dot(e_y, off) + y
+        off = dot(normal, off) / dot(normal, self.direction) * self.direction - off
+        return dot(e_x, off) + x, dot(e_y, off) + y
 
     def sampled_at(self, screen: Screen, values: np.ndarray) -> np.ndarray:
         """Interpolate values at the rays (k, c + 1, r + 1) to a screen's pixel corners, (k, columns + 1, rows + 1)."""
@@ -180,10 +180,6 @@ def _frame(receiver: Receiver) -> tuple[Vector, Vector, Vector]:
     return receiver.frame
 
 
-def _dot(vector: Vector, of: np.ndarray) -> np.ndarray:
-    return vector[0] * of[0] + vector[1] * of[1] + vector[2] * of[2]
-
-
 def light_of_wave(screen: Screen, picture: np.ndarray, wave: Wave, *, wavelength: float, parts: int) -> LightBehind:
     """Return the rays of a wave through the corners of a screen's pixels, each pixel divided into parts x parts.
 
@@ -227,7 +223,7 @@ def between_targets(
 
     def cosines(p: np.ndarray, t: np.ndarray) -> Points:
         way = _normalised(t - p)
-        return _dot(e_x, way), _dot(e_y, way)
+        return dot(e_x, way), dot(e_y, way)
 
     t = in_space(behind.receiver, *pixel_corners(behind))
     m = in_space(behind.receiver, *(np.array(c) for c in centroid(target, behind))).reshape(3, 1, 1)

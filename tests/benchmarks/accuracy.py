@@ -179,7 +179,7 @@ def swept(scene: str, budget: float) -> Record:
 def as_record(facts: Record) -> Record:
     """The parts of tradeoff.json that figure and page show."""
     ran = [run for run in facts["runs"] if run["status"] == "done"]
-    seen = ("label", "seconds", "rrmsd", "lowest", "highest", "seeds")
+    seen = ("label", "seconds", "rrmsd")
     kept = ("title", "budget_seconds", "spent_seconds", "calibration", "reference", "presets", "front_halving")
     return {
         **{name: facts[name] for name in kept},
@@ -243,14 +243,14 @@ def circumstances() -> Record:
     }
 
 
-def known() -> dict[str, Any]:
-    """The recorded results."""
-    return json.loads(RECORDED.read_text(encoding="utf-8")) if RECORDED.exists() else {}
+def known(path: Path) -> dict[str, Any]:
+    """The results that are recorded in a file."""
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
 
-def put(recorded: Mapping[str, Any]) -> None:
-    """Keep them, numbers to DIGITS."""
-    files.put(RECORDED, (json.dumps(round_numbers(recorded, DIGITS), ensure_ascii=False, indent=1) + "\n").encode())
+def put(path: Path, recorded: Mapping[str, Any]) -> None:
+    """Keep results in a file, numbers to DIGITS."""
+    files.put(path, (json.dumps(round_numbers(recorded, DIGITS), ensure_ascii=False, indent=1) + "\n").encode())
 
 
 def write(recorded: Mapping[str, Any]) -> None:
@@ -392,7 +392,7 @@ def main() -> None:
     parser.add_argument("--budget", type=float, default=600.0, help="seconds of a sweep")
     parser.add_argument("--limit", type=float, default=600.0, help="seconds of Mitsuba's run")
     asked = parser.parse_args()
-    all_pieces, recorded = pieces(asked.budget, asked.limit), known()
+    all_pieces, recorded = pieces(asked.budget, asked.limit), known(RECORDED)
     if asked.list:
         for name, piece in all_pieces.items():
             found = piece.find(recorded)
@@ -404,9 +404,9 @@ def main() -> None:
         when, before = circumstances() | {"others": round(psutil.cpu_percent(WATCHED) / 100, 2)}, pace_now()
         record = all_pieces[name].record()
         record |= {"recorded": when | {"pace": (before + pace_now()) / 2}}
-        recorded = known()
+        recorded = known(RECORDED)
         all_pieces[name].keep(recorded, record)
-        put(recorded)
+        put(RECORDED, recorded)
         write(recorded)
     write(recorded)
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bstcad.runs import processes
+
 ROOT = Path(__file__).parent.parent.parent
 TEMPLATES = ROOT / "templates"
-LIMIT = 3600.0  # seconds; a command that hangs is an error
+LIMIT = 3600.0  # seconds, after which a command is ended
 
 
 @dataclass(frozen=True)
@@ -37,10 +35,6 @@ class Run:
 def generate(scene: str | Path, folder: Path, *settings: str) -> Run:
     """`bstcad generate` of a template or of a scene file's whole path, with settings as `--set` takes them."""
     path = (TEMPLATES / scene).with_suffix(".toml")
-    command = [sys.executable, "-m", "bstcad.cli", "generate", str(path), "-o", str(folder)]
-    command += [word for setting in settings for word in ("--set", setting)]
-    began, before = time.perf_counter(), os.times()
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=LIMIT)
-    seconds, after = time.perf_counter() - began, os.times()
-    spent = after.children_user + after.children_system - before.children_user - before.children_system
-    return Run(folder, done.returncode, done.stderr, seconds, spent)
+    changes = [word for setting in settings for word in ("--set", setting)]
+    ended = processes.run(["generate", str(path), "-o", str(folder), *changes], LIMIT)
+    return Run(folder, ended.code, ended.stderr, ended.seconds, ended.cpu_seconds)

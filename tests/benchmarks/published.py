@@ -26,7 +26,6 @@ from skimage.metrics import structural_similarity
 
 from bstcad.designs.folder import read_nominal
 from bstcad.figures.light_figures import View
-from bstcad.planning.cold_run import round_numbers
 from bstcad.runs import files
 from tests import markdown
 from tests.benchmarks import accuracy
@@ -41,7 +40,6 @@ SUN_SIDE, SUN_INSIDE = 256, 212  # pixels; the picture in its black border
 SIDE, COLOURS = 256, 64  # pixels a side of each of the two pictures of a scene; grey levels
 GAP = 4  # pixels between them
 BRIGHT = 99.5  # percentile of the target that is shown white
-DIGITS = 5
 CASES = {  # name: (title, scene)
     "thu": ("letters, collimated, off axis", TEMPLATES / "thu.toml"),
     "portrait": ("portrait, point source", TEMPLATES / "portrait.toml"),
@@ -107,11 +105,6 @@ def side_by_side(target: np.ndarray, irradiance: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
-def known() -> dict[str, Any]:
-    """The records."""
-    return json.loads(RECORDED.read_text(encoding="utf-8")) if RECORDED.exists() else {}
-
-
 def page(recorded: Mapping[str, Any], others: Mapping[str, Any]) -> str:
     """Return the page from the records, and from accuracy.json Mitsuba's run and the paper's procedure."""
     when = {json.dumps(found["recorded"]): found["recorded"] for found in recorded.values()}
@@ -121,11 +114,6 @@ def page(recorded: Mapping[str, Any], others: Mapping[str, Any]) -> str:
         titles={name: title for name, (title, _) in CASES.items()},
         records=sorted(when.values(), key=lambda each: each["date"]),
     )  # fmt: skip
-
-
-def write() -> None:
-    """The page from what is recorded."""
-    files.put(PAGE, page(known(), accuracy.known()).encode())
 
 
 def main() -> None:
@@ -140,11 +128,10 @@ def main() -> None:
             print(f"{SUN} is left as it is: make published SUN_PICTURE=…/img1.jpg records it", flush=True)
             continue
         print(f"recording {name}", flush=True)
-        recorded = known() | {name: designed(name, asked.sun_picture)}
-        recorded = {key: recorded[key] for key in CASES if key in recorded}
-        files.put(RECORDED, (json.dumps(round_numbers(recorded, DIGITS), ensure_ascii=False, indent=1) + "\n").encode())
-    if known():
-        write()
+        recorded = accuracy.known(RECORDED) | {name: designed(name, asked.sun_picture)}
+        accuracy.put(RECORDED, {key: recorded[key] for key in CASES if key in recorded})
+    if recorded := accuracy.known(RECORDED):
+        files.put(PAGE, page(recorded, accuracy.known(accuracy.RECORDED)).encode())
 
 
 if __name__ == "__main__":

@@ -89,7 +89,7 @@ HEIGHTS = [name for name in templates() if 'kind = "radial"' not in (TEMPLATES /
 
 @pytest.mark.parametrize("template", HEIGHTS)
 def test_other_programs_agree(template, tmp_path):
-    """Domes have a judge of their own (tests/benchmarks/judged_dome.py), since these programs trace heights."""
+    """Domes are judged by tests/benchmarks/independent.py alone, since these programs trace heights."""
     lens = written(template, {"tailoring.quality": "draft"}, tmp_path)
     channels = lens.scene.verification_channels()
     for name, goal in product(comparison.JUDGES, lens.scene.goals):

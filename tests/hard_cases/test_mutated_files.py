@@ -114,7 +114,7 @@ def tiny():
 def runs():
     """The runs of a sweep: presets, neighbours, and one that was stopped at its limit."""
     scene = tiny()
-    points = tradeoff.run_order(scene.tailoring.seed, tradeoff.knobs(scene))[:4]
+    points = tradeoff.run_order(tradeoff.knobs(scene))[:4]
     found = [run_of(scene, point).model_copy(update={"allowed_seconds": 30.0}) for point in points]
     return tradeoff.RunFile(runs=tuple(found)).model_dump_json(indent=1).encode()
 

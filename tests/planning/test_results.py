@@ -11,7 +11,7 @@ from bstcad.figures.drawing import png
 from bstcad.planning import results
 from bstcad.planning.cold_run import DONE, FAILED, ColdRun
 from bstcad.planning.results import halving_factor, pareto_front
-from bstcad.planning.tradeoff import Knob, knob_points, other_seed, tradeoff
+from bstcad.planning.tradeoff import tradeoff
 from bstcad.report.units import number
 from tests.planning.conftest import FAR, Synthetic
 
@@ -36,15 +36,6 @@ def test_the_price_of_halving_is_that_of_the_power_law(power):
     assert (
         halving_factor(pareto_front(runs)) == pytest.approx(2**power) and halving_factor(pareto_front(runs[:2])) is None
     )
-
-
-def test_two_seeds_give_median_and_range(tiny):
-    point = (("tailoring.rays", 5),)
-    runs = {point: run(10, 0.3), other_seed(0, point): run(11, 0.1)}
-    knob = Knob("adam", "Adam", {"not run": (("tailoring.rays", 4),), "a": point})
-    [place] = knob_points(0, knob, runs)
-    assert (place.seconds, place.lowest, place.highest, place.seeds) == (10.5, 0.1, 0.3, 2)
-    assert place.rrmsd == pytest.approx(0.2) and knob_points(0, knob, runs, timed=False)[0].seconds is None
 
 
 def only(table, *runs):
@@ -100,8 +91,6 @@ def test_the_page_fetches_nothing_and_shows_every_run(swept):
     text = (folder / "tradeoff.html").read_text()
     assert not re.search(r'(?:src|href)="(?!data:)', text) and "<script" not in text
     assert results.verdict(found)[1] in text and "HALVING" in text
-    assert "The seed has no effect on L-BFGS with flux tubes" in text
-    assert "The seed has an effect on Adam with random rays" in text
     assert text.count('<th scope="row" class="label">') == len(found.front) + len(found.runs_with_lens) + len(
         found.failed
     )

@@ -76,7 +76,7 @@ class TestKnobs:
         }  # fmt: skip
 
     def test_presets_come_first_then_neighbours_and_the_paper_last(self, tiny):
-        order = run_order(tiny.tailoring.seed, knobs(tiny))
+        order = run_order(knobs(tiny))
         assert order[:2] == [(), sorted_settings({"tailoring.quality": "standard"})]  # the base is the draft
         assert order[-1] == sorted_settings({"tailoring.quality": "paper"})
         near = [{"tailoring.rays": 91}, {"lens.back.control_points": 17}, {"tailoring.stage2_iterations": 6}]
@@ -186,7 +186,7 @@ class TestFiles:
 
 KEYS = """
     name title base budget_seconds spent_seconds errors_alone version sources machine versions reference calibration
-    runs knobs front front_halving presets seeds history
+    runs knobs front front_halving presets history
 """
 OF_A_RUN = """
     settings status reason where seconds cpu_seconds kernel_seconds cost_seconds predicted_seconds peak_memory_gb rrmsd

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from bstcad.optics.surfaces.motion import Motion
 from bstcad.optics.surfaces.outlines import Outline
-from bstcad.optics.surfaces.rays import MIN_AXIAL_COSINE, Frame, Landed, Rays, Status, Vector, axes, clocked
+from bstcad.optics.surfaces.rays import MIN_AXIAL_COSINE, Frame, Landed, Rays, Status, Vector, axes, clocked, dot
 
 # attributes and methods that a moved receiver has in common with the receiver at rest
 COPIED = ("unit", "light", "photometric_unit", "names", "position_text", "per_radian", "areas", "cell_sizes")
@@ -336,8 +336,3 @@ class TiltedPlane(PlaneReceiver):
         (e_x, e_y, _), offset = self.axes, self._from_centre(rays)
         x, y = aim[0] - self.centre[0], aim[1] - self.centre[1]
         return torch.stack([x * a + y * b - o for a, b, o in zip(e_x, e_y, offset, strict=True)])
-
-
-def dot(vector: Sequence[float | Tensor] | Tensor, of: Array | Sequence[Array]) -> Array:
-    """Return the dot product of a vector and an array of vectors (3, …)."""
-    return vector[0] * of[0] + vector[1] * of[1] + vector[2] * of[2]

@@ -38,7 +38,7 @@ from bstcad.optics.surfaces.bspline import BSplineSurface, evaluate, interpolati
 from bstcad.optics.surfaces.charts import Chart, SphereChart
 from bstcad.optics.surfaces.motion import Motion, along_axis
 from bstcad.optics.surfaces.outlines import POINTS_AROUND, Circle, Outline
-from bstcad.optics.surfaces.rays import Rays
+from bstcad.optics.surfaces.rays import Rays, dot
 from bstcad.optics.surfaces.surfaces import Patch, Surface, Vectors, points_on
 
 NEWTON_STEPS = 20  # maximum number of Newton steps, after which a ray misses; a smooth dome needs 3 to 5
@@ -469,11 +469,6 @@ def path_to_sphere(origin: Tensor, along: Tensor, radius: Tensor | float) -> Ten
     middle = dot(origin, along)
     square = middle * middle - dot(origin, origin) + radius**2
     return torch.sqrt(square.clamp(min=0)) - middle
-
-
-def dot(p: Tensor, q: Tensor) -> Tensor:
-    """Return the dot product of vectors (3, …)."""
-    return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 
 def across(along: Tensor) -> tuple[Tensor, Tensor]:

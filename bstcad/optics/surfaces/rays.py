@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from types import MappingProxyType
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -123,6 +124,11 @@ def point_along(start: Vector, distance: float, direction: Vector) -> Vector:
     """Return start + distance · direction."""
     (x, y, z), (d_x, d_y, d_z) = start, direction
     return x + distance * d_x, y + distance * d_y, z + distance * d_z
+
+
+def dot(vector: Sequence[float | Tensor] | Tensor, of: Any) -> Any:
+    """Return the dot product of a vector and vectors (3, …), numbers, numpy arrays or torch tensors."""
+    return vector[0] * of[0] + vector[1] * of[1] + vector[2] * of[2]
 
 
 def axes(tilt: tuple[float, float]) -> Frame:

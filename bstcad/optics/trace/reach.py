@@ -22,9 +22,9 @@ from bstcad.optics.lens.interfaces import Law
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.numerics.reductions import total
-from bstcad.optics.receivers.receivers import Receiver, dot
+from bstcad.optics.receivers.receivers import Receiver
 from bstcad.optics.surfaces.charts import HEIGHTS
-from bstcad.optics.surfaces.rays import Rays
+from bstcad.optics.surfaces.rays import Rays, dot
 from bstcad.optics.trace.tubes import rays_to
 
 MAX_EXIT_ANGLE = math.radians(85)  # largest angle of refraction in air (rad); incidence in PMMA 0.2° below critical

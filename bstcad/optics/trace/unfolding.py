@@ -17,8 +17,8 @@ from torch import Tensor
 from bstcad.optics.lens.interfaces import Interface, Reflect
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.receivers.irradiance import Screen
-from bstcad.optics.receivers.receivers import LevelPlane, PlaneReceiver, Receiver, dot
-from bstcad.optics.surfaces.rays import Frame, Rays, Vector, point_along
+from bstcad.optics.receivers.receivers import LevelPlane, PlaneReceiver, Receiver
+from bstcad.optics.surfaces.rays import Frame, Rays, Vector, dot, point_along
 from bstcad.optics.surfaces.surfaces import sag
 from bstcad.optics.surfaces.tilted import TiltedSurface
 

@@ -28,10 +28,10 @@ from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.emitters import Emitter
 from bstcad.optics.light.wavefront import MM_PER_NM, Wave, length
 from bstcad.optics.numerics.reductions import total
-from bstcad.optics.receivers.receivers import LevelPlane, dot
+from bstcad.optics.receivers.receivers import LevelPlane
 from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.motion import Motion
-from bstcad.optics.surfaces.rays import Rays
+from bstcad.optics.surfaces.rays import Rays, dot
 from bstcad.optics.trace.trace import behind, clear_window
 
 RAYS_PER_SIDE = 512  # rays per side of the square grid that is launched

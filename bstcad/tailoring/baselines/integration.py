@@ -26,10 +26,10 @@ from torch import Tensor
 
 from bstcad.optics.lens.interfaces import TANGENCY_TOLERANCE, Law
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.receivers.receivers import Receiver, dot
+from bstcad.optics.receivers.receivers import Receiver
 from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.bspline import BSplineSurface, evaluate, net_gradient
-from bstcad.optics.surfaces.rays import Rays
+from bstcad.optics.surfaces.rays import Rays, dot
 from bstcad.optics.surfaces.sides import Sides, as_pair
 from bstcad.optics.trace.reach import wanted_slopes
 from bstcad.optics.trace.trace import clear_window, to_first_net

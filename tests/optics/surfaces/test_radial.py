@@ -15,7 +15,7 @@ from bstcad.optics.surfaces.charts import HEIGHTS, SphereChart
 from bstcad.optics.surfaces.outlines import Circle
 from bstcad.optics.surfaces.radial import RadialSurface
 from bstcad.optics.surfaces.rays import Rays, Status
-from tests.benchmarks import independent_dome
+from tests.benchmarks import independent_trace
 
 R, Z, HALF = 15.0, 2.0, math.radians(85.0)
 CHART = SphereChart(R)
@@ -173,7 +173,7 @@ def test_a_net_that_is_not_radial_is_refused(fault):
 def by_scipy(surface, origin, direction, start):
     """Return the point at which a line meets the B-spline of the control points, by MINPACK from a point near it."""
     net = surface.control_points() - (0.0, 0.0, surface.z)
-    knots = [independent_dome.uniform_knots(count) for count in net.shape[:2]]
+    knots = [independent_trace.uniform_knots(count) for count in net.shape[:2]]
 
     def point(t):
         along = BSpline(knots[1], np.moveaxis(BSpline(knots[0], net, 2)(t[0]), 0, 0), 2)
@@ -201,11 +201,14 @@ def test_points_are_on_the_surface_and_on_the_ray(spread):
     x, y, _ = CHART.coordinates(torch.from_numpy(points[found].T.copy()))
     for k in np.flatnonzero(found)[:3]:
         assert np.abs(by_scipy(surface, o[k], d[k], points[k]) - points[k]).max() < 1e-12 * R
-    other = independent_dome.meet(independent_dome.dome_of(surface.control_points(), (0, 0, Z)), o + (0, 0, Z), d)
-    assert (other.found == found).all()
-    assert np.abs(other.point - (0, 0, Z) - points)[found].max() < 1e-12 * R
+    net, work = independent_trace.dome_of(surface.control_points(), (0, 0, Z)), np.empty((7, 3))
     unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    assert np.abs(other.normal - unit)[found].max() < 1e-11
+    for k, p in enumerate(o + (0, 0, Z)):
+        meets, _, point, normal = independent_trace.on_dome(net, *independent_trace.start(net, p, d[k]), p, d[k], work)
+        assert meets == found[k]
+        if meets:
+            assert np.abs(np.subtract(point, (0, 0, Z)) - points[k]).max() < 1e-12 * R
+            assert np.abs(normal - unit[k]).max() < 1e-11
 
 
 def test_rays_through_the_centre_meet_the_surface_in_their_direction():
@@ -249,14 +252,14 @@ def test_the_first_of_several_crossings_is_met():
     rays = rays_from(0.85 * R * o, d - 0.8 * (d * o).sum(0) * o)  # along the surface rather than towards it
     found, points, _ = met(surface, rays)
     o, d = rays.position.numpy().T, rays.direction.numpy().T
-    net = independent_dome.dome_of(surface.control_points() - (0, 0, Z))
-    u, v = (p.ravel() for p in np.meshgrid(*[np.linspace(0, 63, 64)] * 2, indexing="ij"))
-    places, several = independent_dome.surface(net, u, v)[0], 0
+    net, work, several = independent_trace.dome_of(surface.control_points() - (0, 0, Z)), np.empty((7, 3)), 0
+    spans = np.linspace(0, 63, 64)
+    places = independent_trace.places_of(net.poles, (net.knots_u, net.knots_v), spans, spans).reshape(-1, 3)
     for k in range(count):
         chosen = np.linalg.norm(np.cross(places - o[k], d[k]), axis=1).argsort()[:near]
-        tiled = (np.repeat(p[k][None], near, 0) for p in (o, d))
-        crossings = independent_dome.meet(net, *tiled, (u[chosen], v[chosen]))
-        paths = np.unique(crossings.path[crossings.found].round(9))
+        starts = zip(spans[chosen // 64], spans[chosen % 64], strict=True)
+        crossings = [independent_trace.on_dome(net, *at, o[k], d[k], work) for at in starts]
+        paths = np.unique([round(path, 9) for meets, path, *_ in crossings if meets])
         if not len(paths):
             assert not found[k]
             continue
