@@ -28,6 +28,7 @@ from scipy.ndimage import binary_closing, binary_dilation
 
 import bstcad
 from bstcad import commands
+from bstcad.api import Design
 from bstcad.commands import ProofOptions
 from bstcad.designs import pipeline
 from bstcad.figures.figure_jobs import NoPictures
@@ -54,7 +55,7 @@ from bstcad.scene.lamp import IntensityFile, RayFile
 from bstcad.tailoring.stage2 import PrecisionComparison
 from tests import suite
 from tests.conftest import verify_with
-from tests.efforts import LITTLE
+from tests.efforts import LITTLE, designed_quickly
 from tests.planning.conftest import typical_pilot
 
 # --- the choices ------------------------------------------------------------------------------------------------------
@@ -665,7 +666,7 @@ BODIES = {  # choices of a scene, by the body that it has
 def test_a_design_remains_the_design_of_its_folder(body, tmp_path):
     """Methods of a design work after it was written, opened, and written again: its net is equal to the last bit."""
     folder = tmp_path / "design"
-    design = bstcad.design(scene_of(PLAIN | BODIES[body]), progress=False)
+    design = Design(designed_quickly(scene_of(PLAIN | BODIES[body])))
     report = design.write(folder, progress=False)
     again = bstcad.open(folder)
     assert np.array_equal(design.lens.back_net.control_points(), again.lens.back_net.control_points())

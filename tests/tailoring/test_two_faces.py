@@ -33,7 +33,6 @@ BEAM = CollimatedSource(aperture=Rectangle(16.0, 16.0), wavelength=600.0)
 NEAR, FAR = Screen(30.0, (-9.0, 9.0), (-9.0, 9.0), 24), Screen(60.0, (-9.0, 9.0), (-9.0, 9.0), 24)
 WAVES = {
     "plane": PlaneWave(30.0), "sphere": SphericalWave((0.0, 0.0, 400.0), 30.0),
-    "from a point": SphericalWave((0.0, 0.0, -300.0), 30.0),
     "zernike": ZernikeWave((0.0, 0.0, 0.0, 2.0, 1.0), 8.0, 30.0),
 }  # fmt: skip
 
