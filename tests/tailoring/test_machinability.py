@@ -18,6 +18,7 @@ from bstcad.optics.surfaces.surfaces import Plane, Sphere
 from bstcad.report import record
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
+from bstcad.tailoring.effort import FULL
 from bstcad.tailoring.machinability import RELIEF_RESERVE, enforce_bounds, excess, place_back
 from bstcad.tailoring.settings import Bounds
 from tests import lenses, suite
@@ -38,13 +39,13 @@ WHOLE = Rectangle(4.0, 6.0)
 @pytest.fixture(scope="module")
 def free():
     """The small design that may have any shape: radius 20 mm, slope 3.6 degrees, 9.82 to 10.01 mm thick."""
-    return designed_quickly(load(DISK, TINY))
+    return designed_quickly(load(DISK, TINY), FULL)
 
 
 @pytest.fixture(scope="module")
 def bound():
     """Return a design whose back is bounded by a tool of 50 mm."""
-    return designed_quickly(load(DISK, TINY | {"lens.tool_radius": 50.0}))
+    return designed_quickly(load(DISK, TINY | {"lens.tool_radius": 50.0}), FULL)
 
 
 def steepest(lens):
