@@ -63,6 +63,7 @@ def test_the_file_has_the_design_s_control_points_and_a_closed_solid(name, tmp_p
     assert np.abs(reread.control_points - net).max() < 1e-11
     assert np.abs(reread.back.control_points() - net).max() < 1e-11
     assert reread.back.kind == "radial" and reread.back.z == pytest.approx(lens.back.z, abs=1e-9)
+    assert reread.edge is None  # a bare lens
     assert text.closed and text.faces == (5 if based.front.outline else 4)
     assert reread.front.conic() == pytest.approx(lens.front.conic(), abs=1e-9)
     assert [check.name for check in step_checks.check(path, based, 1e-9, 100) if not check.passed] == []
@@ -221,6 +222,7 @@ def test_a_part_is_read_back_in_the_chart_of_its_design(tmp_path):
         mount = Mount(datum="flange", flange=plate)
         mounting.write_if_it_fits(lens, mount, tmp_path / "part.step", "dome", Part())
         found = step_checks.lens_of_part(tmp_path, lens, mount)
+        assert step_reading.read(tmp_path / "part.step").edge is not None  # a lens with walls of its own
         assert found.back.radius == lens.back.radius and found.apertures[0].radius == pytest.approx(
             lens.front.outline.radius, abs=1e-8
         )
