@@ -18,6 +18,7 @@ from bstcad.scene.errors import SceneError
 from bstcad.tailoring.slope_fit import Fit
 from bstcad.tailoring.slope_map import (
     bending,
+    centroid,
     face_grid,
     fit_to_map,
     lit_corners,
@@ -144,3 +145,10 @@ def test_the_bending_is_that_of_the_slopes_needed(name):
 
     error = (bent(found) - bent(needed)).norm() / bent(needed).norm()
     assert float(error) < 0.15  # the slopes for all pairs are not the gradient of one surface
+
+
+def test_the_centroid_of_one_bright_pixel_is_its_middle():
+    picture = np.zeros((4, 8))
+    picture[1, 6] = 3.0
+    screen = Screen(1000.0, (-40.0, 40.0), (-10.0, 30.0), (8, 4))
+    assert centroid(picture, screen) == pytest.approx((25.0, 15.0), rel=1e-12)
