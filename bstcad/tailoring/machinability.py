@@ -150,7 +150,7 @@ def _parts(lens: Lens, nets: dict[int, BSplineSurface], bounds: Bounds) -> Itera
 
 def _bounds_from_above(lens: Lens, bounds: Bounds) -> dict[int, Bounds]:
     """Return the bounds on z(x, y), seen from +z, for each tailored face, by its number."""
-    turned = replace(bounds, concave=bounds.convex, convex=bounds.concave)  # of a face seen from -z
+    turned = replace(bounds, concave=bounds.convex, convex=bounds.concave)  # bounds of a face that is seen from -z
     highest = lens.faces[-1].name
     return {lens.number_of(f.name): bounds if f.name == highest else turned for f in lens.tailored_faces}
 

@@ -278,7 +278,7 @@ def _possible_variances(energy: np.ndarray, modes: np.ndarray, noise: np.ndarray
     if len(detected) >= EXTRAPOLATION_BANDS:
         return variance
     excess = (energy - 1) / deviation
-    log_density = -(excess**2) / 2 - math.log(math.sqrt(2 * math.pi))  # of the normal distribution
+    log_density = -(excess**2) / 2 - math.log(math.sqrt(2 * math.pi))  # logarithm of the normal density
     possible = noise * deviation * (excess + np.exp(log_density - log_ndtr(excess)))
     possible[detected] = variance[detected]
     last = detected[-1] if len(detected) else 0
