@@ -147,7 +147,11 @@ def pytest_xdist_make_scheduler(config, log):
     """Return the scheduler that deals out long files; --dist loadfile is the one that it replaces."""
     from xdist.scheduler import LoadFileScheduling
 
-    known = {file: sum(seconds.values()) for file, seconds in json.loads(DURATIONS.read_text()).items()}
+    left_out = {"thorough"} if "not thorough" in config.getoption("markexpr") else set()
+    known = {
+        file: sum(seconds for kind, seconds in kinds.items() if kind not in left_out)
+        for file, kinds in json.loads(DURATIONS.read_text()).items()
+    }
 
     class PartsOfFiles(LoadFileScheduling):
         """Scheduler whose unit is a file, or a part of a file that takes longer than MAX_SECONDS."""

@@ -204,6 +204,21 @@ def tree(file):
     return ast.parse(SOURCES[file].read_text())
 
 
+@functools.cache
+def nodes(tree):
+    """The nodes of a syntax tree, which each rule goes through."""
+    return tuple(ast.walk(tree))
+
+
+def dotted_name(node):
+    """A name, or names with dots between them, as text; "" for another expression.  It takes a hundredth of unparse."""
+    names = []
+    while isinstance(node, ast.Attribute):
+        names.append(node.attr)
+        node = node.value
+    return ".".join((node.id, *reversed(names))) if isinstance(node, ast.Name) else ""
+
+
 def offenders(rule, files=SOURCES, allowed=lambda file, offence: False):
     """Offences against a rule by file, but those that are allowed there; {} if it is kept."""
     found = {file: [offence for offence in rule(tree(file)) if not allowed(file, offence)] for file in files}
@@ -228,15 +243,20 @@ def allowed_to(owner):
     return given | {part for part in MAY_IMPORT if part.partition(".")[0] in given - {*MAY_IMPORT}}
 
 
+@functools.cache
 def imported(tree):
     """Every module a file imports, at its top or inside a function, as dotted names."""
-    for node in ast.walk(tree):
+    return tuple(_imported(tree))
+
+
+def _imported(tree):
+    for node in nodes(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             base = ("." * node.level) + (node.module or "")
             yield from (f"{base}.{alias.name}" for alias in node.names)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+        elif isinstance(node, ast.Call) and dotted_name(node.func).endswith("import_module"):
             yield from (argument.value for argument in node.args if dotted(argument))
 
 
@@ -328,7 +348,7 @@ def test_no_two_files_have_one_name():
 def compiled_functions():
     """The names of the functions that numba compiles: they are called by position."""
     for file in SOURCES:
-        for node in ast.walk(tree(file)):
+        for node in nodes(tree(file)):
             if isinstance(node, ast.FunctionDef):
                 decorators = {ast.unparse(each).partition("(")[0] for each in node.decorator_list}
                 if decorators & {"njit", "compiled", "compiled_kernel", "inlined"}:
@@ -337,10 +357,10 @@ def compiled_functions():
 
 def positional(tree):
     """Calls with more than four positional arguments, and records that are filled from a list."""
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if isinstance(node, ast.Call) and len(node.args) > 4 and not any(isinstance(a, ast.Starred) for a in node.args):
             yield ast.unparse(node.func)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("._make"):
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "_make":
             yield from (ast.unparse(node.func) for listed in node.args if isinstance(listed, ast.List | ast.Tuple))
 
 
@@ -359,7 +379,7 @@ DOORS = {
 
 def takes_scene(tree):
     """Names of the functions of a syntax tree with a parameter, and of its classes with a field, that is a Scene."""
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         prefix = f"{node.name}." if isinstance(node, ast.ClassDef) else ""
         for each in node.body if isinstance(node, ast.Module | ast.ClassDef) else ():
             if isinstance(each, ast.AnnAssign) and re.search(r"\bScene\b", ast.unparse(each.annotation)):
@@ -386,12 +406,12 @@ FLAGS = {("shell", True), ("allow_pickle", True), ("weights_only", False)}
 
 def runs_strangers_code(tree):
     """The names in a syntax tree by which a file from elsewhere could have its own code run."""
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if isinstance(node, ast.Import | ast.ImportFrom):
             modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module or ""]
             yield from (module for module in modules if module.split(".")[0] in UNSAFE)
-        elif isinstance(node, ast.Name | ast.Attribute) and ast.unparse(node) in CALLS:
-            yield ast.unparse(node)
+        elif isinstance(node, ast.Name | ast.Attribute) and (name := dotted_name(node)) in CALLS:
+            yield name
         elif isinstance(node, ast.Call):
             flags = [(word.arg, getattr(word.value, "value", None)) for word in node.keywords]
             yield from (word for word, value in flags if (word, value) in FLAGS)
@@ -422,17 +442,17 @@ def depends_on_threads(tree):
 
     What stands in `with threadpool_limits(1, …):` has one thread.
     """
-    blocks = [node for node in ast.walk(tree) if isinstance(node, ast.With)]
+    blocks = [node for node in nodes(tree) if isinstance(node, ast.With)]
     alone = {
         id(node) for block in blocks for node in ast.walk(block)
         if ast.unparse(block.items[0].context_expr).startswith("threadpool_limits(1,")
     }  # fmt: skip
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if id(node) in alone:
             continue
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
             yield "@"
-        elif isinstance(node, ast.Call) and DIVIDED.fullmatch(name := ast.unparse(node.func)):
+        elif isinstance(node, ast.Call) and DIVIDED.fullmatch(name := dotted_name(node.func)):
             yield name
 
 
@@ -458,7 +478,7 @@ def overlooked_by_a_cache(tree):
             made_of = [from_afar[n.id] for n in ast.walk(node.value) if isinstance(n, ast.Name) and n.id in from_afar]
             targets = [n.id for target in node.targets for n in ast.walk(target) if isinstance(n, ast.Name)]
             from_afar |= {name: made_of[0] for name in targets if made_of}
-    for function in ast.walk(tree):
+    for function in nodes(tree):
         compiled = isinstance(function, ast.FunctionDef) and any(
             re.search("njit|compiled", ast.unparse(decorator)) for decorator in function.decorator_list
         )
@@ -479,14 +499,18 @@ def test_compiled_functions_read_nothing_of_other_files():
 SURFACES = ("Plane", "Sphere", "Conic", "Toroid", "BSplineSurface", "RadialSurface")
 
 
+def is_call_of_type(node):
+    return isinstance(node, ast.Call) and dotted_name(node.func) == "type"
+
+
 def questions_of_type(tree):
     """Places in a syntax tree that ask a surface what it is, instead of what it does."""
-    for node in ast.walk(tree):
-        asks = isinstance(node, ast.Call) and ast.unparse(node.func) in ("isinstance", "issubclass")
-        if asks or (isinstance(node, ast.Compare) and "type(" in ast.unparse(node.left)):
+    for node in nodes(tree):
+        asks = isinstance(node, ast.Call) and dotted_name(node.func) in ("isinstance", "issubclass")
+        if asks or (isinstance(node, ast.Compare) and any(map(is_call_of_type, ast.walk(node.left)))):
             named = {name.id for name in ast.walk(node) if isinstance(name, ast.Name)}
             yield from (ast.unparse(node) for name in SURFACES if name in named)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("getattr", "hasattr"):
+        elif isinstance(node, ast.Call) and dotted_name(node.func) in ("getattr", "hasattr"):
             call = ast.unparse(node)
             if re.search(r"\b(front|back|surface)\b", ast.unparse(node.args[0])) and "curvature" in call:
                 yield call

@@ -19,11 +19,11 @@ from bstcad.optics.trace import tubes
 from bstcad.runs import checkpoint
 from bstcad.scene.scene import load
 from bstcad.tailoring.driver import Hooks
-from bstcad.tailoring.effort import FULL
 from bstcad.tailoring.merit import Merit
 from bstcad.tailoring.stage2 import Problem
 from tests import suite
 from tests.conftest import pixels_of_all
+from tests.efforts import LITTLE
 from tests.fake_device import SECOND, SecondDevice, on_second
 
 TEMPLATES = sorted((Path(__file__).parent.parent / "templates").glob("*.toml"))
@@ -49,7 +49,7 @@ QUICK = ("beam_shaper", "draft")
 
 
 # Each design compares float32 with float64: by one evaluation here, which takes the way of all.
-OPTIONS = DesignOptions(effort=replace(FULL, compared_evaluations=1))
+OPTIONS = DesignOptions(effort=replace(LITTLE, compared_evaluations=1))
 BOUNDED = ("machinable_letters", "paper")  # the paper's procedure knows no bounds on the back
 
 

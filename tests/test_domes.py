@@ -19,7 +19,7 @@ from bstcad.optics.surfaces.radial import RadialSurface
 from bstcad.optics.trace.measure import Effort
 from bstcad.scene.errors import SceneError
 from tests import suite
-from tests.conftest import draws_nothing, verify_with
+from tests.conftest import draws_nothing, pictures, verify_with
 from tests.efforts import LITTLE
 
 SCENE = """
@@ -81,7 +81,7 @@ def designed(tmp_path_factory):
     (path / "dome.toml").write_text(SCENE + MOUNT)
     scene = bstcad.load(path / "dome.toml")
     assert scene.lens.front.outline.radius == pytest.approx(np.sqrt(8.0**2 - 1.0))  # it ends in the flange's lower face
-    options = ProofOptions(Effort(128, places=33, points=64, tubes=97), tailoring=LITTLE)
+    options = ProofOptions(Effort(128, places=33, points=64, tubes=97), pictures("sheet"), tailoring=LITTLE)
     return commands.generate(scene, path / "out", device="cpu", options=options), path / "out"
 
 

@@ -627,8 +627,12 @@ def average(light: Callable[[PixelBox], np.ndarray], size: Pixels, window: Windo
     return down @ np.concatenate([(across @ part.T).T for part in parts])
 
 
+@functools.lru_cache(maxsize=4)  # 30 ms a call; each change of a scene, its check and its design draw the same outline
 def inside(outline: Outline, pixels: Pixels, size: Size) -> np.ndarray:
-    """Return the fraction of each pixel (rows, columns) of a rectangle of this size inside an outline centred in it."""
+    """Return the fraction of each pixel (rows, columns) of a rectangle of this size inside an outline centred in it.
+
+    The array is shared: nobody may write to it.
+    """
     columns, rows = pixels
     fine = max(2048 // max(pixels), 4)  # sub-pixels along the side of a pixel
     x, y = (
@@ -637,4 +641,6 @@ def inside(outline: Outline, pixels: Pixels, size: Size) -> np.ndarray:
     )
     high = fine * max(2**20 // (columns * fine * fine), 1)  # about a million sub-pixels at a time
     bands = (outline.contains(x, band[:, None]).numpy() for band in y.split(high))
-    return np.concatenate([band.reshape(-1, fine, columns, fine).mean((1, 3)) for band in bands])
+    found = np.concatenate([band.reshape(-1, fine, columns, fine).mean((1, 3)) for band in bands])
+    found.flags.writeable = False
+    return found

@@ -16,7 +16,9 @@ from bstcad.planning.effect_estimates import coarse_lens, diagnosis, left_out
 from bstcad.report.record import LEFT_OUT
 from bstcad.scene.scene import load
 from bstcad.tailoring.driver import Hooks
+from bstcad.tailoring.effort import FULL
 from tests import suite
+from tests.efforts import LITTLE, designed_quickly
 from tests.scenes import DISK, SMALL
 
 TEMPLATES = Path(__file__).parent.parent.parent / "templates"
@@ -45,7 +47,7 @@ def of(found):
 
 @pytest.mark.parametrize("name", suite.in_turns(SCENES, 3))
 def test_every_kind_of_design_has_one(name):
-    found, course = of(pipeline.design(load(DISK, TINY | SCENES[name])))
+    found, course = of(designed_quickly(load(DISK, TINY | SCENES[name])))
     assert sum(part["error"] for part in found["remaining_error"]["parts"]) == pytest.approx(1)
     assert sum(octave["error"] for octave in found["remaining_error"]["octaves"]) == pytest.approx(1)
     assert found["remaining_error"]["outside"] == pytest.approx(0.1)
@@ -77,10 +79,11 @@ def test_lines_that_stand_for_a_lamp_are_told_from_a_continuous_spectrum():
     """A lens that is tailored for two lines far apart has another picture at wavelengths between them, by new rays."""
     lines = {"source.wavelength": [[500.0, 1.0], [650.0, 1.0]], "lens.material": "PMMA", "lens.index": None}
     off_axis = {"target.x": [40.0, 80.0], "target.y": [-20.0, 20.0]}
-    found = pipeline.design(load(DISK, TINY | lines | off_axis))
-    continuous = found.scene.changed({"source.wavelength": [[nm, 1.0] for nm in np.arange(430.0, 725.0, 10.0)]})
+    found = designed_quickly(load(DISK, TINY | lines | off_axis), FULL)
+    continuous = found.scene.changed({"source.wavelength": [[nm, 1.0] for nm in np.arange(430.0, 725.0, 20.0)]})
+    few = Effort(256, accuracy=0.0, witness=False)
     pictures = (
-        measure(found.lens, scene.channels(), scene.target.screen, found.goals[0].picture, Effort(256)).picture
+        measure(found.lens, scene.channels(), scene.target.screen, found.goals[0].picture, few).picture
         for scene in (found.scene, continuous)
     )
     before, after = (picture / picture.sum() for picture in pictures)
@@ -92,7 +95,10 @@ def test_lines_that_stand_for_a_lamp_are_told_from_a_continuous_spectrum():
 
 def test_a_design_that_was_stopped_before_there_was_a_curve():
     asked = iter([False, False, False])
-    found, _ = of(pipeline.design(load(DISK, TINY), hooks=Hooks(interrupted=lambda: next(asked, True))))
+    options = pipeline.DesignOptions(effort=LITTLE)
+    found, _ = of(
+        pipeline.design(load(DISK, TINY), hooks=Hooks(interrupted=lambda: next(asked, True)), options=options)
+    )
     assert found["convergence"] is None and found["remaining_error"]["octaves"]
 
 

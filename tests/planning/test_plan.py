@@ -14,7 +14,7 @@ from bstcad.planning.effect_estimates import simulated
 from bstcad.planning.plan import plan, predict_qualities
 from bstcad.planning.prediction import PILOT_QUALITIES, QUALITIES, run_pilot
 from bstcad.planning.reduction import PILOT
-from bstcad.scene.errors import toml_positions
+from bstcad.scene.errors import SceneError, toml_positions
 from bstcad.scene.scene import load
 from tests import suite
 from tests.efforts import LITTLE
@@ -192,8 +192,18 @@ def test_a_chip_that_blurs_the_picture_is_said_first(tmp_path, capsys, monkeypat
 
 class TestCommand:
     @suite.in_turn(0, 2)
-    def test_what_is_not_predicted_is_said(self, capsys):
-        """The plate would reach the target."""
+    def test_what_is_not_predicted_is_said(self, capsys, monkeypatch):
+        """The plate would reach the target; the second command has the first one's refusal."""
+        refusals = []
+
+        def pilot(scene, quality, tick):
+            if not refusals:
+                with pytest.raises(SceneError) as refusal:
+                    run_pilot(scene, quality, tick, size=replace(PILOT, effort=LITTLE))
+                refusals.append(refusal.value)
+            raise refusals[0]
+
+        monkeypatch.setattr(plans, "run_pilot", pilot)
         few = ["plan", str(TEMPLATES / "caustic_portrait.toml"), "--set", "target.pixels=48", "--set", "target.z=24.0"]
         few += ["--set", f"{NET}=65"]
         assert cli.run([*few, "--json"]) == 0

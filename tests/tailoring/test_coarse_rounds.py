@@ -16,8 +16,9 @@ from bstcad.tailoring import stage1, stage2
 from bstcad.tailoring.driver import BEST_LENS_STAGE, Hooks
 from bstcad.tailoring.merit import CoarseVariable
 from tests import suite
+from tests.efforts import FEW_RAYS
 
-LATER = DesignOptions(compare_later=True)
+LATER = DesignOptions(compare_later=True, effort=FEW_RAYS)
 SIDE = {"shape": "rectangle", "width": 60.0, "height": 60.0}
 NEAR = {  # a wall nearer than the plate is wide, fifty times as bright in one corner as in another
     "name": "near",

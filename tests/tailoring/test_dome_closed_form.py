@@ -151,7 +151,7 @@ def by_rounds(profile, m, plan):
 ])  # fmt: skip
 def test_rounds_of_stage_1_find_the_dome_of_the_equation(profile, finest, at_rim):
     """The distance from the centre within 1e-4 of R up to 70°; the light's edge on cells shows in the last degrees."""
-    plan = [(48, COARSE_FACE_FIT)] * 7 + [(128, FINE_FACE_FIT)] * 5 + [(finest, FINE_FACE_FIT)] * 3  # half steps
+    plan = [(48, COARSE_FACE_FIT)] * 6 + [(128, FINE_FACE_FIT)] * 3 + [(finest, FINE_FACE_FIT)] * 3  # half steps
     lens, rho = by_rounds(profile, 129, plan), distances(profile)
     length, psi = np.meshgrid(np.linspace(0, RIM, 100), np.linspace(0, 2 * math.pi, 8))
     x, y = (torch.from_numpy(length * f(psi)) for f in (np.cos, np.sin))

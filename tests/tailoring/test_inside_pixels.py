@@ -48,7 +48,7 @@ LETTERS = {
     "tailoring.stage2_iterations": 60,
     "tailoring.transport_grid": 128,
 }
-EFFORT = Effort(rays=724, accuracy=0.0, witness=False)
+EFFORT = Effort(rays=512, accuracy=0.0, witness=False)
 
 
 def even(receiver):

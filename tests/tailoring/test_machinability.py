@@ -15,6 +15,7 @@ from bstcad.commands import ProofOptions
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
+from bstcad.optics.trace.measure import Effort
 from bstcad.report import record
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
@@ -33,19 +34,20 @@ TINY = SMALL | {
     "tailoring.transport_grid": 32,
     "tailoring.stage2_iterations": 36,
 }
+RATED_BY_FEW_RAYS = replace(FULL, fine=Effort(512, accuracy=0.0, witness=False))
 WHOLE = Rectangle(4.0, 6.0)
 
 
 @pytest.fixture(scope="module")
 def free():
     """The small design that may have any shape: radius 20 mm, slope 3.6 degrees, 9.82 to 10.01 mm thick."""
-    return designed_quickly(load(DISK, TINY), FULL)
+    return designed_quickly(load(DISK, TINY), RATED_BY_FEW_RAYS)
 
 
 @pytest.fixture(scope="module")
 def bound():
     """Return a design whose back is bounded by a tool of 50 mm."""
-    return designed_quickly(load(DISK, TINY | {"lens.tool_radius": 50.0}), FULL)
+    return designed_quickly(load(DISK, TINY | {"lens.tool_radius": 50.0}), RATED_BY_FEW_RAYS)
 
 
 def steepest(lens):

@@ -15,7 +15,7 @@ from bstcad.scene.scene import load
 from bstcad.tailoring.driver import Hooks
 from bstcad.tailoring.minimise import AdamState, Best, LbfgsState, adam, lbfgs, minimise
 from tests import suite, two_faces
-from tests.efforts import FEW_RAYS
+from tests.efforts import LITTLE
 from tests.scenes import DISK, DOME, SMALL
 
 TINY = SMALL | {"tailoring.rays": 64, "target.pixels": 32, "tailoring.transport_grid": 32, "tailoring.rounds": 3}
@@ -41,8 +41,8 @@ SCENES = {
 }
 
 
-# Scenes with bounds are rated by few rays; the law is one of bits, whatever the rays.
-OPTIONS = DesignOptions(effort=FEW_RAYS)
+# The law is one of bits, whatever the rays.
+OPTIONS = DesignOptions(effort=LITTLE)
 QUICK = (
     "dome",
     "least squares, within bounds",

@@ -23,7 +23,7 @@ SMALL = {
     "tailoring.rays": "200",
     "tailoring.transport_grid": "64",
 }
-EFFORT = replace(FULL, fine=replace(FULL.fine, rays=512))  # rays that resolve pictures of 32 x 32 pixels
+EFFORT = replace(FULL, fine=replace(FULL.fine, rays=256))  # rays that resolve pictures of 32 x 32 pixels
 
 
 def small(name, **more):

@@ -16,11 +16,11 @@ def deepest_gouge(moves, radius, lift, net, outline):
     long = np.linalg.norm(end - begin, axis=1) < 0.5  # longer moves are those of roughing and between lines
     begin, end = begin[long], end[long]
     tree, span = cKDTree((begin + end) / 2), end - begin
-    points, width = points_on(net, outline, 0.02), 0.02
+    points, width = points_on(net, outline, 0.03), 0.03
     clearance = None
     for turn in range(4):
         if turn:
-            worst = points[np.argsort(clearance)[:3000]]
+            worst = points[np.argsort(clearance)[:1500]]
             away = np.linspace(-width / 2, width / 2, 5)
             x, y = (np.ravel(worst[:, k, None, None] + part) for k, part in enumerate(np.meshgrid(away, away)))
             inside = outline.depth(x, y) >= 0

@@ -65,7 +65,7 @@ def test_the_command_and_python_state_the_tool(small_design, tmp_path, capsys):
     scene.write_text(scene.read_text().replace('zero = "top"', 'zero = "bottom"'))
     [*_, words] = bstcad.open(folder).export("raster", cusp=0.05)
     assert "Z0 on the bottom" in words.read_text()
-    names = {path.name for path in design.export("spiral", tool_radius=2.0, cusp=1e-3)}
+    names = {path.name for path in design.export("spiral", tool_radius=2.0, cusp=1e-2)}
     assert names == {"toolpath-spiral.csv", "toolpath-spiral.txt"}
     assert "radius 2 mm" in (folder / "toolpath-spiral.txt").read_text()
     for wrong, words in (({"tool_radius": "big"}, "'big' is not a number"), ({"nose": 1.0}, "'nose' is no setting")):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from scipy.interpolate import BSpline
+from scipy.interpolate import NdBSpline
 from scipy.spatial import cKDTree
 
 from bstcad.exports.toolpath_files import toolpath_files
@@ -48,8 +48,8 @@ def exact(net, x, y):
     """Heights of a net by scipy's splines, at points that are not in the end spans."""
     (m, n), heights = net.heights.shape, net.heights.numpy()
     t, s = ((at - ends[0]) / pitch - 0.5 for at, ends, pitch in zip((x, y), (net.x, net.y), net.pitch, strict=True))
-    along, across = (BSpline.design_matrix(at, knots(count), 2) for at, count in ((t, m), (s, n)))
-    return net.z + np.asarray(along.multiply(across @ heights.T).sum(1)).ravel()
+    face = NdBSpline((knots(m), knots(n)), heights, 2, extrapolate=False)
+    return net.z + face(np.column_stack([t, s]))
 
 
 def points_on(net, outline, spacing):
@@ -62,8 +62,8 @@ def points_on(net, outline, spacing):
 
 def highest(net, outline):
     """The highest z of the face, on a grid and on finer ones about its highest point."""
-    coarse = points_on(net, outline, max(outline.half_extent) / 300)
-    place, reach = coarse[coarse[:, 2].argmax()], max(outline.half_extent) / 300
+    coarse = points_on(net, outline, max(outline.half_extent) / 120)
+    place, reach = coarse[coarse[:, 2].argmax()], max(outline.half_extent) / 120
     for _ in range(2):
         away = np.linspace(-reach, reach, 81)
         x, y = (np.clip(p + away, -h, h) for p, h in zip(place, outline.half_extent, strict=False))

@@ -16,7 +16,6 @@ from bstcad.analysis.light import mount_losses
 from bstcad.analysis.shape import describe
 from bstcad.cad import mounting
 from bstcad.commands import ProofOptions
-from bstcad.designs.pipeline import design as design_of
 from bstcad.optics.lens.interfaces import cross
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.channels import Channel
@@ -30,6 +29,7 @@ from bstcad.scene.scene import load
 from bstcad.verify import step_checks
 from tests import suite
 from tests.conftest import draws_nothing, proofs, quick_effort
+from tests.efforts import designed_quickly
 from tests.lenses import net
 from tests.scenes import DISK
 
@@ -74,7 +74,9 @@ def test_the_light_is_that_of_rays_through_the_faces_of_the_part(design, name, t
     around, screen = polygons(tmp_path / "part.step"), replace(design.scene.target.screen, pixels=8)
     wide = found.apertures[0].half_extent[0] < 0.98 * found.apertures[1].half_extent[0]
     for source in (design.scene.source, CollimatedSource(Rectangle(9.0, 7.0))):
-        light = measure(found, [Channel(source, lens.index)], screen, np.ones(screen.shape), Effort(512, accuracy=0))
+        light = measure(
+            found, [Channel(source, lens.index)], screen, np.ones(screen.shape), Effort(512, accuracy=0, witness=False)
+        )
         seen = independent(source, lens, around, screen)
         assert light.flux["on target"] == pytest.approx(seen.sum(), rel=1.5e-3)
         picture, seen = light.picture / light.picture.sum(), seen / seen.sum()
@@ -100,7 +102,7 @@ def polygons(path):
 def _along(wire):
     """Places along a closed wire in its order."""
     ordered = cadquery.Wire.assembleEdges(wire.Edges())
-    return ordered.positions(np.linspace(0, 1, 300, endpoint=False), mode="length")
+    return ordered.positions(np.linspace(0, 1, 200, endpoint=False), mode="length")
 
 
 def inside(corners, places):
@@ -180,7 +182,7 @@ def cut(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         draws_nothing(patch)
         kept = proofs(patch)
-        report = commands.write(design_of(scene), folder, ProofOptions(replace(quick_effort(), places=1025)))
+        report = commands.write(designed_quickly(scene), folder, ProofOptions(replace(quick_effort(), places=1025)))
     return scene, folder, report, kept[0]
 
 
