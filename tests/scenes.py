@@ -77,25 +77,28 @@ def versions() -> bytes:
     return found.digest()
 
 
-def designed(scene: Any, effort: Any, folder: Path, drawing: Any = None) -> dict[str, Any]:
+def designed(scene: Any, effort: Any, folder: Path, drawing: Any = None, tailoring: Any = None) -> dict[str, Any]:
     """Copy the design of a scene to a folder, as `commands.generate` writes it, and return its report.json.
 
-    effort: of the verification.  drawing: the class of its pictures; None: NoPictures.  A test that has changed the
-    package (monkeypatch) must not ask for a design, which others would get.
+    effort: effort of the verification.  drawing: class of its pictures; None: NoPictures.  tailoring: effort of the
+    design; None: FULL.  A test that has changed the package (monkeypatch) must not ask for a design, which others would
+    get.
     """
     from bstcad import commands
     from bstcad.figures.figure_jobs import NoPictures
     from bstcad.scene.schema import contents
+    from bstcad.tailoring.effort import FULL
 
     drawing = drawing or NoPictures
     digests = [content.digest for _, content in contents(scene)]
-    asked = repr((scene.toml(), digests, effort, drawing.__name__)).encode()
+    tailoring = tailoring or FULL
+    asked = repr((scene.toml(), digests, effort, drawing.__name__, tailoring)).encode()
     place = KEPT / hashlib.sha256(versions() + asked).hexdigest()[:24]
     KEPT.mkdir(exist_ok=True)
     with FileLock(f"{place}.lock"):
         if not (facts := place / "facts").exists():
             shutil.rmtree(place, ignore_errors=True)
-            options = commands.ProofOptions(effort, drawing)
+            options = commands.ProofOptions(effort, drawing, tailoring=tailoring)
             report = commands.generate(scene, place / "design", options, device="cpu")
             facts.write_bytes(pickle.dumps(report.facts))
             _delete_old(place)

@@ -4,6 +4,7 @@ import contextlib
 import inspect
 import io
 import re
+import runpy
 import signal
 import subprocess
 import sys
@@ -222,11 +223,13 @@ def test_version_and_help(capsys):
             assert said.replace("\\[", "[").replace(" ", "") in shown
 
 
-def test_generate_lens_takes_what_generate_takes(tmp_path):
-    command = [sys.executable, str(ROOT / "generate_lens.py"), "none.toml", "--quality", "draft"]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env={"PYTHONPATH": str(ROOT)})
-    assert done.returncode == 2
-    assert done.stderr.startswith("bstcad: none.toml: no such scene file")
+def test_generate_lens_takes_what_generate_takes(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["generate_lens.py", "none.toml", "--quality", "draft"])
+    monkeypatch.setattr(cli, "main", lambda words: sys.exit(cli.run(words)))  # `main` ends processes of other tests
+    with pytest.raises(SystemExit, match="^2$"):
+        runpy.run_path(str(ROOT / "generate_lens.py"), run_name="__main__")
+    assert capsys.readouterr().err.startswith("bstcad: none.toml: no such scene file")
 
 
 def test_progress_is_few_lines_that_show_the_end_or_bars_with_the_merit():

@@ -160,7 +160,7 @@ COMPROMISES = {
 ONE_FACE, TWO_FACES = 0.03, 0.15  # RRMSD: up to 0.008 and 0.102 are found
 WAVES = 0.3  # RMS without tilt: up to 0.17 are found
 ON_TARGET = 0.95  # smallest fraction on the target of the light that leaves the lens
-QUICK = Effort(rays=512, accuracy=0.0, witness=False)  # rays a side
+QUICK = Effort(rays=384, accuracy=0.0, witness=False)  # rays a side
 
 
 @pytest.fixture

@@ -94,7 +94,7 @@ class TestOwnSurfaces:
         design = made.with_lens(lens)
         assert made.transport is not None and design.transport is None and "changed by hand" in repr(design)
         report = design.write(tmp_path / "own", progress=False)
-        scene, effort = made.scene, Effort(1024, seed=5)
+        scene, effort = made.scene, Effort(1024, seed=5, witness=False)
         theirs, ours = (
             bstcad.measure(one, scene.channels(), scene.target.screen, made.target, effort).rrmsd
             for one in (made.lens, lens)

@@ -74,7 +74,7 @@ def test_a_design_mixes_no_devices_and_finds_the_lens_of_the_cpu(template, quali
     held_to_the_cpu(scene(template, quality), quality)
 
 
-@suite.in_turn(0, 2)
+@suite.in_turn(0, 4)
 def test_so_does_one_for_a_tilted_target_that_loses_light_on_the_way():
     metal = {"kind": "fresnel", "metal": "Al", "polarisation": "s"}
     wanted = scene(TEMPLATES[0].with_name("mirror.toml"), "draft")

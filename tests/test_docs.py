@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -20,6 +21,7 @@ import typer
 
 import bstcad
 from bstcad import cli
+from bstcad.designs import pipeline
 from bstcad.manufacture.tolerance import tolerancing
 from bstcad.optics.surfaces.surfaces import sag
 from bstcad.planning import batch
@@ -28,6 +30,7 @@ from bstcad.runs.processes import ExitStatus
 from bstcad.scene.scene import load
 from tests import suite
 from tests.conftest import draws_nothing, quick_effort, quickly, verify_with
+from tests.efforts import LITTLE
 from tests.planning.conftest import Synthetic, typical_pilot
 from tests.scenes import designed
 
@@ -65,7 +68,9 @@ def make_small(scene, path):
     text = re.sub(r"rrmsd = [\d.]+", "rrmsd = 0.4", text)
     text = re.sub(r"light_on_target = [\d.]+", "light_on_target = 0.7", text)
     text = re.sub(r"wavefront = [\d.]+", "wavefront = 1.0", text)
-    few = "" if scene.name == "thu.toml" else "\nrays = 192"  # `bstcad plan` knows no scenes with knobs of their own
+    few = (
+        "" if scene.name == "thu.toml" else "\nrays = 192\ntransport_grid = 64"
+    )  # `bstcad plan` knows no scenes with knobs of their own
     if "quality = " in text:
         text = re.sub(r'quality = "\w+"(.*\nrays = \d+)?', f'quality = "draft"{few}', text)
     elif path.suffix == ".toml":
@@ -92,7 +97,7 @@ def prepared(tmp_path_factory):
 
 def make_design(place, name):
     """Design a small template into the outputs of a folder, without pictures."""
-    designed(load(place / "templates" / f"{name}.toml"), quick_effort(), place / "outputs" / name)
+    designed(load(place / "templates" / f"{name}.toml"), quick_effort(), place / "outputs" / name, tailoring=LITTLE)
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +118,7 @@ def workplace(prepared, tmp_path, monkeypatch, request):
     place = shutil.copytree(prepared, tmp_path / "work")
     monkeypatch.chdir(place)
     draws_nothing(monkeypatch)
+    monkeypatch.setattr(pipeline, "DesignOptions", partial(pipeline.DesignOptions, effort=LITTLE))
     monkeypatch.setattr("bstcad.figures.rendering.draw", lambda path, picture: bool(picture.write_bytes(b"drawn")))
     quickly(monkeypatch)
     verify_with(monkeypatch, quick_effort())

@@ -18,11 +18,12 @@ from bstcad.optics.surfaces.surfaces import Toroid, sag
 from bstcad.scene.scene import load
 from tests import suite
 from tests.conftest import quick_effort
+from tests.efforts import LITTLE
 from tests.scenes import designed
 
 
 def made(scene, folder):
-    return SimpleNamespace(scene=scene, folder=folder, report=designed(scene, quick_effort(), folder))
+    return SimpleNamespace(scene=scene, folder=folder, report=designed(scene, quick_effort(), folder, tailoring=LITTLE))
 
 
 @pytest.fixture(scope="module")

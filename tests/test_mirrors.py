@@ -11,6 +11,7 @@ import bstcad
 from bstcad import commands
 from bstcad.verify import step_checks
 from tests.conftest import draws_nothing, quick_effort
+from tests.efforts import LITTLE
 from tests.scenes import designed
 from tests.test_seen import letter
 
@@ -30,7 +31,7 @@ def made(tmp_path_factory):
     scene = bstcad.load("templates/mirror.toml").changed(
         SMALL | PARALLEL | {"target.tilt": [0.0, 35.0], "target.image": str(place / "F.png"), "target.gamma": 1.0}
     )
-    designed(scene, EFFORT, place / "out")
+    designed(scene, EFFORT, place / "out", tailoring=LITTLE)
     return place / "out", json.loads((place / "out" / "report.json").read_text()), scene
 
 

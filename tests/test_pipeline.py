@@ -13,6 +13,7 @@ from bstcad.scene import scene
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring.driver import Hooks
 from tests import suite
+from tests.efforts import designed_quickly
 from tests.tracing import simulated
 
 SMALL = {
@@ -118,7 +119,7 @@ def test_a_back_that_would_reach_the_front_or_the_target_is_refused():
 def test_a_target_that_is_not_square_gets_its_picture():
     """A round spot on 300 x 150 mm, on pixels of equal sides: as round and bright as asked."""
     wide = {"target.x": "[-150.0, 150.0]", "target.y": "[-75.0, 75.0]", "target.pixels": "64"}
-    found = pipeline.design(small("disk", **wide, **{"target.outline": '{ shape = "circle", radius = 70.0 }'}))
+    found = designed_quickly(small("disk", **wide, **{"target.outline": '{ shape = "circle", radius = 70.0 }'}))
     assert found.goals[0].picture.shape == (32, 64)
     value, efficiency = judged(found)
     assert value < 0.16  # on 150 x 150 mm and 32 x 32 pixels: 0.11

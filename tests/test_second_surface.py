@@ -11,7 +11,7 @@ from bstcad.scene.effects import Fresnel
 from bstcad.verify.judges.comparison import compare
 from tests import suite
 from tests.conftest import quick_effort
-from tests.efforts import designed_quickly
+from tests.efforts import LITTLE, designed_quickly
 from tests.scenes import designed
 from tests.test_seen import letter
 
@@ -32,7 +32,7 @@ def scene_of(**changes):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("glass") / "out"
-    designed(scene_of(), EFFORT, place)
+    designed(scene_of(), EFFORT, place, tailoring=LITTLE)
     return place
 
 

@@ -63,7 +63,7 @@ def test_a_run_with_a_damaged_report_fails_and_says_so(tiny, monkeypatch):
 def test_a_lens_tailored_to_other_pixels_is_judged_on_those_of_the_base(small_design):
     """The judge takes the lens from the run's folder, and light and pixels from the base."""
     run, scene = ColdRun(settings=(), status=DONE), folders.read_nominal(small_design.folder).scene
-    effort = Effort(512)  # of its proof: the noise of half as many rays a side is a third of its RRMSD
+    effort = Effort(512, witness=False)  # of its proof: the noise of half as many rays a side is a third of its RRMSD
     full = judge_run(run, scene, small_design.folder, effort)
     coarse = judge_run(run, scene.changed({"target.pixels": [32, 24]}), small_design.folder, effort)
     assert abs(full.rrmsd / small_design.report["rrmsd"] - 1) < 0.1  # other rays than its proof's
@@ -76,7 +76,7 @@ def test_of_several_targets_the_worst_counts(small_design):
     own = scene.target.model_dump(mode="json", exclude_none=True)
     both = [own, own | {"z": scene.target.z + 40.0}]  # for the second of which nobody designed the lens
     alone, second, worst = (
-        judge_run(run, scene.changed({"target": targets}), small_design.folder, Effort(256, accuracy=0))
+        judge_run(run, scene.changed({"target": targets}), small_design.folder, Effort(256, accuracy=0, witness=False))
         for targets in (own, both[1], both)
     )
     assert alone.rrmsd < 0.9 * second.rrmsd and worst.rrmsd == second.rrmsd

@@ -34,7 +34,7 @@ def portrait(net):
 @pytest.fixture(scope="module")
 def flown():
     """The pilots of one scene, by quality."""
-    size, rays = replace(PILOT, effort=LITTLE), Effort(512, accuracy=0.02, witness=False, cells=2)
+    size, rays = replace(PILOT, tubes=256, effort=LITTLE), Effort(384, accuracy=0.02, witness=False, cells=2)
     return {quality: run_pilot(portrait(65), quality, size=size, rays=rays) for quality in PILOT_QUALITIES}
 
 

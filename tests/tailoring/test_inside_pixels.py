@@ -33,6 +33,7 @@ back = { kind = "bspline", z = 18.0, control_points = 65 }
 [tailoring]
 quality = "draft"
 rays = 192
+transport_grid = 64
 [target]
 """
 RECEIVERS = {

@@ -162,7 +162,7 @@ def test_the_number_of_points_leaves_no_bias():
     def draw(points, seed):
         return drawn_channels(LAMP, lambda nm: 1.5, 8, seed)
 
-    efforts = [Effort(128, seed, accuracy=0.0) for seed in range(8, 80, 8)]
+    efforts = [Effort(128, seed, accuracy=0.0, witness=False) for seed in range(8, 80, 8)]
     found = [measure(curved(), (), SCREEN, target, effort, sampler=draw) for effort in efforts]
     errors = np.array([light.standard_error for light in found])
     off = np.array([light.rrmsd for light in found]) - exact.rrmsd
