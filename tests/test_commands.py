@@ -258,6 +258,7 @@ class TestGenerate:
                 commands.verify(path)
 
     @suite.in_turn(0, 2)
+    @suite.in_turn(1, 2)
     def test_the_3d_picture_is_drawn_where_the_machine_can(self, proved):
         commands.verify(proved, options=ProofOptions(drawing=pictures("solid")))
         page, drawn = (proved / "report.html").read_text(), proved / "figures" / "lens.png"

@@ -115,6 +115,7 @@ def workplace(prepared, tmp_path, monkeypatch, request):
     if request.node.callspec.params["page"].stem in LONG:
         request.getfixturevalue("second_design")
     monkeypatch.setattr("bstcad.planning.plan.run_pilot", typical_pilot)
+    monkeypatch.setattr("bstcad.planning.prediction.pace", lambda: 1.0)
     place = shutil.copytree(prepared, tmp_path / "work")
     monkeypatch.chdir(place)
     draws_nothing(monkeypatch)

@@ -8,6 +8,7 @@ from bstcad import cli, commands
 from bstcad.figures import rendering
 from bstcad.figures.figure_jobs import MILLIONTHS, corners
 from bstcad.optics.receivers.irradiance import Screen
+from tests import suite
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +50,7 @@ def test_corners_of_a_tilted_screen_lie_on_its_plane():
     assert np.linalg.norm(found - np.roll(found, 1, axis=0), axis=1) == pytest.approx([10, 20, 10, 20])
 
 
+@suite.in_turn(0, 2)
 def test_the_picture_has_the_screen_the_lens_and_the_rays(small_design, tmp_path, capsys):
     code, err = said(capsys, "show", small_design.folder, "--png", tmp_path / "light.png")
     if code:

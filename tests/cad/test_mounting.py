@@ -82,11 +82,11 @@ def test_the_lens_may_be_cut_to_any_wire(spline, tmp_path):
 def test_an_array_is_one_part():
     lens = plate("convex")
     base = cq.Workplane("XY", origin=(0, 0, 0.5)).rect(40, 34).extrude(1.5)
-    places = [(12.0 * i, 10.0 * j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    places = [(12.0 * i, 10.0 * j) for i in (-1, 0) for j in (0, 1)]
     part = mounted(base, [PlacedLens(lens, at=(*at, 0.0)) for at in places])
     check(part)
-    assert Counter(part.faces) == {"back": 9, "front": 9, "rim": 72, "flange": 6}
-    wanted = 9 * exact_volume(lens) + (40 * 34 - 9 * 80) * 1.5
+    assert Counter(part.faces) == {"back": 4, "front": 4, "rim": 32, "flange": 6}
+    wanted = 4 * exact_volume(lens) + (40 * 34 - 4 * 80) * 1.5
     assert occ_volume(part.solid, 1e-5) == pytest.approx(wanted, rel=1e-5)
 
 

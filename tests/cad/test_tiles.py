@@ -34,7 +34,7 @@ from tests.tracing import stratified
 PLATE, DISC = Rectangle(24.0, 20.0), Circle(11.0)
 LENSES = {
     "plane": (Plane(8.0), PLATE, (2, 2)),
-    "sphere": (Sphere(8.0, 0.01), DISC, (3, 2)),
+    "sphere": (Sphere(8.0, 0.01), DISC, (2, 2)),
     "conic": (Conic(8.0, 0.01, -1.0), PLATE, (1, 3)),
     "net": (rough(0.01, seed=3, z=8.0, m=17, half=15.0), DISC, (2, 1)),
 }

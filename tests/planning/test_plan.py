@@ -42,6 +42,7 @@ def flown():
 def known_pilots(flown, monkeypatch):
     """Predictions take the pilots that were flown already."""
     monkeypatch.setattr(plans, "run_pilot", lambda scene, quality, tick: flown[quality])
+    monkeypatch.setattr("bstcad.planning.prediction.pace", lambda: 1.0)
 
 
 @pytest.fixture
@@ -205,7 +206,7 @@ class TestCommand:
 
         monkeypatch.setattr(plans, "run_pilot", pilot)
         few = ["plan", str(TEMPLATES / "caustic_portrait.toml"), "--set", "target.pixels=48", "--set", "target.z=24.0"]
-        few += ["--set", f"{NET}=65"]
+        few += ["--set", f"{NET}=33"]
         assert cli.run([*few, "--json"]) == 0
         out, err = capsys.readouterr()
         found = json.loads(out)

@@ -24,8 +24,8 @@ from tests.planning.conftest import typical_pilot
 
 SMALL = {"tailoring.quality": "draft", "lens.back.control_points": 129, "target.pixels": 64}
 NEAR = 0.05  # RRMSD between two pictures
-FEW = Reduction(pixels=32, net=33, cells=48, tubes=64, rounds=1, evaluations=3, blurred=2)
-MORE = replace(FEW, pixels=48, tubes=96)
+FEW = Reduction(pixels=24, net=25, cells=48, tubes=64, rounds=1, evaluations=3, blurred=2)
+MORE = replace(FEW, pixels=32, tubes=80)
 
 
 def apart(one: np.ndarray, other: np.ndarray) -> float:
@@ -100,9 +100,10 @@ def test_a_scene_that_a_design_would_refuse_is_refused():
         preview(scene)
 
 
-@suite.in_turn(0, 2)
-def test_the_desk_answers_the_newest_request_of_each_page_in_order():
+@suite.in_turn(0, 4)
+def test_the_desk_answers_the_newest_request_of_each_page_in_order(monkeypatch):
     """Previews are small, and predictions have no pilots."""
+    monkeypatch.setattr("bstcad.planning.prediction.pace", lambda: 1.0)
     desk = PreviewDesk((FEW, MORE), typical_pilot)
     scene = load("templates/disk.toml", {"lens.back.control_points": 33, "target.pixels": 16})
     try:

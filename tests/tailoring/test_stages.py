@@ -191,7 +191,7 @@ def test_stage_1_finds_the_front_curvature_and_the_back_together():
 @suite.in_turn(0, 2)
 def test_the_paper_lowers_both_of_its_merits():
     task, lens = small("portrait", **{
-        "tailoring.quality": "paper", "tailoring.stage1_iterations": "30", "tailoring.stage2_iterations": "15",
+        "tailoring.quality": "paper", "tailoring.stage1_iterations": "60", "tailoring.stage2_iterations": "20",
         "tailoring.precision": "float64", "tailoring.rays": "100",
     })  # fmt: skip
     blank, driver = task.rrmsd(lens), Driver()
@@ -200,7 +200,7 @@ def test_the_paper_lowers_both_of_its_merits():
     first = task.rrmsd(lens)
     second = task.rrmsd(driven(driver, task, paper.stage2(task, lens)).lens)
     assert second < first < blank
-    assert len(driver.record.history) == 15 + 1  # evaluations, and the judge
+    assert len(driver.record.history) == 20 + 1  # evaluations, and the judge
 
 
 def test_states_are_saved_until_the_user_has_enough():
