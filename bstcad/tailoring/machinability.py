@@ -215,18 +215,18 @@ def _thickness_excess(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]
     return float(square.detach()), gradient, worst
 
 
-def enforce_bounds(lens: Lens, bounds: Bounds) -> Lens:
+def enforce_bounds(lens: Lens, bounds: Bounds, evaluations: int = REPAIR_EVALUATIONS) -> Lens:
     """Return the lens with its tailored faces and the position of its back changed as little as the bounds require.
 
-    The penalty alone is minimised, in Sobolev variables (merit.py).  If REPAIR_EVALUATIONS do not suffice, the faces
-    are flattened.  If the front is tailored, the back is shifted only if changes of the faces do not suffice, since a
-    shift changes the picture.  SceneError if even a flat back exceeds a bound.
+    The penalty alone is minimised, in Sobolev variables (merit.py).  If so many evaluations do not suffice, the
+    faces are flattened.  If the front is tailored, the back is shifted only if changes of the faces do not suffice,
+    since a shift changes the picture.  SceneError if even a flat back exceeds a bound.
     """
     for place in (_unmoved, _with_back_moved) if lens.is_tailored(FRONT) else (_with_back_moved,):
         lens = place(lens, bounds)
         if not _exceeds(lens, bounds):
             return lens
-        bent = place(_reduce_excess(lens, bounds), bounds)
+        bent = place(_reduce_excess(lens, bounds, evaluations), bounds)
         if not _exceeds(bent, bounds):
             return _nearest(lens, bent, bounds, place)
         lens = bent
@@ -275,7 +275,7 @@ def _exceeds(lens: Lens, bounds: Bounds) -> bool:
     return excess(lens, bounds).worst > -BOUND_RESERVE
 
 
-def _reduce_excess(lens: Lens, bounds: Bounds) -> Lens:
+def _reduce_excess(lens: Lens, bounds: Bounds, evaluations: int) -> Lens:
     """Minimise the penalty; return the first lens that exceeds no bound, or else the lens of the smallest penalty."""
     start = _heights(lens)
     variables = [SobolevVariable.of(net, torch.ones_like(net.heights)) for net in lens.nets]
@@ -288,7 +288,7 @@ def _reduce_excess(lens: Lens, bounds: Bounds) -> Lens:
         gradients = [v.adjoint(g) for v, g in zip(variables, over.gradients, strict=True)]
         return over.mean_square, gradients, over.worst
 
-    for reached in minimise(in_c, lbfgs([v.zero() for v in variables], REPAIR_EVALUATIONS), REPAIR_EVALUATIONS):
+    for reached in minimise(in_c, lbfgs([v.zero() for v in variables], evaluations), evaluations):
         if reached.best.figure <= -BOUND_RESERVE:
             break
     return at(reached.best.parameters)
