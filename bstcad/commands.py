@@ -76,7 +76,7 @@ from bstcad.toolpath.cutting import CHOICES, DEFAULTS, Cutting
 from bstcad.verify import checks
 from bstcad.verify.checks import Proof
 from bstcad.verify.judges import comparison
-from bstcad.verify.judges.comparison import Comparison
+from bstcad.verify.judges.comparison import Comparison, JudgeEffort
 from bstcad.verify.verdict import Check, verdict
 
 if TYPE_CHECKING:
@@ -105,6 +105,7 @@ class ProofOptions:
     sections: Sequence[OwnSection] = ()  # additional sections of report.html
     limit: float | None = None  # largest time (s) from start of design to end of report; None: no limit, as in `verify`
     tailoring: efforts.TailoringEffort = efforts.FULL  # effort of the design, in `generate` and `retailor`
+    judges: JudgeEffort = JudgeEffort()  # effort of the comparison with other programs, in `verify`
 
 
 # --- generate ---------------------------------------------------------------------------------------------------------
@@ -331,7 +332,7 @@ def verify(
             judged: list[Comparison] = []
             for number, goal in enumerate(made.goals):
                 lit, seed = (proof.lens, made.channels, goal), made.scene.tailoring.seed
-                by_others = comparison.run_judges(against, *lit, seed=seed, progress=progress)
+                by_others = comparison.run_judges(against, *lit, seed=seed, progress=progress, effort=options.judges)
                 drawn.begin(draw_judges, by_others, number=number)
                 judged += by_others
             proof = replace(proof, checks=(*proof.checks, *(check for each in judged for check in each.checks)))

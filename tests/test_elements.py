@@ -25,7 +25,7 @@ from bstcad.scene.elements import Mirror, Window, interfaces
 from bstcad.scene.errors import SceneError
 from bstcad.tailoring import slope_map
 from bstcad.verify import step_checks
-from bstcad.verify.judges.comparison import compare
+from bstcad.verify.judges.comparison import JudgeEffort, compare
 from tests import suite
 from tests.conftest import quick_effort
 from tests.scenes import DISK, designed
@@ -254,14 +254,16 @@ def test_rays_in_space_draw_its_picture(folder):
 def test_batoid_traces_them_too(folder):
     again = bstcad.open(folder)
     scene = again.scene
-    found = compare("batoid", again.lens, scene.verification_channels(), *scene.goals, rays=100_000, seed=1)
+    found = compare(
+        "batoid", again.lens, scene.verification_channels(), *scene.goals, effort=JudgeEffort(100_000), seed=1
+    )
     assert found.judge.agrees, found.judge
 
 
 @pytest.mark.bench
 def test_mitsuba_says_that_it_knows_none_of_them(folder):
     again = bstcad.open(folder)
-    said = compare("mitsuba", again.lens, again.scene.channels(), *again.scene.goals, rays=1)
+    said = compare("mitsuba", again.lens, again.scene.channels(), *again.scene.goals, effort=JudgeEffort(1))
     assert "windows or mirrors" in said.judge.declined
 
 

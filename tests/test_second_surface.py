@@ -8,7 +8,7 @@ import pytest
 import bstcad
 from bstcad.optics.lens.interfaces import Reflect, Refract
 from bstcad.scene.effects import Fresnel
-from bstcad.verify.judges.comparison import compare
+from bstcad.verify.judges.comparison import JudgeEffort, compare
 from tests import suite
 from tests.conftest import quick_effort
 from tests.efforts import LITTLE, designed_quickly
@@ -52,7 +52,9 @@ def test_its_proof_through_the_file_knows_all_passes(folder):
 def test_batoid_sees_the_same_picture(folder):
     design = bstcad.open(folder)
     scene = design.scene
-    found = compare("batoid", design.lens, scene.verification_channels(), *scene.goals, rays=100_000, seed=1)
+    found = compare(
+        "batoid", design.lens, scene.verification_channels(), *scene.goals, effort=JudgeEffort(100_000), seed=1
+    )
     assert found.judge.agrees, found.judge
 
 

@@ -14,7 +14,7 @@ from bstcad.commands import ProofOptions
 from bstcad.figures.figure_jobs import NoPictures
 from bstcad.optics.surfaces.surfaces import sag
 from bstcad.optics.trace.measure import Effort
-from bstcad.verify.judges import comparison
+from bstcad.verify.judges.comparison import JudgeEffort
 from bstcad.verify.judges.faces import FaceError, Traced
 from tests import suite
 from tests.conftest import flat_pictures, quick_effort
@@ -107,12 +107,9 @@ def verified(two, tmp_path_factory):
             drawn.append((draw.__name__, number))
             super().begin(draw, *given, number=number)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(comparison, "OWN_EFFORT", replace(quick_effort(), witness=False))
-        found = commands.verify(
-            two.folder, against=[tracer], measured=cloud, options=ProofOptions(quick_effort(), Drawing),
-            place=place / "part",
-        )  # fmt: skip
+    effort = JudgeEffort(own=replace(quick_effort(), witness=False))
+    options = ProofOptions(quick_effort(), Drawing, judges=effort)
+    found = commands.verify(two.folder, against=[tracer], measured=cloud, options=options, place=place / "part")
     page = (place / "part" / "report.html").read_text(encoding="utf-8")
     figures = {path.stem for path in (place / "part" / "figures").iterdir()}
     return SimpleNamespace(report=found, tracer=tracer, page=page, figures=figures, drawn=drawn)

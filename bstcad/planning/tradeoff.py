@@ -23,6 +23,7 @@ from typing import Any
 import bstcad
 from bstcad.designs.folder import SCENE, scene_files
 from bstcad.optics.surfaces.sides import Sides, as_pair, scaled
+from bstcad.optics.trace.measure import Effort
 from bstcad.planning import cold_run, results
 from bstcad.planning.cold_run import ColdRun, LocalPool, Settings, StoredRecord, Value, format_value, sorted_settings
 from bstcad.planning.net_choice import NET_KEY, with_net
@@ -226,12 +227,18 @@ class RunFile(StoredRecord):
 
 
 def tradeoff(
-    scene: Scene, folder: Path, *, budget: float, progress: Progress = no_progress, machines: Machines | None = None
+    scene: Scene,
+    folder: Path,
+    *,
+    budget: float,
+    progress: Progress = no_progress,
+    machines: Machines | None = None,
+    reference: Effort = cold_run.REFERENCE_EFFORT,
 ) -> TradeoffTable:
     """Do the most important runs that the budget (s) allows, and write tradeoff.csv, .json, .png and .html.
 
-    machines: machines of the runs; None: this machine.  The csv and json files are written after each run, so that they
-    exist after an interruption.
+    machines: machines of the runs; None: this machine.  reference: effort of the measurement of each lens.  The csv and
+    json files are written after each run, so that they exist after an interruption.
     """
     scene = scene.changed({"tailoring.accuracy": None, "tailoring.max_time": None})  # these end a design early
     base, _ = with_net(scene)
@@ -243,7 +250,7 @@ def tradeoff(
             place.mkdir(parents=True, exist_ok=True)
         for name, data in contents.items():
             files.put(folder / "scene" / name, data)
-        sweep = _Sweep(base, budget, folder, progress)
+        sweep = _Sweep(base, budget, folder, progress, reference=reference)
         try:
             sweep.run(machines, contents)
         except BaseException as error:
@@ -274,8 +281,9 @@ def check_free(folder: Path, contents: cold_run.SceneFiles) -> None:
 
 
 class _Sweep:
-    def __init__(self, base: Scene, budget: float, folder: Path, progress: Progress) -> None:
+    def __init__(self, base: Scene, budget: float, folder: Path, progress: Progress, reference: Effort) -> None:
         self._base, self._budget, self._folder, self._progress = base, budget, folder, progress
+        self._reference = reference
         self._knobs = knobs(base)
         self._order, self._work = run_order(self._knobs), cache(partial(predicted_work, base))
         self._under_way: dict[Settings, tuple[float, float]] = {}  # (start time, predicted seconds) of current runs
@@ -304,7 +312,7 @@ class _Sweep:
                     # The first run has no time limit, since a sweep needs at least one.
                     limit = self._left() + MAX_OVERRUN * self._budget if self.runs or self._under_way else math.inf
                     self._under_way[point] = time.perf_counter(), self._predicted(point)
-                    machines.start(point, cold_run.run_and_judge, contents, point, limit, cold_run.REFERENCE_EFFORT)
+                    machines.start(point, cold_run.run_and_judge, contents, point, limit, self._reference)
                 if not self._under_way:
                     return
                 self._record_answer(machines.next(self._tick))

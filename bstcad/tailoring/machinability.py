@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 
 import torch
 from torch import Tensor
@@ -76,10 +76,16 @@ def place_back(lens: Lens, z: float, least: float, bounds: Bounds | None = None)
 
 def thickness_points(lens: Lens) -> tuple[Tensor, Tensor]:
     """Return x and y (mm) of the points inside the outline at which the thickness is computed."""
-    axes = (torch.linspace(-half, half, THICKNESS_POINTS, dtype=torch.float64) for half in lens.outline.half_extent)
+    x, y = _points_inside(lens.outline)
+    return x.to(lens.like), y.to(lens.like)
+
+
+@lru_cache(maxsize=1)  # one design asks for its points some hundred times
+def _points_inside(outline: Outline) -> tuple[Tensor, Tensor]:
+    axes = (torch.linspace(-half, half, THICKNESS_POINTS, dtype=torch.float64) for half in outline.half_extent)
     x, y = torch.meshgrid(*axes, indexing="ij")
-    inside = lens.outline.contains(x, y)
-    return x[inside].to(lens.like), y[inside].to(lens.like)
+    inside = outline.contains(x, y)
+    return x[inside], y[inside]
 
 
 def rim_points(lens: Lens) -> tuple[Tensor, Tensor]:
@@ -191,33 +197,36 @@ def _thickness_excess(lens: Lens, bounds: Bounds) -> tuple[float, Tensor, float]
     The unit of the excess is the smaller of the difference of the bounds and the sag range (PV) of the back.
     """
     assert bounds.thickest is not None, "without a maximum thickness a shift of the back meets the bounds"
-    everywhere, net = thickness_points(lens), lens.back_net
-    heights = net.relative_sag_and_slope(*everywhere)[0]
-    room = min(bounds.thickest - bounds.thinnest, float(heights.max() - heights.min())) or 1.0
-    leaf = net.heights.detach().requires_grad_()
-    back, square, worst = replace(net, heights=leaf), torch.zeros(()), -PENALTY_MARGIN
+    net, leaf = lens.back_net, lens.back_net.heights.detach().requires_grad_()
+    back, square, worst, room = replace(net, heights=leaf), torch.zeros(()), -PENALTY_MARGIN, 0.0
     rim = rim_points(lens), max(bounds.thinnest, bounds.edge or 0.0)
-    for (x, y), least in ((everywhere, bounds.thinnest), rim):
-        glass = back.sag_and_slope(x, y)[0] - lens.front.sag_and_slope(x, y)[0]
+    for (x, y), least in ((thickness_points(lens), bounds.thinnest), rim):
+        heights = back.relative_sag_and_slope(x, y)[0]
+        if not room:  # everywhere comes first
+            sag_range = float((heights.max() - heights.min()).detach())
+            room = min(bounds.thickest - bounds.thinnest, sag_range) or 1.0
+        glass = (back.z + heights) - lens.front.sag_and_slope(x, y)[0]
         relative = torch.maximum(glass - bounds.thickest, least - glass) / room
-        square = square + total(torch.relu(relative + PENALTY_MARGIN) ** 2) / len(x)
         worst = max(worst, float(relative.detach().max()))
+        square = square + total(torch.relu(relative + PENALTY_MARGIN) ** 2) / len(x)
+    if worst <= -PENALTY_MARGIN:  # no thickness is near its bound
+        return 0.0, torch.zeros_like(net.heights), worst
     (gradient,) = torch.autograd.grad(square, leaf)
     return float(square.detach()), gradient, worst
 
 
-def enforce_bounds(lens: Lens, bounds: Bounds) -> Lens:
+def enforce_bounds(lens: Lens, bounds: Bounds, evaluations: int = REPAIR_EVALUATIONS) -> Lens:
     """Return the lens with its tailored faces and the position of its back changed as little as the bounds require.
 
-    The penalty alone is minimised, in Sobolev variables (merit.py).  If REPAIR_EVALUATIONS do not suffice, the faces
-    are flattened.  If the front is tailored, the back is shifted only if changes of the faces do not suffice, since a
-    shift changes the picture.  SceneError if even a flat back exceeds a bound.
+    The penalty alone is minimised, in Sobolev variables (merit.py).  If so many evaluations do not suffice, the
+    faces are flattened.  If the front is tailored, the back is shifted only if changes of the faces do not suffice,
+    since a shift changes the picture.  SceneError if even a flat back exceeds a bound.
     """
     for place in (_unmoved, _with_back_moved) if lens.is_tailored(FRONT) else (_with_back_moved,):
         lens = place(lens, bounds)
         if not _exceeds(lens, bounds):
             return lens
-        bent = place(_reduce_excess(lens, bounds), bounds)
+        bent = place(_reduce_excess(lens, bounds, evaluations), bounds)
         if not _exceeds(bent, bounds):
             return _nearest(lens, bent, bounds, place)
         lens = bent
@@ -266,7 +275,7 @@ def _exceeds(lens: Lens, bounds: Bounds) -> bool:
     return excess(lens, bounds).worst > -BOUND_RESERVE
 
 
-def _reduce_excess(lens: Lens, bounds: Bounds) -> Lens:
+def _reduce_excess(lens: Lens, bounds: Bounds, evaluations: int) -> Lens:
     """Minimise the penalty; return the first lens that exceeds no bound, or else the lens of the smallest penalty."""
     start = _heights(lens)
     variables = [SobolevVariable.of(net, torch.ones_like(net.heights)) for net in lens.nets]
@@ -279,7 +288,7 @@ def _reduce_excess(lens: Lens, bounds: Bounds) -> Lens:
         gradients = [v.adjoint(g) for v, g in zip(variables, over.gradients, strict=True)]
         return over.mean_square, gradients, over.worst
 
-    for reached in minimise(in_c, lbfgs([v.zero() for v in variables], REPAIR_EVALUATIONS), REPAIR_EVALUATIONS):
+    for reached in minimise(in_c, lbfgs([v.zero() for v in variables], evaluations), evaluations):
         if reached.best.figure <= -BOUND_RESERVE:
             break
     return at(reached.best.parameters)

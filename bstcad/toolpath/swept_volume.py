@@ -31,9 +31,10 @@ from bstcad.toolpath.spiral import Spiral, nose_height
 
 LEFT = 2.0  # material that stays, in cusps of the formula, above which a place is not reached
 SAMPLES = 40_000, 200_000  # smallest and largest number of points of the face
-WORK = 1e8  # largest number of pairs of a point and a move near it
+WORK = 4e7  # largest number of pairs of a point and a move within the radius of the tool
+FARTHEST = 2.0  # distance along the plane up to which moves are looked for / radius of the tool
 TURN = 40.0  # cost of a turn near a point, in moves near a point
-CELLS_PER_RADIUS = 2  # cells of the grid of moves per radius of the tool
+CELLS_PER_RADIUS = 8  # cells of the grid of moves per radius of the tool; a move is divided to fit into a cell
 TASKS = 16  # number of parts of the points, for the threads
 DEEPEST_MOVES, PLACES_ON_MOVE = 2000, (0.25, 0.5, 0.75)  # moves, and places on each, where the search begins
 SEARCH_STARTS, SEARCH_SIDE, SEARCH_ROUNDS = 200, 5, 5  # worst points, points per side of a grid about each, and rounds
@@ -64,18 +65,21 @@ def check_raster(path: Raster) -> Swept:
     lift = (0.0, 0.0, path.top + radius)
     begin = np.concatenate([each.points[:-1] for each in path.passes]) + lift
     end = np.concatenate([each.points[1:] for each in path.passes]) + lift
-    begin, end = _pieces(begin, end, radius)
+    cell = radius / CELLS_PER_RADIUS
+    begin, end = _pieces(begin, end, cell)
     half = float(np.linalg.norm(end - begin, axis=1).max(initial=0.0)) / 2
-    middle, cell = (begin + end)[:, :2] / 2, radius / CELLS_PER_RADIUS
+    middle = (begin + end)[:, :2] / 2
     low = middle.min(0)
     columns, rows = (int(count) for count in np.floor((middle.max(0) - low) / cell) + 1)
     place = np.floor((middle - low) / cell).astype(np.int64)
     number = place[:, 0] * rows + place[:, 1]
     order = np.argsort(number, kind="stable")
     starts = np.searchsorted(number[order], np.arange(columns * rows + 1))
+    lowest = np.full(columns * rows, np.inf)
+    np.minimum.at(lowest, number, np.minimum(begin[:, 2], end[:, 2]))
     area = (columns * cell) * (rows * cell)
     near = len(begin) * (2 * (radius + half + cell)) ** 2 / area
-    scene = begin[order], end[order], starts, (low[0], low[1], cell, columns, rows), radius, half
+    scene = begin[order], end[order], starts, lowest, (low[0], low[1], cell, columns, rows), radius, half
 
     def contact(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         z, step = tool.ball(x, y), SLOPE_STEP * radius
@@ -185,24 +189,38 @@ def _measured(kernel, points: np.ndarray, scene) -> np.ndarray:  # type: ignore[
 
 
 @compiled_kernel(error_model="numpy")
-def _to_moves(points, begin, end, starts, grid, radius, half, clearance, first, last):
-    """Store the distance of each point from the nearest straight move, less the radius; moves are sorted by cells."""
+def _to_moves(points, begin, end, starts, lowest, grid, radius, half, clearance, first, last):
+    """Store the distance of each point from the nearest straight move, less the radius; moves are sorted by cells.
+
+    The cell of the point comes first.  A cell whose moves are all farther than the nearest so far is left out: its own
+    distance along the plane, less half of the longest move, and the height of its lowest move are less than theirs.
+    """
     low_x, low_y, cell, columns, rows = grid
-    reach = radius + half
     for k in range(first, last):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        best = math.inf
-        i0, i1 = max(int((x - reach - low_x) // cell), 0), min(int((x + reach - low_x) // cell), columns - 1)
-        j0, j1 = max(int((y - reach - low_y) // cell), 0), min(int((y + reach - low_y) // cell), rows - 1)
-        for i in range(i0, i1 + 1):
-            for move in range(starts[i * rows + j0], starts[i * rows + j1 + 1]):
-                a, b, c = begin[move, 0], begin[move, 1], begin[move, 2]
-                u, v, w = end[move, 0] - a, end[move, 1] - b, end[move, 2] - c
-                length2 = u * u + v * v + w * w
-                share = ((x - a) * u + (y - b) * v + (z - c) * w) / length2 if length2 > 0.0 else 0.0
-                share = min(max(share, 0.0), 1.0)
-                a, b, c = x - a - share * u, y - b - share * v, z - c - share * w
-                best = min(best, a * a + b * b + c * c)
+        best, own_i, own_j = math.inf, int((x - low_x) // cell), int((y - low_y) // cell)
+        for turn in range(2):  # its own cell, then those around it
+            reach = 0.0 if turn == 0 else min(math.sqrt(best) + half, FARTHEST * radius)
+            a0, a1 = max(int((x - reach - low_x) // cell), 0), min(int((x + reach - low_x) // cell), columns - 1)
+            b0, b1 = max(int((y - reach - low_y) // cell), 0), min(int((y + reach - low_y) // cell), rows - 1)
+            for i in range(a0, a1 + 1):
+                away_x = max(low_x + i * cell - x, x - low_x - (i + 1) * cell, 0.0)
+                for j in range(b0, b1 + 1):
+                    if turn == 1 and i == own_i and j == own_j:
+                        continue
+                    away_y = max(low_y + j * cell - y, y - low_y - (j + 1) * cell, 0.0)
+                    away = max(math.sqrt(away_x * away_x + away_y * away_y) - half, 0.0)
+                    above = max(lowest[i * rows + j] - z, 0.0)
+                    if away * away + above * above > best:
+                        continue
+                    for move in range(starts[i * rows + j], starts[i * rows + j + 1]):
+                        a, b, c = begin[move, 0], begin[move, 1], begin[move, 2]
+                        u, v, w = end[move, 0] - a, end[move, 1] - b, end[move, 2] - c
+                        length2 = u * u + v * v + w * w
+                        share = ((x - a) * u + (y - b) * v + (z - c) * w) / length2 if length2 > 0.0 else 0.0
+                        share = min(max(share, 0.0), 1.0)
+                        a, b, c = x - a - share * u, y - b - share * v, z - c - share * w
+                        best = min(best, a * a + b * b + c * c)
         clearance[k] = math.sqrt(best) - radius
 
 

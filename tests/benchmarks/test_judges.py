@@ -93,7 +93,7 @@ def test_other_programs_agree(template, tmp_path):
     lens = written(template, {"tailoring.quality": "draft"}, tmp_path)
     channels = lens.scene.verification_channels()
     for name, goal in product(comparison.JUDGES, lens.scene.goals):
-        found = comparison.compare(name, lens.lens, channels, goal, rays=MANY)
+        found = comparison.compare(name, lens.lens, channels, goal, effort=comparison.JudgeEffort(MANY))
         judge = found.judge
         assert bool(judge.declined) is ((template, name) in DECLINED)
         if judge.declined:

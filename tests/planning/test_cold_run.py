@@ -31,8 +31,7 @@ def test_a_sweep_of_cold_runs_measures_each_and_tells_why_one_failed(tiny, tmp_p
         Knob("control_points", "Control points per side", {"3": REFUSED, "33": ()}),
     )
     monkeypatch.setattr(tradeoff, "knobs", lambda scene: few)
-    monkeypatch.setattr(cold_run, "REFERENCE_EFFORT", EFFORT)
-    found = tradeoff.tradeoff(tiny, tmp_path / "sweep", budget=1e5)
+    found = tradeoff.tradeoff(tiny, tmp_path / "sweep", budget=1e5, reference=EFFORT)
     runs = {run.settings: run for run in found.runs}
     assert len(runs) == 2 and not found.not_run
     base, refused = (runs[point] for point in ((), REFUSED))

@@ -19,7 +19,6 @@ from bstcad.optics.receivers.irradiance import Screen
 from bstcad.optics.surfaces.bspline import QUARTERS, BSplineSurface
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Sphere
-from bstcad.tailoring import machinability
 from bstcad.tailoring.clearance import PENALTY_MARGIN, CellGrid, clearance, unit
 from bstcad.tailoring.machinability import active_bounds, enforce_bounds, excess
 from bstcad.tailoring.merit import Merit
@@ -156,11 +155,10 @@ def test_a_lens_with_room_stays_as_it_is():
     assert enforce_bounds(lens, Bounds(thinnest=0.5)) is lens
 
 
-def test_the_back_is_moved_as_the_last_resort(monkeypatch):
+def test_the_back_is_moved_as_the_last_resort():
     """The back moves if bending does not suffice: the bending has hardly begun in this test."""
-    monkeypatch.setattr(machinability, "REPAIR_EVALUATIONS", 1)
     lens = crossing(Rectangle(8.0, 8.0))
-    found = enforce_bounds(lens, Bounds(thinnest=0.5))
+    found = enforce_bounds(lens, Bounds(thinnest=0.5), evaluations=1)
     assert found.back.z > lens.back.z and thickness_range(found)[0] >= 0.5
 
 

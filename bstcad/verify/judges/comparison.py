@@ -31,15 +31,19 @@ from bstcad.scene.errors import MachineError, SceneError, nearest
 from bstcad.verify.verdict import Check
 
 JUDGES = {"batoid": "bstcad.verify.judges.batoid", "mitsuba": "bstcad.verify.judges.mitsuba"}
-JUDGE_RAYS = 1 << 24  # total number of rays that a judge traces for one target
 MAX_COMPARED_PIXELS = 128  # largest number of pixels along the longer side of the compared pictures
-OWN_EFFORT = Effort(
-    accuracy=0.0, witness=False, cells=1
-)  # effort of bstcad's picture: all rays, no picture by flux tubes
 OWN_SEED_OFFSET = 500_009  # difference between the seeds of bstcad's and the judge's rays
 AGREEMENT_FACTOR = 1.5  # limit of the pictures' difference / its noise for many pixels; for N: 1 + 3 / sqrt(N) times it
 MIN_NOISE = 1e-9  # lower bound of the noise, relative to the target's RMS
 FLUX_TOLERANCE = 0.005  # largest difference of the two programs' fluxes on the target, as a fraction of the source's
+
+
+@dataclass(frozen=True)
+class JudgeEffort:
+    """Effort of a comparison with another program."""
+
+    rays: int = 1 << 24  # total number of rays that a judge traces for one target
+    own: Effort = Effort(accuracy=0.0, witness=False, cells=1)  # bstcad's picture: all rays, none by flux tubes
 
 
 @dataclass(frozen=True)
@@ -122,22 +126,24 @@ def run_judges(
     goal: Goal,
     seed: int,
     progress: Callable[[str, int, int, str], None],
+    effort: JudgeEffort = JudgeEffort(),
 ) -> tuple[Comparison, ...]:
     """Compare the picture of each judge with bstcad's, one after the other."""
     compared = []
     for number, judge in enumerate(judges):
         name = judge if isinstance(judge, str) else judge.name
         progress("judges", number, len(judges), f"{name} {goal.key}" if goal.suffix else name)
-        compared.append(compare(judge, lens, channels, goal, rays=JUDGE_RAYS, seed=seed))
+        compared.append(compare(judge, lens, channels, goal, effort=effort, seed=seed))
     if judges:
         progress("judges", len(judges), len(judges), "")
     return tuple(compared)
 
 
 def compare(
-    judge: str | OwnJudge, lens: Lens, channels: Sequence[Channel], goal: Goal, *, rays: int, seed: int = 0
-) -> Comparison:
-    """Compare a judge's picture of the light on a target with bstcad's; rays: number of the judge's rays in total."""
+    judge: str | OwnJudge, lens: Lens, channels: Sequence[Channel], goal: Goal, *,
+    effort: JudgeEffort = JudgeEffort(), seed: int = 0,
+) -> Comparison:  # fmt: skip
+    """Compare a judge's picture of the light on a target with bstcad's."""
     began = time.perf_counter()
     (functions, name, version), key = _judge_functions(judge), goal.key if goal.suffix else ""
     declined = functions.cannot(lens, channels)
@@ -147,9 +153,9 @@ def compare(
         return Comparison(Judge(name, version, declined, target=key))
     raster = coarse_screen(goal.screen)
     target, light = resample(goal.picture, raster.shape), functions.light(lens, channels)
-    traced = functions.trace(lens, light, raster, rays=rays, seed=seed)
+    traced = functions.trace(lens, light, raster, rays=effort.rays, seed=seed)
     seconds = time.perf_counter() - began
-    ours = measure(lens, light, raster, target, effort=replace(OWN_EFFORT, seed=seed + OWN_SEED_OFFSET))
+    ours = measure(lens, light, raster, target, effort=replace(effort.own, seed=seed + OWN_SEED_OFFSET))
     total = float(target.sum())
     theirs, first, second = (_scale_to(picture, total) for picture in (traced.picture, *traced.halves))
     difference = _difference(theirs, ours.picture, target)

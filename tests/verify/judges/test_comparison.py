@@ -17,9 +17,10 @@ from bstcad.commands import ProofOptions
 from bstcad.optics.light.channels import Channel
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import Screen
-from bstcad.optics.trace.measure import tubes_picture
+from bstcad.optics.trace.measure import Effort, tubes_picture
 from bstcad.scene.errors import MachineError, SceneError
 from bstcad.verify.judges import comparison
+from bstcad.verify.judges.comparison import JudgeEffort
 from bstcad.verify.judges.faces import FaceError, Traced
 from tests.conftest import quick_effort
 from tests.verify.judges.lenses import CASES, SCREEN
@@ -28,11 +29,15 @@ from tests.verify.judges.lenses import CASES, SCREEN
 with_others = pytest.mark.bench
 
 
+LITTLE = JudgeEffort(1 << 12, Effort(512, accuracy=0.0, witness=False, cells=1))
+
+
 def compared(name, case="a beam", rays=1 << 18):
     glass, source, screen = CASES[case]
     channels = (Channel(source, glass.index),)
     target = tubes_picture(glass, channels, screen, 256).numpy()
-    return comparison.compare(name, glass, channels, Goal("target", screen, target), rays=rays, seed=3)
+    goal, effort = Goal("target", screen, target), replace(LITTLE, rays=rays)
+    return comparison.compare(name, glass, channels, goal, effort=effort, seed=3)
 
 
 def passed(found):
@@ -54,7 +59,6 @@ class TestStandIn:
         found = SimpleNamespace(cannot=lambda *a: "", light=lambda glass, channels: tuple(channels), trace=trace)
         monkeypatch.setitem(sys.modules, "stand_in", found)
         monkeypatch.setitem(comparison.JUDGES, "numpy", "stand_in")
-        monkeypatch.setattr(comparison, "OWN_EFFORT", replace(comparison.OWN_EFFORT, rays=512))
         return found
 
     def test_a_judge_of_the_same_light_agrees_within_its_noise(self, judge):
@@ -87,11 +91,10 @@ class TestStandIn:
         found = compared("numpy")
         assert found.checks == () and found.judge.rays is None and found.judge.declined == "it is too dark"
 
-    def test_each_judge_is_asked_in_turn(self, judge, monkeypatch):
+    def test_each_judge_is_asked_in_turn(self, judge):
         told, (glass, source, screen) = [], CASES["a beam"]
-        monkeypatch.setattr(comparison, "JUDGE_RAYS", 1 << 12)
         given = glass, (Channel(source, glass.index),), Goal("target", screen, np.ones(screen.shape)), 0
-        found = comparison.run_judges(["numpy"], *given, lambda *a: told.append(a))
+        found = comparison.run_judges(["numpy"], *given, lambda *a: told.append(a), LITTLE)
         assert [each.judge.rays for each in found] == [1 << 12]
         assert told == [("judges", 0, 1, "numpy"), ("judges", 1, 1, "")]
 
@@ -175,9 +178,9 @@ def test_a_step_file_by_itself_has_no_light(small_design, tmp_path):
 @with_others
 def test_the_report_holds_the_judge(small_design, tmp_path, monkeypatch):
     monkeypatch.setattr("bstcad.figures.rendering.lens_picture", lambda mesh: None)
-    monkeypatch.setattr(comparison, "JUDGE_RAYS", 1 << 18)
     folder = shutil.copytree(small_design.folder, tmp_path / "small")
-    report = commands.verify(folder, against=("batoid",), options=ProofOptions(quick_effort())).facts
+    options = ProofOptions(quick_effort(), judges=replace(LITTLE, rays=1 << 18))
+    report = commands.verify(folder, against=("batoid",), options=options).facts
     [judge] = report["judges"]
     assert report["passed"] and judge["name"] == "batoid" and judge["agrees"]
     assert judge["over_noise"] in [c["value"] for c in report["checks"] if c["name"].startswith("irradiance by batoid")]
