@@ -3,6 +3,7 @@
 import re
 import runpy
 import shutil
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,11 @@ import zxingcpp
 
 import bstcad
 from bstcad.api import Design
+from bstcad.designs import pipeline
 from bstcad.scene.errors import MachineError
 from tests import suite
 from tests.conftest import draws_nothing, quick_effort, verify_with
-from tests.efforts import designed_quickly
+from tests.efforts import LITTLE, designed_quickly
 
 GALLERY = Path(__file__).parent.parent / "docs" / "gallery-scripts"
 WORDS = "https://pypi.org/project/bstcad"
@@ -55,6 +57,7 @@ def test_a_script_of_the_gallery_runs_to_its_end(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     draws_nothing(monkeypatch)  # pictures of reports; those of the script are drawn
     verify_with(monkeypatch, quick_effort())
+    monkeypatch.setattr(pipeline, "DesignOptions", partial(pipeline.DesignOptions, effort=LITTLE))
     try:
         runpy.run_path(script.name, run_name="__main__")
     except MachineError as refusal:
