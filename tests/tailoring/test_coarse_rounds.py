@@ -30,7 +30,7 @@ NEAR = {  # a wall nearer than the plate is wide, fifty times as bright in one c
         "back": {"kind": "bspline", "z": 12.0, "control_points": 65},
     },
     "target": {"z": 62.0, "x": [-30.0, 30.0], "y": [-30.0, 30.0], "pixels": 64, "uniform": True},
-    "tailoring": {"quality": "draft", "rays": 128, "transport_grid": 64, "stage2_iterations": 12},
+    "tailoring": {"quality": "draft", "rays": 128, "transport_grid": 32, "stage2_iterations": 12},
 }
 
 
