@@ -17,6 +17,8 @@ from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import sag
 from bstcad.scene.errors import SceneError
 
+pytestmark = pytest.mark.usefixtures("few_samples")
+
 
 @pytest.mark.parametrize("outline", [Rectangle(8.0, 6.0), Circle(3.0)], ids=["plate", "disc"])
 def test_a_height_map_is_the_face_by_the_scales_that_it_states(outline):

@@ -16,6 +16,7 @@ from tests.conftest import quick_effort
 from tests.scenes import DISK, SMALL
 from tests.toolpath.test_simulated_shop import lens_of, waves
 
+pytestmark = pytest.mark.usefixtures("few_samples")
 PLATE = Rectangle(8.0, 6.0)
 COARSE = Cutting(cusp=0.05, tolerance=0.002)
 

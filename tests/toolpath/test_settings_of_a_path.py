@@ -17,6 +17,7 @@ from bstcad.toolpath.raster import SAFE_HEIGHT
 from tests.toolpath.test_foreign_gcode import run
 from tests.toolpath.test_simulated_shop import Router, clearance, highest, lens_of, points_on, waves
 
+pytestmark = pytest.mark.usefixtures("few_samples")
 PLATE = Rectangle(8.0, 6.0)
 COARSE = {"cusp": 0.05, "tolerance": 0.002}
 
