@@ -25,6 +25,7 @@ LITTLE = TailoringEffort(  # effort of tailoring that resolves designs of some 2
     compared_tubes=16,
     compared_evaluations=2,
 )
+FEWEST_RAYS = Effort(256, places=65, points=1024, tubes=97)  # verifies the small design: an RRMSD to a few percent
 FEW_RAYS = replace(FULL, fine=Effort(128, accuracy=0.0, witness=False))  # rates lenses within bounds by few rays
 
 

@@ -251,7 +251,7 @@ TAILORED = {  # a front that is searched for; two nets for two pictures, and for
 }
 
 
-FEW_STEPS = {"rays": 190, "rounds": 2, "stage2_iterations": 4}
+FEW_STEPS = {"rays": 190, "rounds": 1, "stage2_iterations": 4}
 QUICK_DESIGNS = {
     "two faces": two_faces.SMALL | two_faces.WITH_WAVE | {"tailoring": two_faces.SMALL["tailoring"] | FEW_STEPS},
     "dome": DOME | {"tailoring": DOME["tailoring"] | FEW_STEPS},

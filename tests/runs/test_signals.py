@@ -12,21 +12,22 @@ from pathlib import Path
 
 import pytest
 
+from bstcad import cli
 from bstcad.designs.pipeline import DesignState
 from bstcad.runs import checkpoint, signals
 from bstcad.scene.scene import load
-from tests import suite
+from tests import conftest, suite
 from tests.scenes import DISK, SMALL
 
 ROOT = Path(__file__).parent.parent.parent
-# First in a process that runs the command line: it verifies by as many tubes and rays as resolve the small design, and
-# draws nothing.
+# First in a process that runs the command line: it designs by little effort, verifies by as many tubes and rays as
+# resolve the small design, and draws nothing.
 FEW_RAYS = """
 from bstcad import commands
-from bstcad.optics.trace.measure import Effort
 from bstcad.figures.figure_jobs import NoPictures
 from functools import partial
-few = commands.ProofOptions(Effort(256, places=65, points=1024, tubes=97), NoPictures)
+from tests.efforts import FEWEST_RAYS, LITTLE
+few = commands.ProofOptions(FEWEST_RAYS, NoPictures, tailoring=LITTLE)
 commands.generate = partial(commands.generate, options=few)
 """
 BOTH = pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
@@ -137,12 +138,12 @@ def test_ctrl_c_is_a_wish_first():
 
 
 @suite.in_turn(0, 2)
-def test_the_first_ctrl_c_ends_what_only_has_to_be_written_and_verified(tmp_path):
+def test_the_first_ctrl_c_ends_what_only_has_to_be_written_and_verified(tmp_path, monkeypatch, capsys):
     """There is no better lens to wait for; the design is kept, and --resume has only these two left to do."""
     path = tmp_path / "small.toml"
     hasty = {"tailoring.rays": 64, "tailoring.rounds": 1, "tailoring.stage2_iterations": 1, "target.pixels": 32}
     path.write_text(load(DISK, SMALL | hasty).toml())
-    stopped = generate(path, tmp_path / "lens")
+    stopped = generate(path, tmp_path / "lens", first=FEW_RAYS)
     for line in stopped.stdout:
         if line.startswith(("write", "verify")):
             break
@@ -151,6 +152,7 @@ def test_the_first_ctrl_c_ends_what_only_has_to_be_written_and_verified(tmp_path
     assert stopped.returncode == 130, said
     assert said[-1].endswith("the design so far is kept; run the same command with --resume to continue it")
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lens.checkpoint", "small.toml"]
-    resumed = generate(path, tmp_path / "lens", "--resume", first=FEW_RAYS)
-    said = resumed.communicate(timeout=120)[0].splitlines()
-    assert resumed.returncode in (0, 1) and not any(line.startswith("stage") for line in said)
+    conftest.quickly(monkeypatch)
+    assert cli.run(["generate", str(path), "-o", str(tmp_path / "lens"), "--resume"]) in (0, 1)
+    said = "".join(capsys.readouterr()).splitlines()
+    assert any(line.startswith("verify") for line in said) and not any(line.startswith("stage") for line in said)

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from bstcad.analysis import shape
 from bstcad.manufacture.measured.cloud import MIN_CLOUD_POINTS
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.surfaces.surfaces import sag, sampled
+from bstcad.optics.surfaces.surfaces import sag
 
 MAX_GAUSS_NEWTON_STEPS = 30  # maximum number of Gauss-Newton steps
 MAX_OUTLIER_ROUNDS = 6  # maximum number of rounds of outlier rejection
@@ -72,15 +72,16 @@ class BackFace:
 
     def distance(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return signed distances (n,), mm, positive outside the glass, and normals (n, 3) at the nearest points."""
-        foot = points[:, :2]
+        surface, (x, y, z) = self.lens.back.plain(), np.ascontiguousarray(points.T)
+        foot_x, foot_y = x, y
         for _ in range(FOOT_ITERATIONS):
-            z, z_x, z_y = sampled(self.lens.back, *foot.T)
+            at = surface.sag_and_slope(torch.from_numpy(foot_x), torch.from_numpy(foot_y))
+            sag_here, z_x, z_y = (value.numpy() for value in at)
             length = np.sqrt(1 + z_x * z_x + z_y * z_y)
-            normal = np.stack([-z_x / length, -z_y / length, 1 / length], axis=1)
-            off = points - np.column_stack([foot, z])
-            d = off[:, 0] * normal[:, 0] + off[:, 1] * normal[:, 1] + off[:, 2] / length
-            foot = points[:, :2] - d[:, None] * normal[:, :2]
-        return d, normal
+            n_x, n_y = -z_x / length, -z_y / length
+            d = (x - foot_x) * n_x + (y - foot_y) * n_y + (z - sag_here) / length
+            foot_x, foot_y = x - d * n_x, y - d * n_y
+        return d, np.stack([n_x, n_y, 1 / length], axis=1)
 
     def height(self, points: np.ndarray) -> np.ndarray:
         """Return the heights (n,) of points above the face along z (mm)."""
@@ -88,7 +89,9 @@ class BackFace:
 
     def columns(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return changes (n, 6) of the distances per mm of shift along, or rotation (at the rim) about, x, y and z."""
-        return np.hstack([normals, np.cross(points - self.pivot, normals) / self.reach])
+        (x, y, z), (n_x, n_y, n_z) = np.ascontiguousarray((points - self.pivot).T), normals.T
+        turns = (y * n_z - z * n_y, z * n_x - x * n_z, x * n_y - y * n_x)
+        return np.stack([n_x, n_y, n_z, *(turn / self.reach for turn in turns)], axis=1)
 
 
 @dataclass(frozen=True)

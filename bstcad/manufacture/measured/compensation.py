@@ -135,8 +135,9 @@ def measured_form(cloud: Cloud, lens: Lens, decentre: float | None) -> FormError
     decentre: accept.decentre (mm) of the scene.
     """
     face = BackFace.of(lens)
-    alignment, checks = made_part.aligned(cloud, face, decentre)
-    for check in checks:
+    part = made_part.aligned(cloud, face, decentre)
+    alignment = part.alignment
+    for check in part.checks:
         if not check.passed and check.id != SCALE:
             where = f" ({check.where})" if check.where else ""
             why = f"no correction is computed from this cloud, since a check fails: {check.name}{where}"

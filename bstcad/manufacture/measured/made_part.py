@@ -81,7 +81,8 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     """
     lens = replace(lens, outline=lens.apertures[1])  # if a mount cuts the rim, the face ends there
     face = BackFace.of(lens)
-    alignment, of_cloud = aligned(cloud, face, nominal.scene.accept.decentre)
+    part = aligned(cloud, face, nominal.scene.accept.decentre)
+    alignment, (size, _), axes = part.alignment, part.scale, part.axes
     form = fit_form_error(face, alignment)
     figures = deviation(lens, alignment, form)
     cheap = replace(nominal.effort(effort), witness=False)
@@ -89,9 +90,8 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     chosen = angles[:: max(1, math.ceil(len(angles) / MAX_TURNED))]
     turned = [_turned_form(face, alignment, angle) for angle in chosen]
     lights = [_light(lens, form, nominal, goal, effort=cheap, turned=turned) for goal in nominal.goals]
-    (size, _), axes = scale(face, alignment), axis_scales(face, alignment)
     checks = (
-        *of_cloud,
+        *part.checks,
         *_light_checks(nominal, lights),
         *_wavefront(lens.with_back(form.add_to(lens.back_net)), nominal),
     )
@@ -112,42 +112,64 @@ def judge(cloud: Cloud, lens: Lens, nominal: Nominal, effort: Effort | None = No
     return MadePart(checks, facts, figures, irradiances=irradiances, outliers=alignment.outliers)
 
 
-def aligned(cloud: Cloud, face: BackFace, decentre: float | None) -> tuple[Alignment, tuple[Check, ...]]:
-    """Return the cloud aligned with a face, and the checks of the cloud; ValueError if it cannot be aligned.
+@dataclass(frozen=True)
+class AlignedPart:
+    """A cloud aligned with the face of a lens, and what the cloud alone tells of the part."""
+
+    alignment: Alignment
+    scale: tuple[float, float]  # scale relative to the design, one for all axes, and its standard uncertainty
+    axes: AxisScales
+    checks: tuple[Check, ...]  # checks of the cloud
+
+
+def aligned(cloud: Cloud, face: BackFace, decentre: float | None) -> AlignedPart:
+    """Return the cloud aligned with a face; ValueError if it cannot be aligned.
 
     decentre: accept.decentre (mm).
     """
     try:
-        alignment, axes = _align(face, cloud.points)
+        alignment, exchange = _align(face, cloud.points)
     except ValueError as error:
         raise ValueError(f"{cloud.path}: {error}") from None
-    return alignment, tuple(_cloud_checks(cloud, face, alignment, axes, decentre=decentre))
+    size, axes = scale(face, alignment), axis_scales(face, alignment)
+    checks = (
+        *_cloud_checks(cloud, face, alignment, exchange),
+        _scale_check(size, axes.stretch),
+        _decentre_check(alignment, decentre),
+    )
+    return AlignedPart(alignment, size, axes, checks)
 
 
-def _cloud_checks(
-    cloud: Cloud, face: BackFace, alignment: Alignment, axes: str, decentre: float | None
-) -> Iterator[Check]:
-    """Check that a cloud is in mm and has the design's axes, and that it is of this face, complete, clean and in place.
+def _cloud_checks(cloud: Cloud, face: BackFace, alignment: Alignment, exchange: str) -> Iterator[Check]:
+    """Check that a cloud is in mm and has the design's axes, and that it is of this face, complete and clean.
 
-    axes: exchange of axes that the cloud needs, in words; decentre: accept.decentre (mm).
+    exchange: exchange of axes that the cloud needs, in words.
     """
     extent = f"its extent fits the lens if its unit is {cloud.unit}"
     yield Check.true("made part: the cloud is in mm", cloud.unit == "mm", extent, id="made-unit")
-    yield Check.true("made part: the axes of the cloud are the design's", not axes, axes, id="made-axes")
+    yield Check.true("made part: the axes of the cloud are the design's", not exchange, exchange, id="made-axes")
     yield from _identity_checks(face, alignment)
     name, measured = "made part: measured fraction of the face", _coverage(face.lens, alignment.points)
     yield Check.at_least(name, measured, MIN_MEASURED_FRACTION, id="made-covered")
     name, where = "made part: fraction of outliers among the points of the face", "clean the part and measure it again"
     yield Check.at_most(name, alignment.outlier_fraction, MAX_OUTLIER_FRACTION, where=where, id="made-outliers")
-    (factor, uncertainty), name = scale(face, alignment), "made part: error of the scale of the cloud"
-    known, stretch = np.isfinite(uncertainty), axis_scales(face, alignment).stretch
+
+
+def _scale_check(scale: tuple[float, float], stretch: str) -> Check:
+    """Check the scale of a cloud; stretch: axes along which the part is stretched, in words."""
+    (factor, uncertainty), name = scale, "made part: error of the scale of the cloud"
+    known = np.isfinite(uncertainty)
     limit = max(SCALE_TOLERANCE, SCALE_SIGMAS * uncertainty) if known else None
     size = f"size of cloud / design: {factor:.5f}" if known else "this form of face does not tell the scale of its part"
     where = "; ".join(filter(None, (size, stretch)))
-    yield Check.at_most(name, abs(factor - 1), limit, where=where, id="made-scale")
+    return Check.at_most(name, abs(factor - 1), limit, where=where, id="made-scale")
+
+
+def _decentre_check(alignment: Alignment, decentre: float | None) -> Check:
+    """Check the decentre of a part in the frame of its cloud."""
     x, y, _ = alignment.pose.shift
     name, where = "made part: decentre in the frame of the cloud", f"x {x:+.4g} mm, y {y:+.4g} mm"
-    yield Check.at_most(name, math.hypot(x, y), decentre, "mm", where=where, id="made-decentre")
+    return Check.at_most(name, math.hypot(x, y), decentre, "mm", where=where, id="made-decentre")
 
 
 def _light_checks(nominal: Nominal, lights: Sequence[Prediction]) -> Iterator[Check]:

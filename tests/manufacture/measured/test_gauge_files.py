@@ -108,7 +108,7 @@ def test_a_fault_of_a_height_map_is_said(tmp_path, lens, heights, fault):
     change, scale, checks, words = FAULTS[fault]
     coarse = change(heights[::2, ::2])
     found = loaded(tmp_path, "x3p", WRITERS["x3p"](coarse, 2 * scale * PITCH), lens.outline)
-    _, made = made_part.aligned(found, BackFace.of(lens), 0.01)
+    made = made_part.aligned(found, BackFace.of(lens), 0.01).checks
     failed = {check.id: check.where for check in made if not check.passed}
     assert list(failed) == checks and words in "".join(failed.values())
 
@@ -248,9 +248,9 @@ def with_xml(change):
 
 @suite.in_turn(0, 2)
 def test_xml_without_bounds_is_refused_before_it_is_read(tmp_path):
-    """40 MB of elements took a minute and 1 GB."""
+    """40 MB of elements took a minute and 1 GB; here are 10.4 MB, just above the limit."""
     begun = time.perf_counter()
-    outside = with_xml(lambda xml: xml.replace(b"</Record2>", b"<a/>" * 10_000_000 + b"</Record2>"))
+    outside = with_xml(lambda xml: xml.replace(b"</Record2>", b"<a/>" * 2_600_000 + b"</Record2>"))
     assert "has more than 10000000 bytes of XML besides its points" in one_sentence(tmp_path, "x3p", outside)
     within = with_xml(
         lambda xml: xml.replace(b"<DataLink>", b"<DataList>" + b"<D/>" * 2_000_001 + b"</DataList><DataLink>")
@@ -277,7 +277,7 @@ def test_a_list_of_data_may_be_longer_than_other_xml(tmp_path, monkeypatch):
 # ---- limits of the child process -------------------------------------------------------------------------------------
 
 READERS = {  # reader of a child, and words of the sentence
-    "sleep(60)": "was not read within 3 s",
+    "sleep(60)": "was not read within 1 s",
     "abort()": "ended the process that reads X3P files (ended by SIGABRT)",
     "_exit(3)": "ended the process that reads X3P files (exit code 3)",
     "bytes(grid_process.MAX_READER_MEMORY)": "needs more than 8 GB of memory",
@@ -296,7 +296,7 @@ def test_a_reader_without_bounds_ends_in_a_sentence(tmp_path, monkeypatch, reade
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.setattr(grid_process, "MODULE", "hostile_reader")
     if "sleep" in statement:
-        monkeypatch.setattr(grid_process, "MAX_READER_TIME", 3.0)
+        monkeypatch.setattr(grid_process, "MAX_READER_TIME", 1.0)
     with pytest.raises(ValueError, match=re.escape(READERS[statement])) as error:
         reader(WRITERS["x3p"](map_of(), 0.3), "X3P")
     assert "; export the file again" in str(error.value) and "\n" not in str(error.value)

@@ -25,11 +25,11 @@ from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.optics.trace.measure import measure
 from bstcad.verify import checks
 from tests import suite
-from tests.conftest import pictures, quick_effort
+from tests.conftest import pictures
+from tests.efforts import FEWEST_RAYS as EFFORT
 from tests.lenses import net
 from tests.manufacture.measured.synthetic import SHIFT, TURN, cloud, dirty, points, with_form_error
 
-EFFORT = quick_effort()
 PART = "made part: "
 
 
@@ -60,7 +60,7 @@ def failed(part):
 def test_the_form_error_is_recovered_and_its_light_predicted(nominal, light):
     lens = nominal.lens
     made = with_form_error(lens, 2e-4, 1.5, seed=4)
-    part = judged(cloud(made, 20_000, noise=2e-5), nominal)
+    part = judged(cloud(made, 8000, noise=2e-5), nominal)
     assert failed(part) == {} and part.facts["passed"]
     x, y = (t.ravel() for t in np.meshgrid(part.deviation.x, part.deviation.y))
     here = torch.from_numpy(x), torch.from_numpy(y)
@@ -80,7 +80,7 @@ def test_the_form_error_is_recovered_and_its_light_predicted(nominal, light):
 
 def as_designed(lens):
     """A cloud of the lens itself in the frame of its design."""
-    return cloud(lens, 10_000, 2e-5, (0.0,) * 3, (0.0,) * 3)
+    return cloud(lens, 4000, 2e-5, (0.0,) * 3, (0.0,) * 3)
 
 
 def test_a_decentre_of_ten_micrometres_is_found_to_a_tenth_and_fails_where_less_is_asked(nominal, same_light):
@@ -256,9 +256,9 @@ def test_a_turned_part_is_aligned_by_its_relief(degrees):
     bowl = Lens.between(Plane(0.0), net(lambda x, y: 0.02 * x**2 + 0.01 * y**2, 5.0, 65, 6.0), Circle(5.0), 1.5)
     lens = with_form_error(bowl, 1e-3, 0.7)
     face, given = BackFace.of(lens), clouds.Cloud(cloud(lens, 3000, 2e-5, SHIFT, (0.0, 0.0, degrees)), "mm", Path())
-    found, checks_of_cloud = made_part.aligned(given, face, None)
-    assert all(check.passed for check in checks_of_cloud) and found.rms < 3e-5
-    assert abs(found.pose.angles[2]) == pytest.approx(degrees, abs=0.05)
+    found = made_part.aligned(given, face, None)
+    assert all(check.passed for check in found.checks) and found.alignment.rms < 3e-5
+    assert abs(found.alignment.pose.angles[2]) == pytest.approx(degrees, abs=0.05)
 
 
 @suite.in_turn(2, 3)

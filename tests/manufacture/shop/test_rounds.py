@@ -26,9 +26,9 @@ from bstcad.optics.surfaces.bspline import BSplineSurface, interpolating_net
 from bstcad.optics.surfaces.surfaces import sag
 from bstcad.optics.trace.measure import Effort
 from tests import suite
-from tests.conftest import quick_effort
+from tests.efforts import FEWEST_RAYS as EFFORT
 
-POINTS, GAUGE, MISPLACED, TURNED = 10_000, 20e-6, 0.03, 0.05  # number, noise (mm), mm, degrees
+POINTS, GAUGE, MISPLACED, TURNED = 4000, 20e-6, 0.03, 0.05  # number, noise (mm), mm, degrees
 
 
 class Shop:
@@ -62,7 +62,7 @@ class Shop:
 
     def deviation(self, height):
         """PV and RMS (mm) of a part after its alignment, without noise."""
-        face, points = BackFace.of(self.lens), self.measure(height, 99, 10_000, noise=0.0, misplaced=0.0).points
+        face, points = BackFace.of(self.lens), self.measure(height, 99, noise=0.0, misplaced=0.0).points
         found = alignment.align(face, points, alignment.first_pose(face, points)[0])
         return np.ptp(found.distances), found.rms
 
@@ -206,7 +206,7 @@ def test_a_folder_remembers_its_rounds(lens, small_design, tmp_path, capsys, mon
         cloud = shop.measure(shop.cut(net, 0), number)
         path = tmp_path / f"part-{number}.csv"
         np.savetxt(path, cloud.points, delimiter=",", header="x [mm],y [mm],z [mm]", comments="", fmt="%.9f")
-        found = commands.compensate(folder, [path], effort=quick_effort())
+        found = commands.compensate(folder, [path], effort=EFFORT)
         place = folder / "compensated" / f"round-{number}"
         assert found.folder == place and found.figures["round"] == number
         assert json.loads((place / "compensation.json").read_text()) == found.figures
@@ -222,7 +222,7 @@ def test_a_folder_remembers_its_rounds(lens, small_design, tmp_path, capsys, mon
     first, second = lights  # waves near the cutoff stay in part; the second round corrects half of what it finds
     assert first["design"] < first["expected"] < first["measured"] / 2
     assert second["expected"] < second["measured"] < first["measured"] / 2
-    monkeypatch.setattr(commands, "compensate", partial(commands.compensate, effort=quick_effort()))
+    monkeypatch.setattr(commands, "compensate", partial(commands.compensate, effort=EFFORT))
     run = tmp_path / "run"  # the job of the page
     run.mkdir()
     cloud = shop.measure(shop.cut(net, 0), 3)

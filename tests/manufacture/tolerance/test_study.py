@@ -30,7 +30,7 @@ from bstcad.report.report import BEGIN, END
 from bstcad.runs.cluster import Cluster
 from tests.conftest import quick_effort
 
-TUBES, FEW_TUBES, FULL = 257, 129, 40
+TUBES, FEW_TUBES, FULL = 129, 65, 24
 
 
 @pytest.fixture(scope="module")
