@@ -274,7 +274,7 @@ def test_an_upload_that_breaks_off_is_a_line_and_leaves_nothing(own, capsys, pat
 
 
 def test_unfinished_headers_are_closed(own, monkeypatch):
-    monkeypatch.setattr(connections, "HEADERS_TIMEOUT", 0.4)
+    monkeypatch.setattr(connections, "HEADERS_TIMEOUT", 0.2)
     with server.bound(0) as listening:
         port = listening.getsockname()[1]
         running = server.uvicorn_server(own.workbench.app)

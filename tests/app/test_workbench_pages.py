@@ -258,12 +258,12 @@ LOOKS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("look", suite.in_turns(LOOKS, 2))
-def test_two_designs_are_compared_and_nobody_is_shut_out(open_page, shared, small_design, look):
-    """axe-core finds no serious fault on any page, in light and dark, and on a telephone."""
+@pytest.mark.parametrize(("look", "pages"), suite.in_turns([(look, pages) for look in LOOKS for pages in (0, 1)], 4))
+def test_two_designs_are_compared_and_nobody_is_shut_out(open_page, shared, small_design, look, pages):
+    """axe-core finds no serious fault on any page, in light and dark, and on a telephone; two of the four at a time."""
     from axe_playwright_python.sync_playwright import Axe
 
-    options, left, right = LOOKS[look], f"left-{look[:4]}", f"right-{look[:4]}"
+    options, left, right = LOOKS[look], f"left-{look[:4]}-{pages}", f"right-{look[:4]}-{pages}"
     for name, z in ((left, 100.0), (right, 90.0)):
         path = shutil.copytree(small_design.folder, shared.folder / name) / folders.SCENE
         text = scene_text.changed(path.read_text(encoding="utf-8"), "name", name)
@@ -277,7 +277,7 @@ def test_two_designs_are_compared_and_nobody_is_shut_out(open_page, shared, smal
     addresses = ("/", "/scene/small", f"/design/{left}", f"/compare?design={left}&design={right}")
     found = []
     page = open_page(shared.address, bypass_csp=True, **options)
-    for address in addresses:
+    for address in addresses[pages::2]:
         page.goto(shared.root + address)
         if "scene" in address:
             page.wait_for_selector(SEEN, timeout=PATIENCE)

@@ -156,7 +156,7 @@ def words_of(made):
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", suite.in_turns(SCENES, 3))
+@pytest.mark.parametrize("name", suite.in_turns(SCENES, 4))
 def test_no_label_lies_on_another_nor_leaves_the_frame(name):
     page, texts = drawn(name)
     pixels = page.dpi / 25.4
@@ -173,7 +173,7 @@ def views_of(made):
     return Views(made.lens, made.mount or Mount(), made.order.origin, used=None, names=(("", ""), ("", "")))
 
 
-@pytest.mark.parametrize("name", suite.in_turns(SCENES, 3))
+@pytest.mark.parametrize("name", suite.in_turns(SCENES, 4))
 def test_sections_are_true_to_scale_and_dimensions_say_what_is_there(name):
     made, (page, texts) = sheet(name), drawn(name)
     words = [text.get_text() for text in texts]
@@ -199,7 +199,7 @@ def area(body):
     return abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
 
 
-@pytest.mark.parametrize("name", suite.in_turns(MOUNTED, 2))
+@pytest.mark.parametrize("name", suite.in_turns(MOUNTED, 4))
 def test_a_section_is_the_solid_s(name):
     """The solid of part.step, by OCC, lies where the polygons of the section lie, and nowhere else."""
     made = sheet(name)
@@ -261,7 +261,7 @@ def test_the_table_of_the_part_has_every_hole_at_its_place():
     assert told["Flange, range of z"] == "z = 0 to 1.5 mm"
 
 
-@pytest.mark.parametrize("name", suite.in_turns(MOUNTED, 2))
+@pytest.mark.parametrize("name", suite.in_turns(MOUNTED, 4))
 def test_clear_apertures_lie_within_the_part_s_faces(name):
     made = sheet(name)
     views = views_of(made)
@@ -313,7 +313,7 @@ def test_the_pdf_is_one_a4_with_its_fonts_and_the_same_twice():
     assert pdf != data_sheet.draw(replace(made, order=replace(made.order, sha256="0" * 64)))
 
 
-@pytest.mark.parametrize("name", suite.in_turns(SCENES, 3))
+@pytest.mark.parametrize("name", suite.in_turns(SCENES, 4))
 def test_every_figure_of_the_tables_is_read_back_from_the_pdf_whole(name):
     """The text of the PDF, without spaces and line breaks, contains each name and value of the tables."""
     made = sheet(name)

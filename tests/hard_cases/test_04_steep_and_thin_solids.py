@@ -70,7 +70,7 @@ class Written:
     area: float  # mm², of all faces
 
 
-@pytest.fixture(scope="module", params=suite.in_turns(LENSES, 2))
+@pytest.fixture(scope="module", params=suite.in_turns(LENSES, 3))
 def written(request, tmp_path_factory) -> Written:
     lens = steep(*LENSES[request.param])
     path = tmp_path_factory.mktemp("steep") / "lens.step"

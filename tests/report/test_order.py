@@ -163,8 +163,11 @@ FACTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("made", "facts"), suite.in_turns(FACTS, 2))
+@pytest.mark.parametrize(("made", "facts"), suite.in_turns(FACTS, 3))
 def test_the_facts_of_a_part(made, facts):
     found = order.part(plate(**made))
     assert {name: found[name] for name in facts} == facts
+
+
+def test_a_stated_density_gives_the_mass():
     assert order.part(plate(), stated=1.18)["Mass"].startswith("2.266 g, for the density of 1.18 g/cm³")

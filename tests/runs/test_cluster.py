@@ -62,12 +62,12 @@ def test_a_worker_of_another_version_does_no_work(address, monkeypatch):
 
 def test_what_cannot_be_had_is_a_sentence(monkeypatch):
     with pytest.raises(SceneError, match="--scheduler tcp://127.0.0.1:9: "):
-        Cluster("tcp://127.0.0.1:9", patience=1.0)
+        Cluster("tcp://127.0.0.1:9", patience=0.3)
     with (
         distributed.LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as empty,
         pytest.raises(SceneError, match="dask worker"),
     ):
-        Cluster(empty.scheduler_address, patience=1.0)
+        Cluster(empty.scheduler_address, patience=0.3)
     monkeypatch.setitem(sys.modules, "distributed", None)
     library = r"pip install 'bstcad\[cluster\]'"
     for scheduler, workers, sentence in (

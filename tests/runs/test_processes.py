@@ -9,6 +9,7 @@ from concurrent.futures import BrokenExecutor
 from contextlib import nullcontext
 from pathlib import Path
 
+import psutil
 import pytest
 
 from bstcad.runs import processes
@@ -38,7 +39,9 @@ def test_the_second_process_lives_as_long_as_a_long_work_of_this_one(fresh, monk
     monkeypatch.setattr(processes, "IDLE_TIMEOUT", 0.3)
     before = processes.submit(os.getpid).result()
     with processes.kept_awake() if awake else nullcontext():
-        time.sleep(1.5)
+        until = time.monotonic() + (1.0 if awake else 20.0)
+        while psutil.pid_exists(before) and time.monotonic() < until:
+            time.sleep(0.05)
     assert (processes.submit(os.getpid).result() == before) == awake
 
 

@@ -189,7 +189,7 @@ def saved(path, found):
 @suite.in_turn(0, 2)
 def test_the_report_has_a_made_part_where_one_was_asked_for(small_design, nominal, tmp_path, quick):
     folder = shutil.copytree(small_design.folder, tmp_path / "design")
-    given = dirty(cloud(with_form_error(nominal.lens, 1e-4, 2.0), 5000, 1e-5), 0.02, (1.0,))[0]
+    given = dirty(cloud(with_form_error(nominal.lens, 1e-4, 2.0), 3000, 1e-5), 0.02, (1.0,))[0]
     report = commands.verify(folder, measured=saved(tmp_path / "cloud.csv", given)).facts
     written, page = json.loads((folder / "report.json").read_text()), (folder / "report.html").read_text()
     assert report["passed"] and {
@@ -203,7 +203,7 @@ def test_the_report_has_a_made_part_where_one_was_asked_for(small_design, nomina
         and "The made part" in page
         and (folder / "figures" / "made_part.png").stat().st_size > 10_000
     )
-    saved(tmp_path / "two" / "cloud.csv", 1.002 * cloud(nominal.lens, 5000, 1e-5))
+    saved(tmp_path / "two" / "cloud.csv", 1.002 * cloud(nominal.lens, 3000, 1e-5))
     options = ProofOptions(drawing=NoPictures)
     assert not commands.verify(folder, options, measured=tmp_path / "two" / "cloud.csv").passed
     assert commands.verify(folder, options).measured is None
