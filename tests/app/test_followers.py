@@ -72,7 +72,7 @@ def test_a_wrong_entry_changes_no_other_field_and_leaves_no_trace(key, wrong, ot
     assert changed(take(own, key, mended, valid_text=SMALL, locked=True)[0], key, None) == changed(own, key, None)
 
 
-@pytest.mark.parametrize("name", suite.in_turns(TEXTS, 3))
+@pytest.mark.parametrize("name", suite.in_turns(TEXTS, 5))
 def test_a_choice_that_is_offered_is_possible_or_told_why_not(name, monkeypatch):
     """Each is typed as the page sends it; what is not possible is greyed, all else makes a valid scene."""
     monkeypatch.setattr(effects, "_REGISTERED", {})  # of other tests of this process

@@ -79,7 +79,7 @@ def test_every_key_can_be_reached():
     assert [row.key for row in rows() if not ways_to(row, TEXTS["disk"])] == []
 
 
-@pytest.mark.parametrize("name", suite.in_turns(DATA, 3))
+@pytest.mark.parametrize("name", suite.in_turns(DATA, 5))
 def test_a_field_says_what_the_schema_says_and_what_the_scene_has(name):
     told = {}
     for row in rows():
@@ -109,12 +109,12 @@ def values(table, prefix=""):
             yield from of_part
 
 
-@pytest.mark.parametrize("name", suite.in_turns(DATA, 3))
+@pytest.mark.parametrize("name", suite.in_turns(DATA, 5))
 def test_every_value_of_a_scene_is_in_its_form(name):
     assert {field.key for field in form(DATA[name]).fields() if field.is_set} == {*values(DATA[name])}
 
 
-@pytest.mark.parametrize("name", suite.in_turns(DATA, 3))
+@pytest.mark.parametrize("name", suite.in_turns(DATA, 5))
 def test_what_is_added_is_there_and_goes_again(name):
     found = form(DATA[name])
     for addition in [*found.additions, *(each for group in found.groups() for each in group.additions)]:
@@ -214,7 +214,7 @@ def is_valid(text, found):
     return valid_text.found
 
 
-@pytest.mark.parametrize("name", suite.in_turns(DATA, 3))
+@pytest.mark.parametrize("name", suite.in_turns(DATA, 5))
 def test_the_html_is_sound(name):
     found = form(DATA[name])
     elements = is_valid(html(found, {}), found)

@@ -90,7 +90,7 @@ def test_a_text_is_changed_as_its_tables_are(name):
     assert count > 250
 
 
-@pytest.mark.parametrize("name", suite.in_turns(TEXTS, 3))
+@pytest.mark.parametrize("name", suite.in_turns(TEXTS, 5))
 def test_the_same_value_changes_nothing_and_another_its_line_alone(name):
     text = TEXTS[name]
     for key, value in leaves(tomllib.loads(text)):
@@ -102,7 +102,7 @@ def test_the_same_value_changes_nothing_and_another_its_line_alone(name):
             assert sum(a != b for a, b in zip(other, text.splitlines(), strict=True)) == 1
 
 
-@pytest.mark.parametrize("name", suite.in_turns(TEXTS, 3))
+@pytest.mark.parametrize("name", suite.in_turns(TEXTS, 5))
 def test_what_goes_takes_its_own_comments_alone(name):
     text = TEXTS[name]
     for piece in (whole := pieces(text)):
@@ -240,7 +240,7 @@ def in_it(place, data):
     return place.replace("target", "target[0]", 1) if isinstance(data["target"], list) else place
 
 
-@pytest.mark.parametrize("name", suite.in_turns(TEXTS, 3))
+@pytest.mark.parametrize("name", suite.in_turns(TEXTS, 5))
 def test_another_kind_has_its_keys_and_those_it_needs(name):
     for place in UNIONS:
         text, data = TEXTS[name], tomllib.loads(TEXTS[name])
@@ -360,7 +360,7 @@ def test_words_that_are_no_value_are_told_so(key, words, sentence):
     assert sentence in str(told.value)
 
 
-@pytest.mark.parametrize("name", suite.in_turns(TEXTS, 3))
+@pytest.mark.parametrize("name", suite.in_turns(TEXTS, 5))
 def test_a_value_is_typed_as_it_is_shown(name):
     data = tomllib.loads(TEXTS[name])
     for key, value in leaves(data):
