@@ -480,13 +480,13 @@ class Words(NoPictures):
 NO_DIFFERENCE = PrecisionComparison(
     21, merit=0.0, gradient=0.0, evaluations=2, rrmsd_float64=0.1, rrmsd_float32=0.1, heights=0.0
 )  # comparison of precisions of a scene that is neither previewed nor planned
-FLOWN = 4  # number of planned scenes of which one has a real pilot; each has the small scene that a pilot designs
+FLOWN = 4  # number of planned scenes of which the last has a real pilot; each has the small scene that a pilot designs
 
 
 def pilots():
     """Yield functions that give the pilots of a scene: a real one is one more design, of the same choices."""
     real = partial(run_pilot, size=PILOT, rays=PILOT_RAYS)
-    return itertools.cycle([real, *(FLOWN - 1) * [typical_pilot]])
+    return itertools.cycle([*(FLOWN - 1) * [typical_pilot], real])
 
 
 PILOTS = pilots()

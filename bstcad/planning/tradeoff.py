@@ -25,7 +25,16 @@ from bstcad.designs.folder import SCENE, scene_files
 from bstcad.optics.surfaces.sides import Sides, as_pair, scaled
 from bstcad.optics.trace.measure import Effort
 from bstcad.planning import cold_run, results
-from bstcad.planning.cold_run import ColdRun, LocalPool, Settings, StoredRecord, Value, format_value, sorted_settings
+from bstcad.planning.cold_run import (
+    REFERENCE_EFFORT,
+    ColdRun,
+    LocalPool,
+    Settings,
+    StoredRecord,
+    Value,
+    format_value,
+    sorted_settings,
+)
 from bstcad.planning.net_choice import NET_KEY, with_net
 from bstcad.planning.prediction import START_SECONDS, typical_seconds
 from bstcad.planning.results import (
@@ -233,7 +242,7 @@ def tradeoff(
     budget: float,
     progress: Progress = no_progress,
     machines: Machines | None = None,
-    reference: Effort = cold_run.REFERENCE_EFFORT,
+    reference: Effort = REFERENCE_EFFORT,
 ) -> TradeoffTable:
     """Do the most important runs that the budget (s) allows, and write tradeoff.csv, .json, .png and .html.
 
@@ -281,7 +290,9 @@ def check_free(folder: Path, contents: cold_run.SceneFiles) -> None:
 
 
 class _Sweep:
-    def __init__(self, base: Scene, budget: float, folder: Path, progress: Progress, reference: Effort) -> None:
+    def __init__(
+        self, base: Scene, budget: float, folder: Path, progress: Progress, reference: Effort = REFERENCE_EFFORT
+    ) -> None:
         self._base, self._budget, self._folder, self._progress = base, budget, folder, progress
         self._reference = reference
         self._knobs = knobs(base)
@@ -416,7 +427,7 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
         versions=sample.versions if sample else {},
         reference={
             "rays": sorted({run.rays for run in runs if run.rays}),
-            "what": REFERENCE_TEXT.format(cold_run.REFERENCE_EFFORT.accuracy, _judged_on(scene.targets)),
+            "what": REFERENCE_TEXT.format(REFERENCE_EFFORT.accuracy, _judged_on(scene.targets)),
         },
         calibration=Calibration.of(unit),
         runs=tuple(map(described, runs)),
