@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from bstcad.optics.lens.face_integrals import Border, gauss_points, of_face, of_wall, outline_border
+from bstcad.optics.lens.face_integrals import Border, divided, gauss_points, of_face, of_wall, outline_border
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.surfaces import Conic, Plane, Sphere
 from tests import lenses
@@ -36,6 +36,13 @@ def disc(radius, x=0.0, y=0.0, turn=1):
     t, weight = gauss_points(np.linspace(0, 2 * np.pi, 129), 5)
     c, s = radius * np.cos(turn * t), radius * np.sin(turn * t)
     return Border(x + c, y + s, -turn * weight * s, turn * weight * c)
+
+
+@pytest.mark.parametrize(("breaks", "parts"), [([0.0, 1.0, 3.0], 5), ([-1.0, 0.5], 4), ([0.0, 1.0, 2.0, 4.0], 3)])
+def test_parts_are_enough_and_keep_the_breaks(breaks, parts):
+    found = divided(np.array(breaks), parts)
+    assert len(found) > parts and set(breaks) <= set(found)
+    assert len(set(np.diff(found).round(12))) <= len(breaks) - 1  # equal parts within an interval
 
 
 @pytest.mark.parametrize("m", [5, 9, 130])

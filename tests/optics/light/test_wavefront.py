@@ -143,3 +143,8 @@ def test_a_zernike_wave_is_stated_on_its_circle_and_its_waves_are_rms():
     tilt = ZernikeWave((0.0, 3.0), 9.0, 40.0)
     assert tilt.steepest(NM) == pytest.approx(2 * 3.0 * NM * 1e-6 / 9.0)
     assert ZernikeWave((0.0, 0.0), 9.0, 40.0).steepest(NM) == 0.0
+
+
+def test_a_wave_is_as_steep_wherever_its_circle_lies():
+    middle, *others = (ZernikeWave(COEFFICIENTS, 9.0, 40.0, at).steepest(NM) for at in [(0, 0), (2.0, 0), (0, 4.0)])
+    assert others == pytest.approx([middle, middle], rel=1e-12)
