@@ -12,6 +12,7 @@ import torch
 import trimesh
 
 from bstcad.cad import mesh
+from bstcad.cad.distances import normals_near
 from bstcad.cad.mesh import Mesh, chordal_error, is_closed, lens_mesh, volume_and_area
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
@@ -27,6 +28,13 @@ FRONTS = pytest.mark.parametrize("front", [Plane(8.0), Sphere(8.0, 0.02), Sphere
 
 def by_trimesh(made):
     return trimesh.Trimesh(made.vertices, made.faces, process=False)
+
+
+def test_normals_of_a_sphere_point_away_from_its_centre():
+    x, y = np.meshgrid(np.linspace(-5, 4, 7), np.linspace(-6, 3, 6))
+    centre, points = np.array([0.0, 0.0, 8.0 - 20.0]), np.stack([x, y, np.full_like(x, 8.0)], -1).reshape(-1, 3)
+    points[:, 2] = centre[2] + np.sqrt(400.0 - x**2 - y**2).ravel()
+    np.testing.assert_allclose(normals_near(Sphere(8.0, -0.05), points), (points - centre) / 20.0, rtol=0, atol=1e-12)
 
 
 @OUTLINES

@@ -10,12 +10,13 @@ import torch
 
 from bstcad.optics.light.collimated import CollimatedSource
 from bstcad.optics.light.point import PointSource
+from bstcad.optics.light.profiles import Profile
 from bstcad.optics.surfaces import sampling
 from bstcad.optics.surfaces.outlines import Circle, Rectangle
 from bstcad.optics.surfaces.rays import axes
 from bstcad.optics.surfaces.surfaces import Plane, Sphere
 from bstcad.optics.trace.trace import to_first_net, window
-from tests.lenses import lens_of, net
+from tests.lenses import Measured, lens_of, net
 from tests.tracing import stratified
 
 Z = 15.0
@@ -214,3 +215,16 @@ def test_the_main_line_is_the_heaviest_and_of_equals_the_middle_one(wavelength, 
     lines = source.lines
     assert source.main_wavelength == lines[0][0] == main
     assert math.fsum(share for _, share in lines) == pytest.approx(1, abs=1e-15)
+
+
+@pytest.mark.parametrize("by", [0.1, -0.2])
+def test_a_wider_cone_has_a_larger_tangent_and_a_measured_light_has_none(by):
+    def tangents(angles):
+        return np.tan(np.radians(angles))
+
+    uniform = PointSource((0.0, 0.0, -50.0), profile="uniform", half_angle=12.0)
+    assert tangents(uniform.with_wider_cone(by).half_angle) == pytest.approx((1 + by) * tangents(12.0))
+    both = PointSource((0.0, 0.0, -50.0), profile="gaussian", half_angle_1e2=(20.0, 9.0)).with_wider_cone(by)
+    assert tangents(both.half_angle_1e2) == pytest.approx((1 + by) * tangents([20.0, 9.0]))
+    assert PointSource((0.0, 0.0, -50.0)).with_wider_cone(by) is None
+    assert PointSource(intensity=Measured(Profile(whole=2.0)), half_angle=9.0).with_wider_cone(by) is None
