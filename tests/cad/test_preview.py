@@ -57,9 +57,7 @@ def test_a_coarse_copy_has_the_outline_and_front_and_nearly_the_back(outline, ha
     lens = replace(plate("convex"), outline=outline).with_back(waves(129, half=half))
     light = coarse_copy(lens, 33)
     assert light.back.m == 33 and lens_solid(light).isValid()
-    assert not outline.is_round or light.back.x[1] == pytest.approx(
-        3.5 + 4 * light.back.pitch[0]
-    )  # four more
+    assert not outline.is_round or light.back.x[1] == pytest.approx(3.5 + 4 * light.back.pitch[0])  # four more
     assert exact_volume(light) == pytest.approx(exact_volume(lens), rel=2e-3)
     x, y = np.random.default_rng(1).uniform(-2.4, 2.4, (2, 500))
     assert np.abs(sag(light.back, x, y) - sag(lens.back, x, y)).max() < 0.01

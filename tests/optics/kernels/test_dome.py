@@ -134,6 +134,16 @@ def test_rays_behind_the_dome_are_those_of_the_plain_form(law):
     for one, other in ((ours.position, plain.position), (ours.direction, plain.direction)):
         torch.testing.assert_close(one[:, plain.alive], other[:, plain.alive], rtol=0, atol=1e-10)
 
+    def gradient(behind):
+        heights = dome().heights.clone().requires_grad_()
+        found = behind(rays, interface_of(replace(dome(), heights=heights), law=law))
+        weight = uniform((2, 3, *rays.flux.shape), 2)
+        both = weight[0] * found.position / 15.0 + weight[1] * found.direction
+        return torch.autograd.grad(torch.where(found.alive, both, 0.0).sum(), heights)[0]
+
+    one, other = gradient(trace.behind), gradient(lambda rays, face: cross(rays, face).rays)
+    torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-10 * float(other.abs().max()))
+
 
 def test_the_gradient_is_finite_differences():
     """The kernel's adjoint against the kernel's values, from a source beside the centre."""
