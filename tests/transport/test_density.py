@@ -21,6 +21,14 @@ from bstcad.transport.density import (
 )
 
 
+def test_a_function_has_its_means_over_cells():
+    """The midpoint rule is exact for a plane."""
+    middle = (np.arange(10) + 0.5) / 10
+    plane = 1.0 + middle[:, None] - 0.5 * middle[None, :]
+    found = Density.from_function(lambda x, y: 1.0 + x - 0.5 * y, 10, samples=3)
+    np.testing.assert_allclose(found.values, plane / plane.mean(), rtol=1e-13)
+
+
 def test_picture_keeps_mass_by_area_for_sizes_that_do_not_divide():
     picture = np.random.default_rng(0).random((37, 53))
     d = Density.from_picture(picture, 20, width=1.0, height=1.0)
