@@ -192,7 +192,6 @@ def scene_of(tmp_path, **more):
     return bstcad.load(path)
 
 
-@suite.in_turn(0, 2)
 def test_two_pictures_are_met_together(tmp_path):
     first = TWO["target"]
     scene = scene_of(tmp_path, target=[first, first | {"z": 80.0}])
