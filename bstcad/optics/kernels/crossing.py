@@ -43,14 +43,29 @@ NORM, COS_OUT, SHIFT, E_X, E_Y, E_Z = (WORK + BLOCK * k for k in range(14, 20))
 CROSSING_WORK, ADJOINT_WORK = WORK + 3 * BLOCK, WORK + 20 * BLOCK  # lengths of `work`
 
 
+@njit(inline="always")
+def is_axial(direction):
+    """Return True for light along the axis, which has no array of directions."""
+    return direction.shape[1] == 0
+
+
 @njit(error_model="numpy")
 def load(position, direction, status, first, count, work):
-    """Load rays first … first + count - 1; status (k, n): a ray is lost if its status is so for all k screens."""
+    """Load rays first … first + count - 1; status (k, n): a ray is lost if its status is so for all k screens.
+
+    direction: (3, n), or (3, 0) for light along the axis.
+    """
     for r in range(count):
         at = first + r
         work[X + r], work[Y + r], work[Z + r] = position[0, at], position[1, at], position[2, at]
-        work[DX + r], work[DY + r], work[DZ + r] = direction[0, at], direction[1, at], direction[2, at]
         work[FATE + r], work[FLUX + r] = status[0, at], 1.0
+    if is_axial(direction):
+        for r in range(count):
+            work[DX + r], work[DY + r], work[DZ + r] = 0.0, 0.0, 1.0
+    else:
+        for r in range(count):
+            at = first + r
+            work[DX + r], work[DY + r], work[DZ + r] = direction[0, at], direction[1, at], direction[2, at]
     for k in range(1, status.shape[0]):
         for r in range(count):
             work[FATE + r] = work[FATE + r] if status[k, first + r] != 0 else 0.0
@@ -90,11 +105,15 @@ def _cross(net, faces, screens, width, position, direction, status, outs, hits, 
     for begin in range(first, last, BLOCK):
         count = min(BLOCK, last - begin)
         load(position, direction, status, begin, count, work)
-        forward.start_search(net, faces, count, work)
-        forward.to_net(faces, count, work)
-        if width >= BLOCK:  # the rows before are in earlier blocks
-            _start_beside(width, first, begin, count, status, path, work)
-        forward.search(net, faces, count, work, active)
+        if is_axial(direction):
+            forward.to_net(faces, count, work)
+            forward.search_along_axis(net, faces, count, work)
+        else:
+            forward.start_search(net, faces, count, work)
+            forward.to_net(faces, count, work)
+            if width >= BLOCK:  # the rows before are in earlier blocks
+                _start_beside(width, first, begin, count, status, path, work)
+            forward.search(net, faces, count, work, active)
         forward.at_back(faces, count, work)
         for r in range(count):
             path[begin + r] = work[Z + r] + work[S + r]
@@ -147,9 +166,12 @@ def store_directions(count, work, first, direction, outs):
     for r in range(count):
         at, alive = first + r, work[FATE + r] == 0.0
         hit[2, at] = work[Z + r] if alive else 0.0
-        behind[0, at] = work[DX + r] if alive else direction[0, at]
-        behind[1, at] = work[DY + r] if alive else direction[1, at]
-        behind[2, at] = work[DZ + r] if alive else direction[2, at]
+        if alive:
+            behind[0, at], behind[1, at], behind[2, at] = work[DX + r], work[DY + r], work[DZ + r]
+        elif is_axial(direction):
+            behind[0, at], behind[1, at], behind[2, at] = 0.0, 0.0, 1.0
+        else:
+            behind[0, at], behind[1, at], behind[2, at] = direction[0, at], direction[1, at], direction[2, at]
 
 
 # --- the adjoint ------------------------------------------------------------------------------------------------------
@@ -369,7 +391,7 @@ def _cross_adjoint(net, faces, screens, position, direction, status, hits, g, mo
     for begin in range(first, last, BLOCK):
         count = min(BLOCK, last - begin)
         load(position, direction, status, begin, count, work)
-        flat = d_rays is None and forward.are_axial(count, work)  # the slopes at the hit do not change with the path
+        flat = d_rays is None and is_axial(direction)  # the slopes at the hit do not change with the path
         _restore_hit(net, faces, flat, path, begin, count, work)
         _leave(faces, count, work)
         load_gradient(faces, screens, g, more, status, begin, count, work)
@@ -388,6 +410,7 @@ class Form(NamedTuple):
     adjoint: Callable[..., None]  # adjoint of `cross`, as `_cross_adjoint`
     hits: int  # number of arrays (n,) that `cross` stores for `adjoint`; the first is the path to the face (mm)
     prepare: Callable[[Rays, Interface], tuple[Rays, Tensor, Any]]  # (rays to be traced, nets, face as numbers)
+    knows_axis: bool = False  # True if light along the axis needs no directions: their array is (3, 0)
 
 
 class Crossing(NamedTuple):
@@ -408,7 +431,7 @@ class Crossing(NamedTuple):
 class Cross(torch.autograd.Function):
     """Map (nets, position (3, n), direction (3, n), status (n,), crossing) to (status, path, cos θ, *outs).
 
-    nets: heights (1, m, n), or the components (3, m, n) of control points (mm).
+    nets: heights (1, m, n), or the components (3, m, n) of control points (mm).  direction: (3, 0) along the axis.
     outs: landing points (2, n) mm for each screen; or, if rays go on, hit (mm) and direction behind the face, (3, n)
     each.  status: (screens, n), or (1, n).  path (n,) to the face (mm) and cos θ (n,) of incidence have a gradient if
     `crossing.lossy`; otherwise cos θ is empty.  The gradient is taken in heights, positions and directions, where
@@ -477,7 +500,7 @@ def prepare_heights(rays: Rays, interface: Interface) -> tuple[Rays, Tensor, Fac
     return rays, -heights if rays.sense < 0 else heights, faces
 
 
-HEIGHTS = Form(_cross, _cross_adjoint, 1, prepare_heights)
+HEIGHTS = Form(_cross, _cross_adjoint, 1, prepare_heights, knows_axis=True)
 
 
 def landed(rays: Rays, interface: Interface, planes: Sequence[Receiver], form: Form = HEIGHTS) -> tuple[Landed, ...]:
@@ -503,10 +526,14 @@ def _across(
     """Return (status for each plane; rays behind the face, with old positions and directions; `outs` of `Cross`)."""
     shape, lossy = rays.status.shape, bool(interface.losses)
     rays, nets, faces = form.prepare(rays, interface)
-    vectors = (reflect_z(t, rays.sense).reshape(3, -1).contiguous() for t in (rays.position, rays.direction))
+    position, direction = (
+        reflect_z(t, rays.sense).reshape(3, -1).contiguous() for t in (rays.position, rays.direction)
+    )
+    if rays.axial and form.knows_axis and not (position.requires_grad or direction.requires_grad):
+        direction = direction[:, :0]
     screens = kernel_arguments.screens(interface, planes, rays.sense) if planes else None
     status, path, cos_in, *outs = Cross.apply(
-        nets, *vectors, rays.status.reshape(-1), Crossing(form, faces, screens, lossy, width=shape[-1]),
+        nets, position, direction, rays.status.reshape(-1), Crossing(form, faces, screens, lossy, width=shape[-1]),
     )  # fmt: skip
     status = status.view(len(status), *shape)
     traced = replace(rays, status=status.amin(0) if len(status) > 1 else status[0])  # lost: on none of the planes

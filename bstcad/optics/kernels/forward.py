@@ -145,21 +145,29 @@ def are_axial(count, work):
 
 
 @njit(error_model="numpy", fastmath={"contract"})
+def search_along_axis(net, faces, count, work):
+    """Find the path and store what `search` stores, for rays along the axis, whose u and v are those of the hit."""
+    last_u, last_v = faces.m - 1.0, faces.n - 1.0
+    for r in range(count):
+        u, v = work[U + r], work[V + r]
+        work[U + r], work[V + r] = (u if u > 0.0 else 0.0), (v if v > 0.0 else 0.0)  # 0 if it is not a number
+    for r in range(count):
+        u, v = min(work[U + r], last_u), min(work[V + r], last_v)
+        work[SAG + r], work[SLOPE_X + r], work[SLOPE_Y + r] = sag(net, faces.m, faces.n, u, v)
+    for r in range(count):
+        work[S + r] = work[SAG + r] / work[DZ + r]
+
+
+@njit(error_model="numpy", fastmath={"contract"})
 def search(net, faces, count, work, active):
     """Find path s from the net's plane to the back by Newton steps of all rays in turn, as `interfaces._newton` does.
 
     On return `work` contains s after a ray's last step, and sag and slopes (in u and v) before that step.
     """
-    last_u, last_v, floor = faces.m - 1.0, faces.n - 1.0, faces.rules.min_derivative
     if are_axial(count, work):
-        for r in range(count):
-            u, v = work[U + r], work[V + r]
-            u, v = (u if u > 0.0 else 0.0), (v if v > 0.0 else 0.0)  # 0 if it is not a number
-            work[SAG + r], work[SLOPE_X + r], work[SLOPE_Y + r] = sag(
-                net, faces.m, faces.n, min(u, last_u), min(v, last_v)
-            )
-            work[S + r] = work[SAG + r] / work[DZ + r]
+        search_along_axis(net, faces, count, work)
         return
+    last_u, last_v, floor = faces.m - 1.0, faces.n - 1.0, faces.rules.min_derivative
     searching = 0
     for r in range(count):
         active[searching] = r
