@@ -351,7 +351,7 @@ def compiled_functions():
         for node in nodes(tree(file)):
             if isinstance(node, ast.FunctionDef):
                 decorators = {ast.unparse(each).partition("(")[0] for each in node.decorator_list}
-                if decorators & {"njit", "compiled", "compiled_kernel", "inlined"}:
+                if decorators & {"njit", "compiled", "compiled_kernel", "inlined", "instructions"}:
                     yield node.name
 
 

@@ -526,14 +526,13 @@ def _across(
     """Return (status for each plane; rays behind the face, with old positions and directions; `outs` of `Cross`)."""
     shape, lossy = rays.status.shape, bool(interface.losses)
     rays, nets, faces = form.prepare(rays, interface)
-    position, direction = (
-        reflect_z(t, rays.sense).reshape(3, -1).contiguous() for t in (rays.position, rays.direction)
-    )
-    if rays.axial and form.knows_axis and not (position.requires_grad or direction.requires_grad):
-        direction = direction[:, :0]
+    given = rays.position, rays.direction
+    if rays.axial and form.knows_axis and not any(t.requires_grad for t in given):
+        given = rays.position, rays.direction[..., :0]
+    vectors = (reflect_z(t, rays.sense).reshape(3, -1).contiguous() for t in given)
     screens = kernel_arguments.screens(interface, planes, rays.sense) if planes else None
     status, path, cos_in, *outs = Cross.apply(
-        nets, position, direction, rays.status.reshape(-1), Crossing(form, faces, screens, lossy, width=shape[-1]),
+        nets, *vectors, rays.status.reshape(-1), Crossing(form, faces, screens, lossy, width=shape[-1]),
     )  # fmt: skip
     status = status.view(len(status), *shape)
     traced = replace(rays, status=status.amin(0) if len(status) > 1 else status[0])  # lost: on none of the planes

@@ -16,6 +16,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
+from bstcad.optics.kernels.wide import add_to_span
 from bstcad.optics.numerics import reductions
 from bstcad.optics.numerics.compiling import compiled
 from bstcad.optics.numerics.reductions import on_threads
@@ -118,58 +119,36 @@ def curved(net, m, n, u, v):
 
 
 @njit(inline="always")
-def _added(column, flat, tilt, b, q):
-    """Return column + b flat + q tilt, each three numbers."""
-    return (
-        column[0] + (flat[0] * b + tilt[0] * q),
-        column[1] + (flat[1] * b + tilt[1] * q),
-        column[2] + (flat[2] * b + tilt[2] * q),
-    )
-
-
-@njit(inline="always")
-def _add_columns(own, i, j, columns):
-    """Add three numbers each to the control points i … i + 2 of columns j, j + 1, …"""
-    for number, column in enumerate(columns):
-        own[i, j + number] += column[0]
-        own[i + 1, j + number] += column[1]
-        own[i + 2, j + number] += column[2]
+def _add_nine(own, i, j, along_u, along_v, g, g_u, g_v):
+    """Add g, g_u and g_v of a point to the nine control points from (i, j) on; the others: from `basis`."""
+    (a0, a2, p0, p2), (b0, b2, q0, q2) = along_u, along_v
+    for k, (a, p) in enumerate(((a0, -p0), (1.0 - a0 - a2, p0 - p2), (a2, p2))):
+        flat, tilted = a * g + p * g_u, a * g_v
+        own[i + k, j] += b0 * flat - q0 * tilted
+        own[i + k, j + 1] += (1.0 - b0 - b2) * flat + (q0 - q2) * tilted
+        own[i + k, j + 2] += b2 * flat + q2 * tilted
 
 
 @njit(error_model="numpy", fastmath={"contract"})
 def scatter(own, touched, u, v, g, g_u, g_v):
-    """Add g, g_u, g_v of points (n,) to their nine control points, the transpose of `sag`; own: see reductions.py.
-
-    Sums over consecutive points with the same control points stay in registers: a processor waits some ten cycles to
-    read a number that it has just written.  If v moves to the next span, two of the three columns stay.
-    """
-    m, n = own.shape
-    i = j = -1
-    zero = (0.0, 0.0, 0.0)
-    left, middle, right = zero, zero, zero  # sums for the control points i … i + 2 in columns j, j + 1 and j + 2
+    """Add g, g_u, g_v of points (n,) to their nine control points, the transpose of `sag`; own: see reductions.py."""
+    (m, n), row = own.shape, -1
     for r in range(u.size):
         h, h_u, h_v = float(g[r]), float(g_u[r]), float(g_v[r])
         if h == 0.0 and h_u == 0.0 and h_v == 0.0:
             continue
-        k, a0, a2, p0, p2 = basis(float(u[r]), m)
-        c, b0, b2, q0, q2 = basis(float(v[r]), n)
-        if k != i or c != j:
-            if k == i and c == j + 1:
-                _add_columns(own, i, j, (left,))
-                left, middle, right = middle, right, zero
-            else:
-                if i >= 0:
-                    _add_columns(own, i, j, (left, middle, right))
-                reductions.clear(own, touched, k, k + 3)
-                left, middle, right = zero, zero, zero
-            i, j = k, c
-        a1, p1, b1, q1 = 1.0 - a0 - a2, p0 - p2, 1.0 - b0 - b2, q0 - q2
-        flat, tilt = (a0 * h - p0 * h_u, a1 * h + p1 * h_u, a2 * h + p2 * h_u), (a0 * h_v, a1 * h_v, a2 * h_v)
-        left = _added(left, flat, tilt, b0, -q0)
-        middle = _added(middle, flat, tilt, b1, q1)
-        right = _added(right, flat, tilt, b2, q2)
-    if i >= 0:
-        _add_columns(own, i, j, (left, middle, right))
+        a, b = float(u[r]) - 0.5, float(v[r]) - 0.5
+        i, j = int(a), int(b)
+        if 1.0 <= a <= m - 3.0 and 1.0 <= b < n - 4.0:  # the fourth number lies in the same row
+            if i != row:
+                reductions.clear(own, touched, i, i + 3)
+                row = i
+            add_to_span(own, np.uint64(i * n + j), np.uint64(n), a - i, b - j, h, h_u, h_v)
+        else:
+            i, a0, a2, p0, p2 = basis(float(u[r]), m)
+            j, b0, b2, q0, q2 = basis(float(v[r]), n)
+            reductions.clear(own, touched, i, i + 3)
+            _add_nine(own, i, j, (a0, a2, p0, p2), (b0, b2, q0, q2), h, h_u, h_v)
 
 
 @njit(error_model="numpy", inline="always")
