@@ -85,7 +85,8 @@ def test_a_stage_hands_on_its_best_lens(monkeypatch):
     on_few, on_all = (judged[name] for name in names(made)[-1:-3:-1])
     assert on_few > 1.2 * on_all  # else there is nothing to see here
     assert judged[BEST_LENS_STAGE] < 1.05 * on_all
-    assert rrmsd(made) == pytest.approx(judged[BEST_LENS_STAGE], rel=0.05)
+    # few rays rate the lens, whose RRMSD is known to 6 %; the lens that is not the best is 20 % off
+    assert rrmsd(made) == pytest.approx(judged[BEST_LENS_STAGE], rel=0.1)
 
 
 @suite.in_turn(1, 2)
