@@ -343,7 +343,7 @@ class _Sweep:
         points = (point for point in self._order if point not in self.runs)
         waiting = [ColdRun(settings=point, predicted_seconds=self._predicted(point), **unset) for point in points]
         runs = [self.runs[point] for point in self._order if point in self.runs]
-        result = table(self._base, self._knobs, [*runs, *waiting], self._budget)
+        result = table(self._base, self._knobs, [*runs, *waiting], self._budget, reference=self._reference)
         results.write(result, self._folder)
         return result
 
@@ -397,8 +397,14 @@ def predicted_work(scene: Scene, point: Settings) -> tuple[bool, float]:
 # --- the table --------------------------------------------------------------------------------------------------------
 
 
-def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: float = math.inf) -> TradeoffTable:
-    """Return the table of a sweep.  runs: ended runs, then runs not done, both in order of importance; budget in s."""
+def table(
+    scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: float = math.inf,
+    reference: Effort = REFERENCE_EFFORT,
+) -> TradeoffTable:  # fmt: skip
+    """Return the table of a sweep.  runs: ended runs, then runs not done, both in order of importance; budget in s.
+
+    reference: effort of the measurement of each lens.
+    """
     own, best = scene.lens.back.net, pareto_front(runs)
     comparable = {run.settings: run for run in runs if run.comparable}
     selected = comparable or {run.settings: run for run in runs if run.done}
@@ -427,7 +433,7 @@ def table(scene: Scene, knobs: Sequence[Knob], runs: Sequence[ColdRun], budget: 
         versions=sample.versions if sample else {},
         reference={
             "rays": sorted({run.rays for run in runs if run.rays}),
-            "what": REFERENCE_TEXT.format(REFERENCE_EFFORT.accuracy, _judged_on(scene.targets)),
+            "what": REFERENCE_TEXT.format(reference.accuracy, _judged_on(scene.targets)),
         },
         calibration=Calibration.of(unit),
         runs=tuple(map(described, runs)),

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 
 import bstcad
+from bstcad.optics.trace.measure import Effort
 from bstcad.planning import cold_run, results, tradeoff
 from bstcad.planning.cold_run import sorted_settings
 from bstcad.planning.results import TRADEOFF_COLUMNS
@@ -192,3 +193,10 @@ OF_A_RUN = """
     settings status reason where seconds cpu_seconds kernel_seconds cost_seconds predicted_seconds peak_memory_gb rrmsd
     rrmsd_half rrmsd_noise rays rrmsd_reported rrmsd_noise_reported passed net stages label knobs units on_front
 """
+
+
+def test_the_table_states_the_effort_of_its_own_reference(tiny, tmp_path):
+    found = tradeoff.tradeoff(
+        tiny, tmp_path / "s", budget=0.1, machines=Synthetic(tiny), reference=Effort(accuracy=0.02)
+    )
+    assert "below 2.00% of the RRMSD" in found.reference["what"]
