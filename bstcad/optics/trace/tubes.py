@@ -1,7 +1,8 @@
 """Flux tubes: a grid of rays whose quads carry the light and are clipped exactly at the pixel borders.
 
 The corners of a grid of tubes are traced to the screen.  A tube of flux F lands on two triangles.  Each carries F / 2,
-spread uniformly over its area, and each pixel receives the part inside it.  The picture has no noise: its error is that
+or the share of its area where both differ little (`triangle_fluxes`), spread uniformly over its area, and each pixel
+receives the part inside it.  The picture has no noise: its error is that
 of linear interpolation between the corners and falls nearly as the square of their distance.  The picture is
 differentiable in the landing points, whereas the number of rays in a pixel is not.
 """
@@ -38,6 +39,9 @@ MAX_BAND_TUBES = 1 << 19  # maximum tubes traced at a time for a picture, which 
 MAX_RAYS_PER_BAND = 1 << 17  # maximum rays traced at a time in plain torch, a megabyte per coordinate
 PARTS_PER_SIDE = 4  # parts per side into which a partly lit tube is divided
 MIN_TRIANGLE_AREA = 1e-9  # smallest area of a triangle that is clipped (pixel²); smaller triangles count in one pixel
+# Difference of the areas of a tube's triangles, relative to their sum, up to which the tube has one density, so that
+# the diagonal between them need not be followed; and difference from which on each triangle has half of the flux.
+EVEN_TUBE, UNEVEN_TUBE = 0.03, 0.12
 COARSE_GRID_POINTS = 33  # points per side of the coarse grid on which `rays_to` solves first
 
 PIXELS: Scale = (0.0, 0.0, 1.0, 1.0)  # scale of corners in pixels
@@ -416,7 +420,7 @@ def collect(corner: Tensor, flux: Tensor, shape: tuple[int, int], scale: Scale =
     outside: Σ flux · (mean squared distance of corners to the picture, pixel²), so that light outside has a gradient.
     """
     if corner.dtype == torch.float64 and (fast := kernel_choice.kernel("tubes.collect", corner)):
-        return fast(corner, flux, (shape, scale), MIN_TRIANGLE_AREA)
+        return fast(corner, flux, (shape, scale), (MIN_TRIANGLE_AREA, EVEN_TUBE, UNEVEN_TUBE))
     return collect_plain(corner, flux, shape, scale)
 
 
@@ -430,8 +434,8 @@ def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int], scale: S
     outside = total(flux * middle(off))
     rows, columns = shape
     first, second, third = triangles(corner)
-    flux = torch.cat([flux.reshape(-1) / 2] * 2)
     area = ((second - first)[0] * (third - first)[1] - (third - first)[0] * (second - first)[1]) / 2
+    flux = triangle_fluxes(flux.reshape(-1), area)
     cell = torch.stack([p.detach().floor() for p in (first, second, third)])
     whole = (cell == cell[0]).all(0).all(0) | (area.detach().abs() < MIN_TRIANGLE_AREA)
     sums = torch.zeros(rows * (columns + 1), dtype=corner.dtype, device=corner.device)
@@ -457,6 +461,24 @@ def collect_plain(corner: Tensor, flux: Tensor, shape: tuple[int, int], scale: S
         index = (row * (columns + 1) + column.clamp(min=0)).long()
         sums = sums.index_add(0, index, share * (1 - offset)).index_add(0, index + 1, share * offset)
     return sums.view(rows, columns + 1).cumsum(1)[:, :columns], outside
+
+
+def triangle_fluxes(flux: Tensor, area: Tensor) -> Tensor:
+    """Return the flux of the first triangles (n,) and of the second triangles of tubes, (2 n,).
+
+    flux F (n,): that of the tubes.  area (2 n,): signed areas A_1 and A_2 of the triangles (pixel²).  A triangle has
+
+        F ((1 - w) A_k / (A_1 + A_2) + w / 2),   w = 3 t² - 2 t³,   t = (|A_1 - A_2| / |A_1 + A_2| - ε_0) / (ε_1 - ε_0),
+
+    with t between 0 and 1, ε_0 = EVEN_TUBE and ε_1 = UNEVEN_TUBE: one density for both where they are nearly alike.
+    """
+    one, two = area.chunk(2)
+    clipped = torch.minimum(one.abs(), two.abs()) >= MIN_TRIANGLE_AREA
+    alike = clipped & ((one - two).abs() < UNEVEN_TUBE * (one + two).abs())
+    whole = torch.where(alike, one + two, torch.ones_like(one))
+    t = ((((one - two) / whole).abs() - EVEN_TUBE) / (UNEVEN_TUBE - EVEN_TUBE)).clamp(0, 1)
+    apart = torch.where(alike, t * t * (3 - 2 * t), torch.ones_like(one))
+    return torch.cat([flux * ((1 - apart) * part / whole + apart / 2) for part in (one, two)])
 
 
 def triangles(corner: Tensor) -> tuple[Tensor, Tensor, Tensor]:
