@@ -259,12 +259,12 @@ def generate(
     device: Device = "auto", resume: Resume = False, verbose: Verbose = False,
 ) -> int:  # fmt: skip
     """Design a lens for a scene, write it, and verify the written files."""
+    commands = load_commands()
+    processes.begin(copied=True)
     with loading():
-        processes.begin()  # this process and the second one load their libraries at the same time
         wanted = load_scene(scene, settings, quality)
     folder = output or user_path(Path("outputs") / wanted.name)
     files.check_free(folder)
-    commands = load_commands()
     wanted, _ = with_net(wanted)
     if commands.folders.step_size(wanted) >= commands.folders.LARGE_STEP:
         note_on_stderr(commands.folders.size_sentence(wanted))
@@ -384,8 +384,8 @@ def verify(
 ) -> int:
     """Verify a lens from its written files, and write its report again."""
     beginning.check(path)
-    processes.begin()
     commands = load_commands()
+    processes.begin(copied=True)
     with progress.watch(Console(stderr=True)) as watched:
         found = commands.verify(path, against=split_names(against), measured=measured, progress=watched, place=output)
     return conclude(getattr(found, "contents", found), output or path, verbose)
@@ -400,8 +400,8 @@ def compensate(
     """Write the back to cut next, from measured points of the parts that were cut last."""
     from bstcad.manufacture.measured.compensation import CompensationSettings as CompensationSettings
 
-    processes.begin()
     commands = load_commands()
+    processes.begin(copied=True)
     with progress.watch(Console(stderr=True)) as watched:
         found = commands.compensate(folder, measured, CompensationSettings(gain, cutoff, by), progress=watched)
     print(found.sentences, f"Files: {found.folder}", sep="\n")
@@ -419,8 +419,8 @@ def retailor(folder: Folder, blank: AsBuiltBlank, output: Output = None, verbose
     from bstcad.manufacture.shop.as_built import AsBuilt
 
     built = AsBuilt.parse(",".join(blank))
-    processes.begin()
     commands = load_commands()
+    processes.begin(copied=True)
     with progress.watch(Console(stderr=True)) as watched:
         place, report, found = commands.retailor(folder, built, output, hooks=commands.Hooks(watched))
     print(found.sentence(report.contents.rrmsd))

@@ -26,6 +26,7 @@ from typing import TypeVar
 import numpy as np
 
 from bstcad.optics.receivers.irradiance import Screen
+from bstcad.optics.trace.source_images import convolved
 from bstcad.photometry.intensity import Intensity
 
 MAX_STRIPS, MIN_STRIPS = 2048, 4  # strips along x: of all pixels near a disc, and of each, exact along y
@@ -155,7 +156,6 @@ class LightSets:
     def _discs(self, radius: float | None) -> np.ndarray | None:
         """Return the means (sets, places) over all discs within the even part; None if no disc fits."""
         from scipy.ndimage import binary_erosion  # not loaded by the import of bstcad
-        from scipy.signal import oaconvolve
 
         (rows, columns), (width, height) = self.screen.shape, self.pixel
         radius = max(width, height) if radius is None else radius
@@ -171,7 +171,7 @@ class LightSets:
         fits = binary_erosion(self.even, kernel > 0)
         if not fits.any():
             return None
-        sums = [oaconvolve(each, kernel, mode="same")[fits] for each in (self.sizes, *self.flux)]
+        sums = [convolved(each, kernel)[fits] for each in (self.sizes, *self.flux)]
         return np.stack([each / sums[0] for each in sums[1:]])
 
     # ---- cut-off ----

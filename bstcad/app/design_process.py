@@ -113,6 +113,7 @@ def design(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool)
     from bstcad import commands
     from bstcad.scene.scene import load
 
+    processes.begin(copied=True)
     scene = load(run_folder / SCENE)
     hooks = commands.Hooks(ProgressFile(run_folder / PROGRESS), on_lens=LightSnapshot(scene, run_folder / LIGHT))
     report = commands.generate(scene, output, hooks=hooks, resume=resume, began=time.perf_counter())
