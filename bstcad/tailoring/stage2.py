@@ -478,8 +478,10 @@ def variables_of(task: Task, lens: Lens, pixels: int | None = None, level: float
     source, lens = task.heaviest.source, task.heaviest.through(lens)
     weights = [local_weight(source, lens, task.goals, number) for number in lens.tailored_numbers]
     if pixels is not None:
-        return NetVariables(tuple(map(CoarseVariable.of, nets, lens.nets, weights)))
-    blocks = tuple(SobolevVariable.of(net, weight, level=level) for net, weight in zip(nets, weights, strict=True))
+        each = zip(nets, lens.nets, weights, strict=True)
+        return NetVariables(tuple(CoarseVariable.of(*net, precision=torch.float32) for net in each))
+    pairs = zip(nets, weights, strict=True)
+    blocks = tuple(SobolevVariable.of(net, weight, level=level, precision=torch.float32) for net, weight in pairs)
     if lens.has_two_tailored_faces and len(task.goals) > 1:
         return NetVariables(blocks, *along_light(source, lens, task.goals))
     return NetVariables(blocks)
