@@ -35,7 +35,10 @@ DENSITY, AT_COLUMN, AT_ROW, START, INDEX, PART, MIDDLE, DEPTH, NEXT_X, NEXT_Y, S
     CORNER * 4 + LENGTH * k for k in range(14)
 )
 FIRST_Y, DX, DY, LEFT_OVER, PHI, WHOLE, SECOND, VALUE, BENEATH = (CORNER * 4 + LENGTH * k for k in range(14, 23))
-EDGES_END = CORNER * 4 + LENGTH * 23  # end of these quantities
+LAST_COLUMN, LAST_ROW = (
+    CORNER * 4 + LENGTH * k for k in (23, 24)
+)  # pixel of the end; rounding must not lead beyond it
+EDGES_END = CORNER * 4 + LENGTH * 25  # end of these quantities
 
 inlined = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 
@@ -104,6 +107,7 @@ def _first_pieces(starts, ends, count, first_column, columns_apart, work):
         next_y = (j + (1.0 if down > 0.0 else 0.0) - y) * spacing_y
         next_x, next_y = (next_x if (right != 0.0) & on else NO_BORDER), (next_y if (down != 0.0) & on else NO_BORDER)
         i, j = (i - first_column if on else 0.0), (j if on else 0.0)
+        last_i, last_j = (i + right if on else 0.0), (j + down if on else 0.0)
         end = next_x if next_x < next_y else next_y
         end = end if end < 1.0 else 1.0
         end = end if end > 0.0 else 0.0
@@ -113,10 +117,13 @@ def _first_pieces(starts, ends, count, first_column, columns_apart, work):
         spacing_x, spacing_y = abs(spacing_x), abs(spacing_y)
         goes_on = end < 1.0
         over_x, over_y = goes_on & (next_x < next_y), goes_on & (not (next_x < next_y))
-        work[AT_COLUMN + r], work[AT_ROW + r] = i + (step_x if over_x else 0.0), j + (step_y if over_y else 0.0)
+        i, j = i + (step_x if over_x else 0.0), j + (step_y if over_y else 0.0)
+        next_x, next_y = next_x + (spacing_x if over_x else 0.0), next_y + (spacing_y if over_y else 0.0)
+        work[AT_COLUMN + r], work[AT_ROW + r], work[LAST_COLUMN + r], work[LAST_ROW + r] = i, j, last_i, last_j
         work[NEXT_X + r], work[NEXT_Y + r] = (
-            next_x + (spacing_x if over_x else 0.0), next_y + (spacing_y if over_y else 0.0)
-        )  # fmt: skip
+            (next_x if i != last_i else NO_BORDER),
+            (next_y if j != last_j else NO_BORDER),
+        )
         work[SPACING_X + r], work[SPACING_Y + r] = spacing_x, spacing_y
         work[STEP_X + r], work[STEP_Y + r], work[START + r] = step_x, step_y, end
         work[FIRST_Y + r], work[DX + r], work[DY + r] = y, dx, dy
@@ -140,11 +147,12 @@ def _next_pieces(count, columns_apart, work):
         work[DEPTH + r] = work[FIRST_Y + r] + middle * work[DY + r] - j
         goes_on = end < 1.0
         over_x, over_y = goes_on & (next_x < next_y), goes_on & (not (next_x < next_y))
-        work[AT_COLUMN + r] = i + (work[STEP_X + r] if over_x else 0.0)
-        work[AT_ROW + r] = j + (work[STEP_Y + r] if over_y else 0.0)
-        work[NEXT_X + r] = next_x + (work[SPACING_X + r] if over_x else 0.0)
-        work[NEXT_Y + r] = next_y + (work[SPACING_Y + r] if over_y else 0.0)
-        work[START + r] = end
+        i, j = i + (work[STEP_X + r] if over_x else 0.0), j + (work[STEP_Y + r] if over_y else 0.0)
+        next_x = next_x + (work[SPACING_X + r] if over_x else 0.0)
+        next_y = next_y + (work[SPACING_Y + r] if over_y else 0.0)
+        work[AT_COLUMN + r], work[AT_ROW + r], work[START + r] = i, j, end
+        work[NEXT_X + r] = next_x if i != work[LAST_COLUMN + r] else NO_BORDER
+        work[NEXT_Y + r] = next_y if j != work[LAST_ROW + r] else NO_BORDER
         going_on += goes_on
     return going_on
 
@@ -230,9 +238,11 @@ def _add_left_over(flat, count, columns_apart, work):
                 break
             s = end
             if next_x < next_y:
-                i, next_x = i + work[STEP_X + r], next_x + work[SPACING_X + r]
+                i += work[STEP_X + r]
+                next_x = next_x + work[SPACING_X + r] if i != work[LAST_COLUMN + r] else NO_BORDER
             else:
-                j, next_y = j + work[STEP_Y + r], next_y + work[SPACING_Y + r]
+                j += work[STEP_Y + r]
+                next_y = next_y + work[SPACING_Y + r] if j != work[LAST_ROW + r] else NO_BORDER
 
 
 @njit(error_model="numpy")
@@ -330,9 +340,11 @@ def _integrate_left_over(flat, count, columns_apart, work):
                 break
             s = end
             if next_x < next_y:
-                i, next_x = i + work[STEP_X + r], next_x + work[SPACING_X + r]
+                i += work[STEP_X + r]
+                next_x = next_x + work[SPACING_X + r] if i != work[LAST_COLUMN + r] else NO_BORDER
             else:
-                j, next_y = j + work[STEP_Y + r], next_y + work[SPACING_Y + r]
+                j += work[STEP_Y + r]
+                next_y = next_y + work[SPACING_Y + r] if j != work[LAST_ROW + r] else NO_BORDER
         work[PHI + r], work[WHOLE + r], work[SECOND + r] = phi, whole, second
 
 

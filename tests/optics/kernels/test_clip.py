@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -167,6 +168,62 @@ def test_one_density_a_tube_costs_little_accuracy(n, monkeypatch):
     monkeypatch.undo()
     assert float((differences(waves(n)[0]) < tubes.EVEN_TUBE).double().mean()) > 0.1
     assert float((one - wanted).norm()) < 1.2 * float((two - wanted).norm())
+
+
+def on_borders(seed, columns, rows):
+    """Corners on the borders of pixels, or within rounding of them, some on the border of the screen or beyond it."""
+    random = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.linspace(-0.4, columns + 0.4, 31), np.linspace(-0.4, rows + 0.4, 140), indexing="ij")
+    corner = np.stack([x, y]) + random.normal(0, (0.1, 0.7)[seed % 2], (2, 31, 140))
+    near = np.round(corner * (1, 3)[seed % 3 > 0]) / (1, 3)[seed % 3 > 0]
+    near = np.clip(near, 0, np.array([columns, rows]).reshape(2, 1, 1))
+    near = np.where(random.random(near.shape) < 0.3, np.nextafter(near, random.choice([-9.0, 99.0], near.shape)), near)
+    return np.where(random.random(corner.shape) < 0.9, near, corner)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_rounding_leads_beyond_the_screen(seed):
+    """Around the sums lie numbers that nobody may change, and around the gradient of the picture nobody may read."""
+    columns, rows = 9, 13
+    corner, flux = on_borders(seed, columns, rows), np.random.default_rng(seed).random((30, 139))
+    if seed % 4 == 0:  # all of a part's light in few columns
+        corner[0] = corner[0] * 0.3 + 2.0
+    tube, scale, rules = (corner, tubes.PIXELS), tubes.PIXELS, (tubes.MIN_TRIANGLE_AREA, tubes.EVEN_TUBE, 0.12)
+    ranges, begins, far = np.empty((4, 2), np.int64), np.zeros(5, np.int64), np.zeros(4)
+    clip._column_ranges(*tube, columns, ranges)
+    begins[1:] = np.cumsum(np.maximum(ranges[:, 1] - ranges[:, 0], 1) * (rows + 1)) + 64 * np.arange(1, 5)
+    begins += 64  # untouched numbers before each part and after the last
+    sums = np.full(begins[-1] + 64, 7.0)
+    ends = begins[:-1] + np.maximum(ranges[:, 1] - ranges[:, 0], 1) * (rows + 1)
+    image = np.zeros((columns, rows))
+    for part in range(4):  # each by itself, since the kernel clears all between two begins
+        first, last = clip._rows_of(part, 4, 30)
+        own = np.array([begins[part], ends[part]])
+        clip._clip(
+            corner[:, first : last + 1],
+            scale,
+            flux[first:last],
+            rules,
+            (columns, rows),
+            ranges[part : part + 1],
+            own,
+            sums,
+            far[:1],
+        )
+        clip._running_sums(ranges[part : part + 1], own, sums, image_of := np.empty((columns, rows)))
+        image += image_of
+    used = np.zeros(sums.size, bool)
+    for first, last in zip(begins, ends, strict=False):
+        used[first:last] = True
+    assert (sums[~used] == 7.0).all()
+    plain, _ = tubes.collect_plain(torch.from_numpy(corner), torch.from_numpy(flux), (rows, columns))
+    np.testing.assert_allclose(image.T, plain.numpy(), atol=1e-9)
+    guarded = np.full(2 * columns * rows + 2 * rows * 4, np.nan)
+    both = guarded[4 * rows : -4 * rows].reshape(columns, rows, 2)
+    clip._with_sums_below(np.asfortranarray(seed_of((rows, columns)).numpy()), both)
+    d_corner, d_flux = np.zeros(corner.shape), np.empty(flux.shape)
+    clip.clip_adjoint(corner, scale, flux, rules, both, 0.3, d_corner, d_flux)
+    assert np.isfinite(d_corner).all() and np.isfinite(d_flux).all()
 
 
 def caustic(n, m):
