@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from bstcad.optics.numerics.reductions import dot, shift, total
+from bstcad.optics.numerics.reductions import dot, shift
 
 Objective = Callable[[list[Tensor]], tuple[float, list[Tensor], float]]  # parameters -> (merit, gradients, figure)
 
@@ -211,7 +211,7 @@ def _step(at: Callable[[Tensor], Values], search: LbfgsState) -> Generator[Query
     slope = dot(g, direction)
     if not slope < 0:
         return None
-    first = 1.0 if pairs else min(1.0, 1.0 / float(total(g.abs())))
+    first = 1.0 if pairs else value / dot(g, g)  # Polyak's step to a merit of 0, if the merit fell as its tangent does
 
     def along(step: float) -> LineSearch:
         value, gradient = yield from at(x + step * direction)
