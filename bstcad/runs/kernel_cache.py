@@ -3,6 +3,10 @@
 numba trusts the files of its cache: an empty or truncated file and a full disk raise errors, and a changed byte of
 machine code may end the process.  So each file ends with the SHA-256 of its content, and a kernel is compiled again
 if its files cannot be read, written or trusted.
+
+numba numbers the compiled forms of a function.  Two processes that compile it at the same time for other types of
+arguments give both forms one number, and the form that is saved last is then called for both: an array with gaps is
+read as one without.  So the file of a form is named after its types.
 """
 
 from __future__ import annotations
@@ -64,6 +68,25 @@ class CheckedCache(FunctionCache):  # type: ignore[misc]
 
 class _CheckedFiles(IndexDataCacheFile):  # type: ignore[misc]
     """Index of a function and its compiled forms, each in a file that ends with its SHA-256, which numba ignores."""
+
+    def save(self, key: Any, data: Any) -> None:
+        """Save a compiled form, before the index that has its key."""
+        self._save_data(self._data_name(key), data)
+        found = self._load_index()
+        if key not in found:
+            self._save_index({**found, key: self._data_name(key)})
+
+    def load(self, key: Any) -> Any:
+        """Return the compiled form of a key; None if there is none."""
+        if key not in self._load_index():
+            return None
+        with contextlib.suppress(OSError):
+            return self._load_data(self._data_name(key))
+        return None
+
+    def _data_name(self, key: Any) -> str:
+        """Return the name of a form's file.  key: types of the arguments, processor, digest of the function."""
+        return f"{Path(self._index_name).stem}.{sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
 
     def _load_index(self) -> Any:
         _check(Path(self._index_path))

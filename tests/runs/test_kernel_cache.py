@@ -6,6 +6,7 @@ import errno
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
 from numba.core.caching import IndexDataCacheFile
 
@@ -69,6 +70,25 @@ def test_damage_is_a_miss_and_is_repaired(place, damage, ending):
     assert hits(kernel()) == 0
     if damage is not unreadable:  # a folder stays
         assert hits(kernel()) == 1
+
+
+def test_two_processes_that_compile_at_once_do_not_mix_their_forms(place, monkeypatch):
+    gaps, none = np.arange(6.0)[::2], np.arange(3.0)  # an array whose numbers are not neighbours in memory, and another
+    first, second = (kernel_cache.compiled_kernel()(twice) for _ in range(2))
+    save_data = IndexDataCacheFile._save_data
+
+    def save_later(self, name, data):
+        """Save a form after the second process, which read the index when it was empty, has saved its own."""
+        monkeypatch.setattr(IndexDataCacheFile, "_save_data", save_data)
+        with monkeypatch.context() as before:
+            before.setattr(kernel_cache._CheckedFiles, "_load_index", lambda self: {})
+            second(gaps)
+        save_data(self, name, data)
+
+    monkeypatch.setattr(IndexDataCacheFile, "_save_data", save_later)
+    first(none)
+    for numbers in (gaps, none):
+        assert kernel_cache.compiled_kernel()(twice)(numbers).tolist() == (2 * numbers).tolist()
 
 
 def test_a_full_disk_keeps_nothing_and_stops_nothing(place, monkeypatch):
