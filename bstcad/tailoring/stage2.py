@@ -600,8 +600,9 @@ def compare_precisions(task: Task, lens: Lens) -> PrecisionComparison:
     Rounding can change where a line search ends, so the lenses may differ by more than rounding and be equally good.
     """
     lens = lens.with_nets(net.refined(coarser(net.shape, task.effort.compared_net)) for net in lens.nets)
+    variables = variables_of(task, lens.to(torch.float64))  # for both: on a target's edge, rounding changes weights
     (merit, gradient, single), (exact_merit, exact_gradient, double) = (
-        _tailor_briefly(task, lens.to(d)) for d in (torch.float32, torch.float64)
+        _tailor_briefly(task, lens.to(d), variables) for d in (torch.float32, torch.float64)
     )
     n, goal = round(side_factor(task.channels) * (task.effort.compared_tubes + 1)), task.goals[0]
     rrmsd = [rrmsd_by_tubes(end, task.channels, goal, n=n) for end in (single, double)]
@@ -622,12 +623,12 @@ def _relative(difference: float, *sizes: float) -> float:
     return difference / max(sizes) if difference else 0.0
 
 
-def _tailor_briefly(task: Task, lens: Lens) -> tuple[float, Tensor, Lens]:
+def _tailor_briefly(task: Task, lens: Lens, variables: NetVariables) -> tuple[float, Tensor, Lens]:
     """Return merit and gradient at the start, and the lens after a few evaluations, in the precision of `lens`."""
     n = min(task.effort.compared_tubes, task.settings.rays)
     merit = Merit.of(task.channels, lens, n, task.goals[:1], overshoot=task.settings.overshoot)
     merit = replace(merit, picture_error=task.merit)
-    problem, variables = Problem(lens, merit), variables_of(task, lens)
+    problem = Problem(lens, merit)
     value, gradients, _ = problem([net.heights for net in lens.nets])
     *_, last = minimise_merit(lens, problem, variables, task.effort.compared_evaluations)
     flat = torch.cat([g.reshape(-1).double().cpu() for g in gradients])

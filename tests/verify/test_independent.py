@@ -17,8 +17,8 @@ SIGMAS = 3
 
 @pytest.fixture(scope="module")
 def judged(small_design):
-    """The judge's figures of the small design: two million rays."""
-    return judge(small_design.folder, points=1 << 18, finer_targets=finer_targets(small_design.folder)[0])
+    """The judge's figures of the small design: four million rays."""
+    return judge(small_design.folder, points=1 << 19, finer_targets=finer_targets(small_design.folder)[0])
 
 
 @suite.in_turn(1, 2)
