@@ -168,13 +168,13 @@ def predicted_seconds(scene: Scene, pilot: Pilot) -> float:
 
 # Sizes (per side, or iterations) for which the following times (s) and memory (GB) are stated, on two cores of pace 1.
 UNIT_TUBES, UNIT_POINTS, UNIT_PIXELS, UNIT_GRID, UNIT_ITERATIONS = 1024, 513, 512, 256, 40
-KERNEL_SECONDS = 0.115  # time of an evaluation of cold_run.calibration_kernel; defines pace 1
+KERNEL_SECONDS = 0.08  # time of an evaluation of cold_run.calibration_kernel; defines pace 1
 ROUND_SECONDS, TRANSPORT_SECONDS, FIT_SECONDS = 0.06, 0.2, 0.6  # stage 1: rest of a round, transport, slope fit
 TWO_FACE_TRANSPORT_SECONDS = 2.4  # time of a transport for two freeform faces, with the trace between them
 TWO_FACE_SECONDS = 3.0  # additional time in stage 1 for two freeform faces of any size
 AIMING_SECONDS = 0.15  # time to find the rays from a point source through UNIT_TUBES² points of a face
 FRONT_SECONDS = 1.7  # time of the search for the free parameters of a front
-EVALUATION_SECONDS, VARIABLE_SECONDS, BLUR_SECONDS = 0.11, 0.046, 0.30  # time of the tubes, net, blur in an evaluation
+EVALUATION_SECONDS, VARIABLE_SECONDS, BLUR_SECONDS = 0.075, 0.03, 0.30  # time of the tubes, net, blur in an evaluation
 CALL_SECONDS = 0.01  # time in an evaluation that is independent of sizes
 IMAGE_SECONDS = 0.7  # time in a round for the images of an extended source
 ADAM_SECONDS = 0.1  # time of a step of Wang et al.'s procedure

@@ -77,7 +77,7 @@ class RatedLens:
 
 SIGNIFICANT_RATIO = 1.05  # smallest ratio of two figures that is significant: `TailoringEffort.stage` has errors of 5 %
 BEST_LENS_STAGE = "back to the best lens before"  # name, in the record of a design, of the return to an earlier lens
-TUBES_PER_SECOND = 4.7e6  # tubes traced per second, with the gradient of the merit, on a machine of pace 1
+TUBES_PER_SECOND = 7e6  # tubes traced per second, with the gradient of the merit, on a machine of pace 1
 RRMSD_SECONDS = 0.5  # seconds that `Task.rrmsd` takes on a machine of pace 1
 ROUGH_RAYS = 0.5  # rays per side, relative to `TailoringEffort.stage`, for an RRMSD known to some 15 %
 
