@@ -185,6 +185,14 @@ def load_commands() -> ModuleType:
     return commands
 
 
+def begin_commands() -> ModuleType:
+    """Import bstcad.commands, and start the second process."""
+    copied = processes.is_new()
+    commands = load_commands()
+    processes.begin(copied=copied)
+    return commands
+
+
 def load_scene(path: Path, settings: list[str] | None, quality: str | None = None) -> Scene:
     """Load a scene with the changes from --set and --quality."""
     from bstcad.scene.scene import load
@@ -259,8 +267,7 @@ def generate(
     device: Device = "auto", resume: Resume = False, verbose: Verbose = False,
 ) -> int:  # fmt: skip
     """Design a lens for a scene, write it, and verify the written files."""
-    commands = load_commands()
-    processes.begin(copied=True)
+    commands = begin_commands()
     with loading():
         wanted = load_scene(scene, settings, quality)
     folder = output or user_path(Path("outputs") / wanted.name)
@@ -384,8 +391,7 @@ def verify(
 ) -> int:
     """Verify a lens from its written files, and write its report again."""
     beginning.check(path)
-    commands = load_commands()
-    processes.begin(copied=True)
+    commands = begin_commands()
     with progress.watch(Console(stderr=True)) as watched:
         found = commands.verify(path, against=split_names(against), measured=measured, progress=watched, place=output)
     return conclude(getattr(found, "contents", found), output or path, verbose)
@@ -398,10 +404,9 @@ def compensate(
     folder: Folder, measured: Clouds, gain: Gain = None, cutoff: Cutoff = None, by: By = "form"
 ) -> int:  # fmt: skip
     """Write the back to cut next, from measured points of the parts that were cut last."""
+    commands = begin_commands()
     from bstcad.manufacture.measured.compensation import CompensationSettings as CompensationSettings
 
-    commands = load_commands()
-    processes.begin(copied=True)
     with progress.watch(Console(stderr=True)) as watched:
         found = commands.compensate(folder, measured, CompensationSettings(gain, cutoff, by), progress=watched)
     print(found.sentences, f"Files: {found.folder}", sep="\n")
@@ -419,8 +424,7 @@ def retailor(folder: Folder, blank: AsBuiltBlank, output: Output = None, verbose
     from bstcad.manufacture.shop.as_built import AsBuilt
 
     built = AsBuilt.parse(",".join(blank))
-    commands = load_commands()
-    processes.begin(copied=True)
+    commands = begin_commands()
     with progress.watch(Console(stderr=True)) as watched:
         place, report, found = commands.retailor(folder, built, output, hooks=commands.Hooks(watched))
     print(found.sentence(report.contents.rrmsd))

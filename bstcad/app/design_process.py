@@ -110,10 +110,11 @@ class LightSnapshot:
 
 def design(job: Mapping[str, Any], run_folder: Path, output: Path, resume: bool) -> State:
     """Design the scene of the run's folder into `output`; resume: continue from the checkpoint."""
+    copied = processes.is_new()
     from bstcad import commands
     from bstcad.scene.scene import load
 
-    processes.begin(copied=True)
+    processes.begin(copied=copied)
     scene = load(run_folder / SCENE)
     hooks = commands.Hooks(ProgressFile(run_folder / PROGRESS), on_lens=LightSnapshot(scene, run_folder / LIGHT))
     report = commands.generate(scene, output, hooks=hooks, resume=resume, began=time.perf_counter())

@@ -157,13 +157,18 @@ def begin(*, copied: bool = False) -> None:
     """Start the second process, unless it runs, and let it load its libraries; return without waiting for it.
 
     copied: start it as a copy of this process, which then need not load again what this process has loaded.  Only for a
-    program that has run nothing in threads yet.
+    program that has run nothing in threads yet (`is_new`): threads of OpenMP end in a copy, and its sums are wrong.
     """
     global _process
     if _process is None:
         if copied and _can_be_copied():
             _process = _start("fork")
         submit(load, *PRELOADED)
+
+
+def is_new() -> bool:
+    """Return True if this process has not loaded torch yet, so that nothing can have run in its threads."""
+    return "torch" not in sys.modules
 
 
 def _can_be_copied() -> bool:

@@ -145,6 +145,16 @@ def test_a_copy_keeps_what_is_loaded_unless_a_thread_runs(busy):
     assert done.stdout.split() == [str(copies), "True", "False", str(1 << 22)], done.stderr
 
 
+@pytest.mark.parametrize("used", [False, True])
+def test_a_command_copies_its_process_only_before_torch_has_run_in_threads(used):
+    """A command may be called in a process that has computed, as a test does; in its copy, sums would be wrong."""
+    code = "import os, sched\nfrom bstcad import cli\nfrom bstcad.runs import processes\n"
+    code += "import torch; torch.ones(1 << 22).sum()\n" if used else ""
+    code += "cli.begin_commands()\nprint(processes.submit(eval, \"'sched' in __import__('sys').modules\").result())\n"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.split() == [str(not used and sys.platform == "linux")], done.stderr
+
+
 def test_a_script_that_guards_nothing_is_not_run_twice(tmp_path):
     """Users' scripts begin with the design, not with `if __name__ == "__main__"`."""
     script = tmp_path / "script.py"
