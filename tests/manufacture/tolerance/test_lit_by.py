@@ -47,7 +47,7 @@ def test_another_light_is_that_of_its_rays(plate, distance):
     found = plate.lit_by("phone", distance=distance)
     scene, away = scene_lit_by(plate.scene, "phone", distance)
     assert away == distance and scene.source.position[2] == -distance
-    light = measure(plate.lens, scene.channels(64), scene.target.screen, plate.target, Effort(512, witness=False))
+    light = measure(plate.lens, scene.channels(64), scene.target.screen, plate.target, Effort(1024, witness=False))
     picture = light.picture / light.picture.sum()
     [goal] = found.goals
     differs = np.sqrt(((goal.lit - picture) ** 2).sum() / (picture**2).sum())
