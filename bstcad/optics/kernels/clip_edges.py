@@ -308,7 +308,7 @@ def integrals_along(g, starts, ends, count, to, work):
 
 @inlined
 def _integrate_pieces(flat, count, work):
-    for r in range(count):  # by itself, since loads from the picture are no vectors
+    for r in range(count):  # a loop of its own, since loads from the picture are no vectors
         at = np.uint64(2.0 * work[INDEX + r])
         work[VALUE + r], work[BENEATH + r] = flat[at], flat[at + np.uint64(1)]
     for r in range(count):
