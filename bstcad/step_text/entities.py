@@ -28,9 +28,11 @@ STRING = re.compile(  # text, perhaps with empty strings, then a string or comme
 )
 POINT_TEXT = re.compile(rf"(?<=;)#({ENTITY})=CARTESIAN_POINT\('\d*',\(({COORDINATE},{COORDINATE},{COORDINATE})\)\);")
 POINT_ROWS = re.compile(  # consecutive points as OCC writes them, nine tenths of a file; they need no other check
-    rf"(?<=;\n)((?:#[1-9]\d{{0,14}}+ = CARTESIAN_POINT\('',\({COORDINATE},\s*+{COORDINATE},\s*+{COORDINATE}\)\);\n)++)"
+    rf"(?<=;\n)(?:#[1-9]\d{{0,14}}+ = CARTESIAN_POINT\('',\({COORDINATE},\s*+{COORDINATE},\s*+{COORDINATE}\)\);\n)"
+    "{1,16384}+".encode()  # some 2 MB, so that the copies that the conversion to numbers makes stay small
 )
 POINTS_MARK = "\0"  # character that replaces consecutive points in the text
+REFERENCE_LIST = re.compile(r"#\d++(?:,#\d++)*+")
 STATEMENT = re.compile(rf"#({ENTITY})=([A-Z][A-Z_0-9]*)?(\(.*\))", re.DOTALL)
 TOKENS = re.compile(  # tokens without blanks: separators, references, numbers, strings, enumerations, keywords
     r"[(),;]++|(?:#\d{1,20}+,)++|#\d{1,20}+(?=[)=])=?|'\d*+'|\.[A-Z_0-9]++\.|[$*](?=[,)])|!?[A-Z_][A-Z_0-9]{0,99}+(?=\()"
@@ -92,43 +94,59 @@ def without_blanks(text: str) -> tuple[str, list[str]]:
     return data.encode("latin-1", "replace").translate(None, BLANKS).decode("latin-1"), strings
 
 
-def read_entities(text: str) -> tuple[str, Entities]:
-    """Return (text without blanks, strings and POINT_ROWS; entities) of a STEP file; ValueError if it is damaged."""
-    parts = [text] if POINTS_MARK in text else POINT_ROWS.split(text)
-    data, strings = without_blanks(POINTS_MARK.join(parts[::2]))
-    start, end = data.find("DATA;"), data.rfind("ENDSEC;")
-    if data.count(POINTS_MARK, start, end) != len(parts) // 2:  # points in a string, a comment or another section
-        parts = [text]
-        data, strings = without_blanks(text)
-        start, end = data.find("DATA;"), data.rfind("ENDSEC;")
-    if not 0 <= start < end:
-        raise damaged("it has no DATA section")
-    written = "".join(parts[1::2])[1:-4].replace(" = CARTESIAN_POINT('',(", ",").replace("));\n#", ",")
-    table = np.fromstring(written, dtype=np.float64, sep=",").reshape(-1, 4)  # numbers below 1e15 are exact
-    section = data[start + len("DATA") : end]  # begins with the semicolon
-    parts = POINT_TEXT.split(section.replace(POINTS_MARK, "") if written else section)
-    rest, names, values = "".join(parts[::3]), parts[1::3], parts[2::3]
+def read_entities(contents: bytes) -> tuple[str, Entities]:
+    """Return (header without blanks and strings, entities) of a STEP file; ValueError if it is damaged.
+
+    The text of the points is converted to numbers block by block, and not kept.
+    """
+    header, rest, strings, numbers, xyz = _statements_and_points(contents)
     *texts, tail = rest[1:].split(";")
     hits = [hit for each in texts if (hit := STATEMENT.fullmatch(each))]
     if tail or not hits or len(hits) < len(texts):
         raise damaged("a statement is not an entity")
     _check_tokens(rest, hits)
-    numbers = np.concatenate([table[:, 0].astype(np.int64), np.fromstring(",".join(names), dtype=np.int64, sep=",")])
-    xyz = np.concatenate([table[:, 1:], np.fromstring(",".join(values), dtype=np.float64, sep=",").reshape(-1, 3)])
-    known = np.sort(np.concatenate([numbers, np.array([hit[1] for hit in hits], dtype=np.int64)]))
-    if not (np.diff(known) > 0).all():
-        raise damaged("two entities share a number")
-    named = np.fromstring(",".join(re.findall(r"#(\d+)", rest)), dtype=np.int64, sep=",")
-    missing = named[known[np.searchsorted(known, named).clip(max=len(known) - 1)] != named]
-    if len(missing):
-        raise damaged(f"entity #{missing.min()} is missing")
+    _check_references(rest, np.concatenate([numbers, np.array([hit[1] for hit in hits], dtype=np.int64)]))
     if not np.isfinite(xyz).all():
         raise ValueError("a CARTESIAN_POINT is not finite; export the file again")
-    if np.abs(xyz).max(initial=0.0) > MAX_COORDINATE:
+    if max(xyz.max(initial=0.0), -xyz.min(initial=0.0)) > MAX_COORDINATE:
         raise ValueError(f"a CARTESIAN_POINT has a coordinate above {MAX_COORDINATE:g}; export the file again")
-    order = np.argsort(numbers)
-    bodies = {hit[1]: (hit[2] or "COMPLEX", hit[3]) for hit in hits}
-    return data, Entities(bodies, strings, numbers[order], xyz[order])
+    if not (np.diff(numbers) > 0).all():
+        order = np.argsort(numbers)
+        numbers, xyz = numbers[order], xyz[order]
+    return header, Entities({hit[1]: (hit[2] or "COMPLEX", hit[3]) for hit in hits}, strings, numbers, xyz)
+
+
+def _statements_and_points(contents: bytes) -> tuple[str, str, list[str], np.ndarray, np.ndarray]:
+    """Return (header, DATA section without points, strings; numbers (n,) and coordinates (n, 3) of the points)."""
+    parts, tables = _without_point_rows(contents)
+    data, strings = without_blanks(POINTS_MARK.join(parts))
+    start, end = data.find("DATA;"), data.rfind("ENDSEC;")
+    if data.count(POINTS_MARK, start, end) != len(tables):  # points in a string, a comment or another section
+        tables = []
+        data, strings = without_blanks(contents.decode("latin-1"))
+        start, end = data.find("DATA;"), data.rfind("ENDSEC;")
+    if not 0 <= start < end:
+        raise damaged("it has no DATA section")
+    section = data[start + len("DATA") : end]  # begins with the semicolon
+    parts = POINT_TEXT.split(section.replace(POINTS_MARK, "") if tables else section)
+    numbers = np.fromstring(",".join(parts[1::3]), dtype=np.int64, sep=",")
+    xyz = np.fromstring(",".join(parts[2::3]), dtype=np.float64, sep=",").reshape(-1, 3)
+    numbers = np.concatenate([*(table[:, 0].astype(np.int64) for table in tables), numbers])
+    xyz = np.concatenate([*(table[:, 1:] for table in tables), xyz])
+    return data[:start], "".join(parts[::3]), strings, numbers, xyz
+
+
+def _without_point_rows(contents: bytes) -> tuple[list[str], list[np.ndarray]]:
+    """Return (the text between POINT_ROWS, the numbers and coordinates of their points, each (n, 4))."""
+    if POINTS_MARK.encode() in contents:
+        return [contents.decode("latin-1")], []
+    parts, tables, end = [], [], 0
+    for rows in POINT_ROWS.finditer(contents):
+        parts.append(contents[end : rows.start()].decode("latin-1"))  # Part 21 is ASCII; latin-1 never fails
+        numbers = rows[0][1:-4].replace(b" = CARTESIAN_POINT('',(", b",").replace(b"));\n#", b",")
+        tables.append(np.fromstring(numbers, dtype=np.float64, sep=",").reshape(-1, 4))  # numbers below 1e15 are exact
+        end = rows.end()
+    return [*parts, contents[end:].decode("latin-1")], tables
 
 
 def required(hit: re.Match[str] | None) -> re.Match[str]:
@@ -189,6 +207,18 @@ def _check_tokens(rest: str, hits: Sequence[re.Match[str]]) -> None:
             if pattern is LONG_NUMBER or not math.isfinite(float(found[0])):
                 number = rest[: found.start()].rpartition(";")[2].partition("(")[0].replace("=", " = ")
                 raise damaged(f"statement {number} is malformed: the number {_shorten(found[0])} {fault}")
+
+
+def _check_references(rest: str, known: np.ndarray) -> None:
+    """Raise ValueError if the text `rest` refers to an entity that is not one of `known`, or if two share a number."""
+    known = np.sort(known)
+    if not (np.diff(known) > 0).all():
+        raise damaged("two entities share a number")
+    lists = (np.fromstring(hit[0].replace("#", ""), dtype=np.int64, sep=",") for hit in REFERENCE_LIST.finditer(rest))
+    named = np.concatenate([np.empty(0, dtype=np.int64), *lists])
+    missing = named[known[np.searchsorted(known, named).clip(max=len(known) - 1)] != named]
+    if len(missing):
+        raise damaged(f"entity #{missing.min()} is missing")
 
 
 def _shorten(word: str) -> str:

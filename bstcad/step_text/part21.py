@@ -164,7 +164,7 @@ def _parse(text: bytes) -> StepText:
         raise ValueError(fault)
     if b"END-ISO-10303-21;" not in text[-200:]:
         raise ValueError("the file is truncated (no END-ISO-10303-21 at its end); export or copy it again")
-    data, entities = read_entities(text.decode("latin-1"))  # Part 21 is ASCII; latin-1 never fails
+    header, entities = read_entities(text)
     lengths, angles = (_units(kind, entities) for kind in ("LENGTH", "PLANE_ANGLE"))
     if len(lengths) != 1:
         raise ValueError(f"its units of length are {' and '.join(lengths) or 'not stated'}; export it in millimetres")
@@ -180,7 +180,7 @@ def _parse(text: bytes) -> StepText:
         product=_product(entities),
         unit=unit,
         angle=", ".join(angles) or "radian",
-        schema=_schema(data, entities.strings),
+        schema=_schema(header, entities.strings),
         solids=len(solids),
         faces=len(_shell_faces(entities)),
         surface=surface,
@@ -191,8 +191,8 @@ def _parse(text: bytes) -> StepText:
     )
 
 
-def _schema(data: str, strings: Sequence[str]) -> str:
-    schema = re.search(r"FILE_SCHEMA\(\('(\d*)'", data)
+def _schema(header: str, strings: Sequence[str]) -> str:
+    schema = re.search(r"FILE_SCHEMA\(\('(\d*)'", header)
     if schema is None:
         raise ValueError("the header has no FILE_SCHEMA; export the file again")
     return one_line(strings[int(schema[1])])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bstcad.step_text import part21
+from bstcad.step_text.entities import read_entities
 
 HEAD = "ISO-10303-21;\nHEADER;\nFILE_SCHEMA(('AP242_X'));\nENDSEC;\nDATA;\n"
 TAIL = "ENDSEC;\nEND-ISO-10303-21;\n"
@@ -47,6 +48,16 @@ def test_the_surface_is_read_as_it_stands():
 def test_points_within_a_comment_or_a_string_are_no_points(begin, end):
     found = part21.parse(text(product=PRODUCT + begin + POINTS + end))  # else two entities would share a number
     assert np.array_equal(found.surface.control_points, NET)
+
+
+@pytest.mark.parametrize("step", [1, -1], ids=["ascending", "descending"])
+def test_points_are_read_in_blocks(step):
+    """40,000 points, which no entity names, are more than two blocks."""
+    numbers = np.arange(1_000, 41_000)
+    rows = "".join(f"#{n} = CARTESIAN_POINT('',({n}.,-{n}.5,1.E-03));\n" for n in numbers[::step])
+    _, found = read_entities(text(points=POINTS + rows).encode())
+    assert np.array_equal(found.points(numbers), np.stack([numbers, -numbers - 0.5, np.full(40_000, 1e-3)], axis=-1))
+    assert np.array_equal(found.points(np.arange(1, 17)), NET.reshape(-1, 3))
 
 
 def test_names_units_and_schema():
