@@ -486,7 +486,7 @@ FLOWN = 4  # number of planned scenes of which the last has a real pilot; each h
 
 
 def pilots():
-    """Yield functions that give the pilots of a scene: a real one is one more design, of the same choices."""
+    """Yield functions that give the pilot of a scene: a real one is one more design, of the same choices."""
     real = partial(run_pilot, size=PILOT, rays=PILOT_RAYS)
     return itertools.cycle([*(FLOWN - 1) * [typical_pilot], real])
 

@@ -109,10 +109,10 @@ def test_a_back_that_would_reach_the_front_or_the_target_is_refused():
     near = small("thu", **{"target.z": "24.0"})
     lens = near.flat_lens(near.lens.back.net)
     with pytest.raises(SceneError, match=r"^lens\.front\.z: .* 0\.5 mm"):
-        pipeline.check_thickness(lens.with_back(lens.back.moved(lens.front.z - 0.5)), near)
+        pipeline.check_thickness(lens.with_back(lens.back.moved(lens.front.z - 0.5)), near, 257)
     with pytest.raises(SceneError, match=r"^target\.z: .* z = 24\.5"):
-        pipeline.check_thickness(lens.with_back(lens.back.moved(24.5)), near)
-    pipeline.check_thickness(lens.with_back(lens.back.moved(23.5)), near)
+        pipeline.check_thickness(lens.with_back(lens.back.moved(24.5)), near, 257)
+    pipeline.check_thickness(lens.with_back(lens.back.moved(23.5)), near, 257)
 
 
 @suite.in_turn(0, 2)

@@ -101,9 +101,9 @@ def _range(glass: np.ndarray) -> tuple[float, float]:
     return float(np.where(unknown, math.inf, glass).min()), float(np.where(unknown, -math.inf, glass).max())
 
 
-def thickness_range(lens: Lens, edge: np.ndarray | None = None) -> tuple[float, float]:
-    """Return the minimum and maximum `thickness` (mm); edge: as in `heights`."""
-    return _range(thickness(lens, points_on(lens.back, *_places(lens, edge))))
+def thickness_range(lens: Lens, edge: np.ndarray | None = None, grid: int = GRID_POINTS) -> tuple[float, float]:
+    """Return the minimum and maximum `thickness` (mm); edge: as in `heights`; grid: points per side."""
+    return _range(thickness(lens, points_on(lens.back, *_places(lens, edge, grid))))
 
 
 def heights(lens: Lens, edge: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -115,9 +115,9 @@ def heights(lens: Lens, edge: np.ndarray | None = None) -> tuple[np.ndarray, np.
     return sag(lens.front, x, y), z
 
 
-def _places(lens: Lens, edge: np.ndarray | None) -> tuple[Tensor, Tensor]:
+def _places(lens: Lens, edge: np.ndarray | None, grid: int = GRID_POINTS) -> tuple[Tensor, Tensor]:
     """Return x and y (mm), in the back's chart, of points inside the outline, or inside an edge in a flat chart."""
-    return _points(lens.outline, GRID_POINTS) if edge is None or not lens.back.chart.flat else _points_in(edge)
+    return _points(lens.outline, grid) if edge is None or not lens.back.chart.flat else _points_in(edge)
 
 
 def _points(outline: Outline, n: int) -> tuple[Tensor, Tensor]:

@@ -392,7 +392,7 @@ def _stage1(
     check_front(lens, scene)
     bounds = active_bounds(lens, task.bounds, task.min_thickness)
     if bounds is None:
-        check_thickness(lens, scene)
+        check_thickness(lens, scene, task.effort.thickness_points)
     rrmsd = require_light(lens, task.rrmsd(lens) if last.rays_rrmsd is None else last.rays_rrmsd)
     driver.end(name, rrmsd)
     if bounds is not None:
@@ -400,7 +400,7 @@ def _stage1(
         if lens.is_tailored(FRONT):  # shifted before stage 2, which corrects the light but does not shift the back
             lens = place_back(lens, lens.back.z, task.min_thickness, bounds)
         lens = enforce_bounds(lens, bounds)
-        check_thickness(lens, scene)
+        check_thickness(lens, scene, task.effort.thickness_points)
         rrmsd = require_bounded_light(scene.lens, task.rrmsd(lens))
         driver.end(f"{BOUNDS_STAGE}, after stage 1", rrmsd)
     precision = None
@@ -545,9 +545,12 @@ def require_bounded_light(blank: LensBlank, rrmsd: float) -> float:
     raise SceneError(f"{bounds}: no lens within these bounds sends light to the target; relax a bound")
 
 
-def check_thickness(lens: Lens, scene: Scene) -> None:
-    """Raise SceneError, before stage 2, if the back crosses the front or reaches the next element or target."""
-    thinnest, thickest = thickness_range(lens.plain())
+def check_thickness(lens: Lens, scene: Scene, points: int) -> None:
+    """Raise SceneError, before stage 2, if the back crosses the front or reaches the next element or target.
+
+    points: per side of the grid on which the thickness is measured.
+    """
+    thinnest, thickest = thickness_range(lens.plain(), grid=points)
     if not thinnest > 0 and not lens.back.chart.flat:
         raise SceneError(
             f"lens.back.radius: the dome that the target needs would cross the front by {-thinnest:.3g} mm; "

@@ -21,7 +21,7 @@ from bstcad.optics.trace.reach import unreached
 from bstcad.planning.cold_run import round_numbers
 from bstcad.planning.effect_estimates import coarse_lens, left_out, simulated
 from bstcad.planning.net_choice import rrmsd_ratio
-from bstcad.planning.prediction import PILOT_QUALITIES, QUALITIES, REMAINING_BLUR, Pilot, predict, run_pilot
+from bstcad.planning.prediction import QUALITIES, REMAINING_BLUR, Pilot, predict, run_pilot
 from bstcad.planning.reduction import replace_net
 from bstcad.report.record import too_steep
 from bstcad.report.units import paragraphs
@@ -32,7 +32,7 @@ from bstcad.scene.scene import Scene
 from bstcad.scene.schema import MAX_CONTROL_POINTS
 from bstcad.verify.nominal import DEFAULT_RRMSD_LIMIT
 
-PilotRun = Callable[[Scene, str, Tick], Pilot]  # designs a pilot of a scene in a quality
+PilotRun = Callable[[Scene, Tick], Pilot]  # designs a pilot of a scene
 
 CAVEAT = "Estimates assume one target and one tailored face; with several, the lens deflects light differently."
 
@@ -186,16 +186,16 @@ def predict_qualities(
     """
     entries: dict[str, Any] = {"predicted": None, "not_predicted": None, "finer": None, "notes": []}
     try:
-        pilots = {quality: (pilot or run_pilot)(scene, quality, tick) for quality in PILOT_QUALITIES}
+        flown = (pilot or run_pilot)(scene, tick)
     except SceneError as refusal:
         return entries | {"not_predicted": f"a small version of this scene was refused: {refusal}"}
-    predicted, steep = predict(scene, pilots), pilots[PILOT_QUALITIES[-1]].steep
-    entries |= {"predicted": predicted, "notes": [*too_steep(steep), *_limit_notes(scene.tailoring, predicted)]}
+    predicted = predict(scene, flown)
+    entries |= {"predicted": predicted, "notes": [*too_steep(flown.steep), *_limit_notes(scene.tailoring, predicted)]}
     net = scaled(scene.lens.back.net, 2)
     if max(as_pair(net)) <= MAX_CONTROL_POINTS:
         finer = replace_net(scene, net)
         gain = rrmsd_ratio(scene, finer, lenses)
-        entries["finer"] = {"control_points": net, "predicted": predict(finer, pilots, gain)}
+        entries["finer"] = {"control_points": net, "predicted": predict(finer, flown, gain)}
     return entries
 
 

@@ -11,8 +11,8 @@ tests/benchmarks/test_prediction.py compares predictions with designs of the tem
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
 
@@ -22,10 +22,12 @@ from numba.core.event import RecordingListener, install_listener
 from bstcad.analysis.light import blur
 from bstcad.analysis.steepness import Steepness
 from bstcad.designs import pipeline
+from bstcad.designs.designed_lens import DesignedLens
 from bstcad.optics.lens.lens import Lens
+from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.surfaces.sides import as_pair
 from bstcad.optics.trace.measure import Effort, measure_goals
-from bstcad.planning.cold_run import KERNEL_REPEATS, calibration_kernel, measure_seconds
+from bstcad.planning.cold_run import calibration_kernel, measure_seconds
 from bstcad.planning.reduction import PILOT, Reduction, pilot_scene, with_quality
 from bstcad.runs.processes import Tick
 from bstcad.scene.scene import Scene
@@ -36,14 +38,15 @@ from bstcad.tailoring.stage2 import round_shares, sheet_sizes, stage3_sheet_size
 
 Interval = tuple[float, float, float]  # (low, likely, high); nine of ten designs lie between low and high
 QUALITIES = ("draft", "standard", "fine")  # qualities with a prediction
-PILOT_QUALITIES = ("draft", "standard")  # qualities with a pilot; "fine" uses the pilot of "standard"
 # High / likely and likely / low of the intervals.
 INTERVAL_FACTORS = {"seconds": 1.5, "rrmsd": 1.5, "rrmsd_half": 1.5, "memory_gb": 1.25}
 
 # --- the pilot --------------------------------------------------------------------------------------------------------
 
-PILOT_EFFORT = Effort(rays=2048, accuracy=0.02, witness=False, cells=2)  # effort of the measurement of a pilot's RRMSDs
+PILOT_RAYS = Effort(rays=512, accuracy=0.05, witness=False, cells=2)  # effort of the measurement of a pilot's RRMSDs
 SEARCH_STAGES = ("stage 2", "stage 3")  # stages that use the minimiser
+PILOT_SHARE = 0.06  # largest share of the time of a design that the search of its pilot takes, unless it is too short
+DRAFT_COARSE_FACTOR = 3  # factor of the evaluations of a draft after coarse rounds (tailoring/stage2.py)
 
 
 @dataclass(frozen=True)
@@ -61,40 +64,74 @@ class Seconds:
 
 
 @dataclass(frozen=True)
+class PilotLight:
+    """Light through the lens of a pilot."""
+
+    rrmsd: float  # largest RRMSD of all goals
+    half_ratio: float  # largest ratio of the RRMSD on half pixels to that on pixels
+
+
+@dataclass(frozen=True)
 class Pilot:
-    """Result of a small design."""
+    """Result of a small design of standard quality."""
 
     scene: Scene  # scene of the small design
     seconds: Seconds  # duration of each part (s)
-    rrmsd: float  # largest RRMSD of all goals
-    half_ratio: float  # largest ratio of the RRMSD on half pixels to that on pixels
+    light: PilotLight  # light at the end
+    early: PilotLight | None  # light after as many evaluations as a draft makes; None: not known
     factor: float  # pixels per side of the full scene / pixels per side of the pilot
     detail: float  # relative RMS of the detail of the full picture that is finer than the pilot's pixels
     blur: float  # RRMSD by blur of the source: on pixels of the full scene, minus RRMSD on pixels of the pilot
     steep: Steepness  # steepness that the map requires of the back
 
+    def light_in(self, quality: str) -> PilotLight:
+        """Return the light through the lens of a pilot of this quality."""
+        return self.early or self.light if quality == "draft" else self.light
 
-def run_pilot(
-    scene: Scene, quality: str, tick: Tick = lambda: None, *, size: Reduction = PILOT, rays: Effort = PILOT_EFFORT
-) -> Pilot:
-    """Design a small version of a scene in a quality (QUALITIES); raise SceneError if the design is refused.
+
+class LensAfter:
+    """Hooks of a design that keep the lenses after given numbers of steps of the search on the target's pixels."""
+
+    def __init__(self, counts: Collection[int], tick: Tick) -> None:
+        self.made: dict[int, Callable[[], Lens]] = {}  # number of steps -> function that makes the lens
+        self._counts, self._steps, self._searches = counts, 0, False
+        self.hooks = Hooks(progress=self._progress, on_lens=self._on_lens)
+        self._tick = tick
+
+    def _progress(self, stage: str, done: int, total: int, text: str) -> None:
+        self._searches = stage in SEARCH_STAGES
+        self._tick()
+
+    def _on_lens(self, make: Callable[[], Lens]) -> None:
+        self._steps += self._searches
+        if self._searches and self._steps in self._counts:
+            self.made.setdefault(self._steps, make)
+
+
+def run_pilot(scene: Scene, tick: Tick = lambda: None, *, size: Reduction = PILOT, rays: Effort = PILOT_RAYS) -> Pilot:
+    """Design a small version of a scene in standard quality; raise SceneError if the design is refused.
 
     rays: of the measurement of its RRMSDs.
     """
-    small, factor = pilot_scene(with_quality(scene, quality), size)
+    standard = with_quality(scene, "standard")
+    small, factor = pilot_scene(standard, size)
+    small = _with_fewer_evaluations(standard, small, size.evaluations)
+    few = with_quality(scene, "draft").tailoring.resolved(scene.lens.back.net).stage2_iterations
     compilations = RecordingListener()
     options = pipeline.DesignOptions(compare_later=True, effort=size.effort)
-    hooks = Hooks(progress=lambda *event: tick())
-    make_design = partial(pipeline.design, small, hooks=hooks, options=options)
+
+    def make_design() -> tuple[DesignedLens, LensAfter]:
+        lenses = LensAfter((few, DRAFT_COARSE_FACTOR * few), tick)
+        return pipeline.design(small, hooks=lenses.hooks, options=options), lenses
+
     with install_listener("numba:compile", compilations):
-        finished = make_design()
+        finished, lenses = make_design()
     if compilations.buffer:  # the first design after an installation waits for the compiler; time another one
-        finished = make_design()
-    light, finer = small.channels(), factor > 1
-    lights = measure_goals(finished.lens, light, finished.goals, rays, ghost=None, sampler=small.sampler)
-    rrmsd = max(each.rrmsd for each in lights)
-    ratios = [each.half.rrmsd / each.rrmsd for each in lights if each.half is not None and each.rrmsd > 0]
-    sides = [max(goal.screen.shape) for goal in finished.goals]
+        finished, lenses = make_design()
+    coarse = any(stage.is_coarse for stage in finished.course.stages)
+    made = None if scene.source.extent else lenses.made.get(DRAFT_COARSE_FACTOR * few if coarse else few)
+    early = None if made is None else small.as_mounted(replace(made().plain(), index=small.index, losses=None))
+    sides, finer = [max(goal.screen.shape) for goal in finished.goals], factor > 1
     pairs = zip(scene.single_target_scenes(), small.single_target_scenes(), strict=True)
     blurs = [blur_rrmsd(one, finished.lens) - blur_rrmsd(few, finished.lens) for one, few in pairs] if finer else [0.0]
     times = dict.fromkeys(("first", "search", "rest"), 0.0)
@@ -104,9 +141,27 @@ def run_pilot(
     transport: Mapping[str, Any] = finished.course.transport or {}
     steep = Steepness(transport["steep_share"], transport["steepest_deg"])
     lost = max(map(detail, (goal.picture for goal in scene.goals), sides)) if finer else 0.0
-    lacks = {"detail": lost, "blur": max(0.0, *blurs)}
-    errors = {"rrmsd": rrmsd, "half_ratio": max(ratios, default=1.0)}
-    return Pilot(small, Seconds(**times), **errors, factor=factor, **lacks, steep=steep)
+    light = partial(_light, small, finished.goals, rays)
+    return Pilot(
+        small, Seconds(**times), light(finished.lens), None if early is None else light(early),
+        factor=factor, detail=lost, blur=max(0.0, *blurs), steep=steep,
+    )  # fmt: skip
+
+
+def _with_fewer_evaluations(scene: Scene, small: Scene, fewest: int) -> Scene:
+    """Return `small`, a small version of `scene`, with so many evaluations that its search takes PILOT_SHARE."""
+    settings = small.tailoring.resolved(small.lens.back.net)
+    allowed = PILOT_SHARE * typical_seconds(scene).total / typical_seconds(small).search
+    if settings.method == "adam" or not allowed < 1:
+        return small
+    evaluations = min(settings.stage2_iterations, max(fewest, round(allowed * settings.stage2_iterations)))
+    return small.changed({"tailoring.stage2_iterations": evaluations})
+
+
+def _light(scene: Scene, goals: Sequence[Goal], rays: Effort, lens: Lens) -> PilotLight:
+    lights = measure_goals(lens, scene.channels(), goals, rays, ghost=None, sampler=scene.sampler)
+    ratios = [each.half.rrmsd / each.rrmsd for each in lights if each.half is not None and each.rrmsd > 0]
+    return PilotLight(max(each.rrmsd for each in lights), max(ratios, default=1.0))
 
 
 def detail(picture: np.ndarray, pixels: int) -> float:
@@ -132,19 +187,18 @@ FINE_RATIO = 0.7  # ratio of the RRMSD in fine to that in standard quality
 REMAINING_BLUR = 0.5  # fraction of the blur by an extended source that remains after stage 3
 
 
-def predict(scene: Scene, pilots: Mapping[str, Pilot], gain: float = 1.0) -> dict[str, dict[str, Interval]]:
-    """Return intervals of INTERVAL_FACTORS, by quality, from pilots of PILOT_QUALITIES.
+def predict(scene: Scene, pilot: Pilot, gain: float = 1.0) -> dict[str, dict[str, Interval]]:
+    """Return intervals of INTERVAL_FACTORS, by quality, from the pilot of a scene.
 
     rrmsd: on pixels.  rrmsd_half: on half pixels.  memory_gb: of two processes.  The RRMSD does not increase from a
     quality to the next better quality.  gain: RRMSD with the net of `scene`, divided by the RRMSD with the net of the
-    scene of which the pilots are small versions.
+    scene of which the pilot is a small version.
     """
     best, intervals = math.inf, {}
     for quality in QUALITIES:
-        pilot = pilots[quality if quality in PILOT_QUALITIES else PILOT_QUALITIES[-1]]
         whole = with_quality(scene, quality)
         best = min(best, gain * predicted_rrmsd(pilot, quality))
-        errors = {"rrmsd": best, "rrmsd_half": pilot.half_ratio * best}
+        errors = {"rrmsd": best, "rrmsd_half": pilot.light_in(quality).half_ratio * best}
         likely = {"seconds": predicted_seconds(whole, pilot), **errors, "memory_gb": memory_gb(whole)}
         wide = [(key, each, INTERVAL_FACTORS[key]) for key, each in likely.items()]
         intervals[quality] = {key: (each / factor, each, each * factor) for key, each, factor in wide}
@@ -153,7 +207,7 @@ def predict(scene: Scene, pilots: Mapping[str, Pilot], gain: float = 1.0) -> dic
 
 def predicted_rrmsd(pilot: Pilot, quality: str) -> float:
     """Return the RRMSD of a full design: the scaled RRMSD of its pilot plus that of detail and blur it lacks."""
-    by_pilot = (FINE_RATIO if quality == "fine" else 1.0) * pilot.factor**PILOT_EXPONENT * pilot.rrmsd
+    by_pilot = (FINE_RATIO if quality == "fine" else 1.0) * pilot.factor**PILOT_EXPONENT * pilot.light_in(quality).rrmsd
     return by_pilot + DETAIL_FACTORS[quality] * pilot.detail + REMAINING_BLUR * pilot.blur
 
 
@@ -168,7 +222,8 @@ def predicted_seconds(scene: Scene, pilot: Pilot) -> float:
 
 # Sizes (per side, or iterations) for which the following times (s) and memory (GB) are stated, on two cores of pace 1.
 UNIT_TUBES, UNIT_POINTS, UNIT_PIXELS, UNIT_GRID, UNIT_ITERATIONS = 1024, 513, 512, 256, 40
-KERNEL_SECONDS = 0.08  # time of an evaluation of cold_run.calibration_kernel; defines pace 1
+PACE_TUBES, PACE_REPEATS = 512, 5  # tubes per side, and evaluations, of cold_run.calibration_kernel for the pace
+KERNEL_SECONDS = 0.0256  # time of an evaluation with PACE_TUBES; defines pace 1
 ROUND_SECONDS, TRANSPORT_SECONDS, FIT_SECONDS = 0.06, 0.2, 0.6  # stage 1: rest of a round, transport, slope fit
 TWO_FACE_TRANSPORT_SECONDS = 2.4  # time of a transport for two freeform faces, with the trace between them
 TWO_FACE_SECONDS = 3.0  # additional time in stage 1 for two freeform faces of any size
@@ -191,7 +246,7 @@ GOAL_MEMORY_FACTOR = 1.2  # memory of tubes per goal with several goals / memory
 @cache
 def pace() -> float:
     """Return the time of the calibration kernel on this machine divided by KERNEL_SECONDS; 0.5: twice as fast."""
-    return min(measure_seconds(calibration_kernel()) for _ in range(KERNEL_REPEATS)) / KERNEL_SECONDS
+    return min(measure_seconds(calibration_kernel(PACE_TUBES)) for _ in range(PACE_REPEATS)) / KERNEL_SECONDS
 
 
 def typical_seconds(scene: Scene) -> Seconds:

@@ -1,9 +1,8 @@
 """Reductions of a scene: smaller designs for a preview, for a prediction, and for estimates of neglected effects.
 
 A preview has sizes of its own, so that it takes a second whatever the scene; details finer than its pixels are not
-shown.  A pilot has the sizes of the scene divided by one factor: a pixel has as many control cells and flux tubes as in
-the scene, and the search makes as many evaluations.  A coarse lens, which has nearly the rays of the finished lens, is
-made by transport and slope fits alone (effect_estimates.py).
+shown.  A pilot has the pixels and the control points of the scene, per side, divided by one factor.  A coarse lens,
+which has nearly the rays of the finished lens, is made by transport and slope fits alone (effect_estimates.py).
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import numpy as np
 
 from bstcad.optics.surfaces.sides import Sides, as_pair, coarser
 from bstcad.scene.scene import Scene
-from bstcad.tailoring.effort import FULL, PREVIEW, TailoringEffort
+from bstcad.tailoring.effort import BRIEF, PREVIEW, TailoringEffort
 
 COARSE_NET = 33  # control points per side in the first rounds of stage 1 of a preview
 GOALS_SIZE_FACTOR = 0.5  # factor on pixels, control points and tubes per side for several targets or a wavefront
@@ -33,8 +32,8 @@ class Reduction:
     net: int  # largest number of control points along the longer side of the back
     cells: int  # cells per side of the transport map; of a pilot the largest number
     tubes: int = 0  # flux tubes per side; of a pilot the largest number
-    rounds: int = 0  # rounds of stage 1; a pilot has those of the scene
-    evaluations: int = 0  # evaluations of stage 2, for a point source or parallel light; a pilot has those of the scene
+    rounds: int = 0  # rounds of stage 1; of a pilot the largest number, 0: those of the scene
+    evaluations: int = 0  # evaluations of stage 2, for a point source or parallel light; of a pilot the fewest
     blurred: int = 0  # evaluations of stage 3, for an extended source; each takes twice the time
     fewest_points: int = 2  # control points per side that a pilot has at least, unless its scene has fewer
     effort: TailoringEffort = PREVIEW  # effort of tailoring
@@ -44,7 +43,7 @@ class Reduction:
 QUICK = Reduction(pixels=72, net=180, tubes=240, cells=48, rounds=2, evaluations=12, blurred=8)
 REFINED = Reduction(pixels=128, net=320, tubes=384, cells=48, rounds=4, evaluations=50, blurred=30)
 # Sizes of a pilot, whose pixels may be more with `fewest_points`, and of a coarse lens.
-PILOT = Reduction(pixels=128, net=193, tubes=512, cells=256, fewest_points=65, effort=FULL)
+PILOT = Reduction(pixels=128, net=193, cells=96, tubes=384, rounds=4, evaluations=30, fewest_points=65, effort=BRIEF)
 COARSE = Reduction(pixels=64, net=33, cells=32, rounds=2)
 
 
@@ -81,6 +80,7 @@ def pilot_scene(scene: Scene, size: Reduction = PILOT) -> tuple[Scene, float]:
     changes: dict[str, Any] = {
         "tailoring.rays": max(min(round(settings.rays / factor), size.tubes), MIN_PILOT_SIDE),
         "tailoring.transport_grid": int(np.clip(round(settings.transport_grid / factor), MIN_PILOT_SIDE, size.cells)),
+        "tailoring.rounds": min(settings.rounds, size.rounds or settings.rounds),
     }
     changes |= _fewer_pixels(scene, [factor] * len(scene.targets))
     return replace_net(scene, coarser(net, round(spans / factor) + 1), changes), factor

@@ -47,6 +47,7 @@ class TailoringEffort:
         rays=2048, accuracy=0.01, witness=False, cells=1
     )  # rays with accuracy or bounds, and in `better`
     flux: Effort = Effort(rays=128, accuracy=1.0, witness=False, cells=1)  # rays for the flux on the target alone
+    thickness_points: int = 1025  # points per side at which the thickness after stage 1 is checked
     wavefront_tubes: int = 256  # flux tubes per side that measure the wavefront error between the stages
     coarsest_grid: int = COARSEST_GRID  # fewest cells per side of the transport map in a round of stage 1
     front_net: int | None = None  # control points per side of the back in the search for a front; None: coarsest net
@@ -71,12 +72,12 @@ class TailoringEffort:
 
 
 FULL = TailoringEffort()
-PREVIEW = TailoringEffort(
+BRIEF = TailoringEffort(
     front_net=17,
     front_search=FrontSearch(cells=32, iterations=40, repeats=1),
     gathering=Gathering(32, Fit(steps=0, degree=5)),  # five times faster
+    thickness_points=257,
     blur=None,
     rates_lenses=False,
-    divides_rounds=False,
-    refines_merit=False,
 )
+PREVIEW = replace(BRIEF, divides_rounds=False, refines_merit=False)

@@ -8,7 +8,7 @@ import pytest
 from bstcad.analysis.steepness import Steepness
 from bstcad.planning import tradeoff
 from bstcad.planning.cold_run import DONE, FAILED, ColdRun, run_and_judge
-from bstcad.planning.prediction import Pilot, typical_seconds
+from bstcad.planning.prediction import Pilot, PilotLight, typical_seconds
 from bstcad.planning.reduction import pilot_scene, with_quality
 from bstcad.runs.cluster import THIS_MACHINE, Answer
 from bstcad.scene.scene import load
@@ -19,14 +19,14 @@ KERNEL = 0.2  # seconds of the calibration kernel
 FAR = "tcp://10.0.0.1:1"  # a worker
 
 
-def typical_pilot(scene, quality, tick=lambda: None):
+def typical_pilot(scene, tick=lambda: None):
     """Return the small scene of `run_pilot` and its typical time, without its design."""
-    small, factor = pilot_scene(with_quality(scene, quality))
+    small, factor = pilot_scene(with_quality(scene, "standard"))
     return Pilot(
         small,
         typical_seconds(small),
-        0.1,
-        half_ratio=1.5,
+        PilotLight(0.1, half_ratio=1.5),
+        early=PilotLight(0.15, half_ratio=1.6),
         factor=factor,
         detail=0.0,
         blur=0.0,

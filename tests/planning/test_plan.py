@@ -12,7 +12,7 @@ from bstcad.optics.trace.measure import Effort
 from bstcad.planning import plan as plans
 from bstcad.planning.effect_estimates import simulated
 from bstcad.planning.plan import plan, predict_qualities
-from bstcad.planning.prediction import PILOT_QUALITIES, QUALITIES, run_pilot
+from bstcad.planning.prediction import QUALITIES, run_pilot
 from bstcad.planning.reduction import PILOT
 from bstcad.scene.errors import SceneError, toml_positions
 from bstcad.scene.scene import load
@@ -33,15 +33,15 @@ def portrait(net):
 
 @pytest.fixture(scope="module")
 def flown():
-    """The pilots of one scene, by quality."""
+    """The pilot of one scene."""
     size, rays = replace(PILOT, tubes=256, effort=LITTLE), Effort(384, accuracy=0.02, witness=False, cells=2)
-    return {quality: run_pilot(portrait(65), quality, size=size, rays=rays) for quality in PILOT_QUALITIES}
+    return run_pilot(portrait(65), size=size, rays=rays)
 
 
 @pytest.fixture
-def known_pilots(flown, monkeypatch):
-    """Predictions take the pilots that were flown already."""
-    monkeypatch.setattr(plans, "run_pilot", lambda scene, quality, tick: flown[quality])
+def known_pilot(flown, monkeypatch):
+    """Predictions take the pilot that was flown already."""
+    monkeypatch.setattr(plans, "run_pilot", lambda scene, tick: flown)
     monkeypatch.setattr("bstcad.planning.prediction.pace", lambda: 1.0)
 
 
@@ -51,7 +51,7 @@ def lens():
     return plans.coarse_lens(portrait(65))
 
 
-def test_better_qualities_and_finer_nets_predict_no_more_error_longer_times_and_more_memory(known_pilots, lens):
+def test_better_qualities_and_finer_nets_predict_no_more_error_longer_times_and_more_memory(known_pilot, lens):
     ahead = predict_qualities(portrait(65), [lens])
     assert ahead["finer"]["control_points"] == 129
     for key, sense in (("rrmsd", -1), ("seconds", 1), ("memory_gb", 1)):
@@ -61,7 +61,7 @@ def test_better_qualities_and_finer_nets_predict_no_more_error_longer_times_and_
         assert all(one <= other for one, other in zip(few, many, strict=True))
 
 
-def test_what_ends_a_design_early_is_said(known_pilots, lens):
+def test_what_ends_a_design_early_is_said(known_pilot, lens):
     scene = portrait(65).changed({"tailoring.max_time": 5.0, "tailoring.accuracy": 0.9})
     late, early = predict_qualities(scene, [lens])["notes"]
     assert "max_time = 5" in late and "fine" in late and "accuracy = 0.9" in early and "draft" in early
@@ -197,10 +197,10 @@ class TestCommand:
         """The plate would reach the target; the second command has the first one's refusal."""
         refusals = []
 
-        def pilot(scene, quality, tick):
+        def pilot(scene, tick):
             if not refusals:
                 with pytest.raises(SceneError) as refusal:
-                    run_pilot(scene, quality, tick, size=replace(PILOT, effort=LITTLE))
+                    run_pilot(scene, tick, size=replace(PILOT, effort=LITTLE))
                 refusals.append(refusal.value)
             raise refusals[0]
 
@@ -231,7 +231,7 @@ class TestCommand:
         assert all(words in out for words in ("vignetting", "Fresnel", '[[effects]] kind = "fresnel"', "not predicted"))
         assert max(map(len, out.splitlines())) <= 100
 
-    def test_predictions_as_json_and_as_a_table(self, capsys, known_pilots):
+    def test_predictions_as_json_and_as_a_table(self, capsys, known_pilot):
         path = str(TEMPLATES / "caustic_portrait.toml")
         few = ["plan", path, "--set", f"{PIXELS}=128", "--set", f"{NET}=65"]
         assert cli.run([*few, "--json"]) == 0

@@ -10,6 +10,7 @@ from bstcad.optics.surfaces.sides import as_pair
 from bstcad.planning import prediction
 from bstcad.planning.prediction import (
     Pilot,
+    PilotLight,
     Seconds,
     detail,
     memory_gb,
@@ -26,7 +27,7 @@ from tests.efforts import LITTLE
 
 NET, PIXELS = "lens.back.control_points", "target.pixels"
 THU = load("templates/thu.toml")
-TINY = Reduction(pixels=32, net=33, cells=32, tubes=64, fewest_points=17, effort=LITTLE)
+TINY = Reduction(pixels=32, net=33, cells=32, tubes=64, evaluations=16, fewest_points=17, effort=LITTLE)
 
 
 @pytest.fixture
@@ -39,13 +40,15 @@ def pilot(scene, *, slower=1.0, factor=4.0):
     """A pilot that took so many times as long as usual."""
     small, _ = pilot_scene(scene)
     took = typical_seconds(small)
-    return Pilot(small, Seconds(slower * took.first, slower * took.search, 0.0), 0.04, 1.5, factor, 0.0, 0.0, None)
+    took = Seconds(slower * took.first, slower * took.search, 0.0)
+    return Pilot(small, took, PilotLight(0.04, 1.5), PilotLight(0.05, 1.6), factor, 0.0, 0.0, None)
 
 
 def test_a_pilot_has_a_quarter_of_the_net_the_pixels_and_the_tubes():
     small, factor = pilot_scene(THU)
     assert factor == 4 and as_pair(small.lens.back.net) == (129, 129) and small.target.columns_rows == (128, 128)
     assert small.tailoring.rays == THU.tailoring.resolved(513).rays / 4
+    assert small.tailoring.rounds == prediction.PILOT.rounds
 
 
 def test_both_nets_of_two_faces_shrink_alike():
@@ -60,8 +63,9 @@ def test_the_pilot_of_a_narrow_target_has_pixels_enough():
 
 def test_a_pilot_as_large_as_its_scene_predicts_itself(same_pace):
     disk = load("templates/disk.toml", {"tailoring.rays": 256})
-    known = {quality: pilot(disk, slower=3.0, factor=1.0) for quality in prediction.PILOT_QUALITIES}
-    found = predict(disk, known)["standard"]
+    both = predict(disk, pilot(disk, slower=3.0, factor=1.0))
+    assert both["draft"]["rrmsd"][1] == pytest.approx(0.05) and both["draft"]["rrmsd_half"][1] == pytest.approx(0.08)
+    found = both["standard"]
     assert found["rrmsd"][1] == pytest.approx(0.04) and found["rrmsd_half"][1] == pytest.approx(0.06)
     assert found["seconds"][1] == pytest.approx(
         3 * (typical_seconds(disk).first + typical_seconds(disk).search) + typical_seconds(disk).rest
@@ -119,17 +123,18 @@ def test_a_pilot_that_waited_for_the_compiler_is_designed_again(same_pace, monke
 
     design = prediction.pipeline.design
     monkeypatch.setattr(prediction.pipeline, "design", compiling)
-    run_pilot(THU, "draft", size=TINY)
+    run_pilot(THU, size=TINY)
     assert len(calls) == 2
-    run_pilot(THU, "draft", size=TINY)
+    run_pilot(THU, size=TINY)
     assert len(calls) == 3
 
 
 @pytest.mark.parametrize("name", suite.in_turns(SCENES, 3))
 def test_every_scene_is_predicted(name, same_pace):
     template, changes = SCENES[name]
-    scene = load(f"templates/{template}.toml", {"tailoring.quality": "draft"} | changes)
-    flown = run_pilot(scene, "draft", size=TINY)
-    assert flown.seconds.first > 0 and 0 < flown.rrmsd < 1.5
-    found = predict(scene, dict.fromkeys(prediction.PILOT_QUALITIES, flown))["draft"]
-    assert all(0 < low < likely < high < np.inf for low, likely, high in found.values())
+    scene = load(f"templates/{template}.toml", changes)
+    flown = run_pilot(scene, size=TINY)
+    assert flown.seconds.first > 0 and 0 < flown.light.rrmsd < 1.5
+    assert (flown.early is None) == (scene.source.extent is not None or scene.tailoring.method == "integration")
+    found = predict(scene, flown)
+    assert all(0 < low < likely < high < np.inf for each in found.values() for low, likely, high in each.values())
