@@ -300,7 +300,8 @@ def plan(
         raise SceneError("--lit-at and --lit-png need --lit-by LIGHT; add it, for example --lit-by phone")
     with loading():
         wanted = load_scene(scene, settings)
-        from bstcad import commands
+        if made is not None or lit_by is not None:
+            from bstcad import commands  # loads more than a plan needs
         from bstcad.designs import folder as folders
         from bstcad.planning.plan import plan as planned
         from bstcad.planning.plan import reach_drawn

@@ -184,7 +184,7 @@ ONLY = {
 # A library, and the declared one that has it among its own requirements and in its interface.
 COMES_WITH = {
     "pydantic_core": "pydantic", "markupsafe": "jinja2", "h11": "uvicorn", "dask": "distributed", "drjit": "mitsuba",
-    "IPython": "ipywidgets", "h5py": "SurfaceTopography",
+    "IPython": "ipywidgets", "h5py": "SurfaceTopography", "warp": "warp-lang",
 }  # fmt: skip
 HEAVY = (
     "torch", "numpy", "scipy", "numba", "OCP", "cadquery", "matplotlib", "pyvista", "PIL",
@@ -194,6 +194,7 @@ HEAVY = (
 NAMELESS = {
     "max", "partial", "neighbours", "ctx.save_for_backward", "machines.start",
     "Geom_BSplineSurface", "BRepBuilderAPI_MakeEdge", "materials.SetMaterial", "evaluate", "rename", "ghost",
+    "launch", "Basis", "Six",
 }  # fmt: skip
 SOURCES = {str(path.relative_to(PACKAGE)): path for path in sorted(PACKAGE.rglob("*.py"))}
 
@@ -304,7 +305,8 @@ def test_the_method_stands_without_scenes_and_applications():
     for part in ("cad", "step_text", "verify"):
         assert not {each.split(".")[0] for each in within(part)} & APPLICATIONS, part
     files = [file for file in SOURCES if names_of(file)[0] in ("optics", "transport", "tailoring")]
-    modules = [".".join(("bstcad", *names_of(file))) for file in files]
+    # Warp, which kernels for a GPU need, is not installed by default
+    modules = [".".join(("bstcad", *names_of(file))) for file in files if "warp" not in imported(tree(file))]
     loads = f"import sys, importlib; [*map(importlib.import_module, {modules})]; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", loads], capture_output=True, text=True, check=True).stdout.split()
     assert {*modules} <= {*loaded}
@@ -345,13 +347,16 @@ def test_no_two_files_have_one_name():
     assert {name for name, count in names.items() if count > 1} == {"__init__.py"}
 
 
+COMPILERS = {"njit", "compiled", "compiled_kernel", "inlined", "instructions", "wp.func", "wp.kernel"}
+
+
 def compiled_functions():
-    """The names of the functions that numba compiles: they are called by position."""
+    """The names of the functions that numba and Warp compile: they are called by position."""
     for file in SOURCES:
         for node in nodes(tree(file)):
             if isinstance(node, ast.FunctionDef):
                 decorators = {ast.unparse(each).partition("(")[0] for each in node.decorator_list}
-                if decorators & {"njit", "compiled", "compiled_kernel", "inlined", "instructions"}:
+                if decorators & COMPILERS:
                     yield node.name
 
 

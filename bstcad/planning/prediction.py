@@ -43,7 +43,10 @@ INTERVAL_FACTORS = {"seconds": 1.5, "rrmsd": 1.5, "rrmsd_half": 1.5, "memory_gb"
 
 # --- the pilot --------------------------------------------------------------------------------------------------------
 
-PILOT_RAYS = Effort(rays=512, accuracy=0.05, witness=False, cells=2)  # effort of the measurement of a pilot's RRMSDs
+# Effort of the measurement of a pilot's RRMSDs: of a source without extent, and of an extended source, whose light is
+# blurred and whose rays take longer.
+PILOT_RAYS = Effort(rays=1024, accuracy=0.05, witness=False, cells=2)
+BLURRED_PILOT_RAYS = replace(PILOT_RAYS, rays=512)
 SEARCH_STAGES = ("stage 2", "stage 3")  # stages that use the minimiser
 PILOT_SHARE = 0.06  # largest share of the time of a design that the search of its pilot takes, unless it is too short
 DRAFT_COARSE_FACTOR = 3  # factor of the evaluations of a draft after coarse rounds (tailoring/stage2.py)
@@ -108,11 +111,12 @@ class LensAfter:
             self.made.setdefault(self._steps, make)
 
 
-def run_pilot(scene: Scene, tick: Tick = lambda: None, *, size: Reduction = PILOT, rays: Effort = PILOT_RAYS) -> Pilot:
+def run_pilot(scene: Scene, tick: Tick = lambda: None, *, size: Reduction = PILOT, rays: Effort | None = None) -> Pilot:
     """Design a small version of a scene in standard quality; raise SceneError if the design is refused.
 
-    rays: of the measurement of its RRMSDs.
+    rays: of the measurement of its RRMSDs; None: by the extent of the source.
     """
+    rays = rays or (PILOT_RAYS if scene.source.extent is None else BLURRED_PILOT_RAYS)
     standard = with_quality(scene, "standard")
     small, factor = pilot_scene(standard, size)
     small = _with_fewer_evaluations(standard, small, size.evaluations)
@@ -181,7 +185,9 @@ def blur_rrmsd(scene: Scene, lens: Lens) -> float:
 
 # --- predictions ------------------------------------------------------------------------------------------------------
 
-PILOT_EXPONENT = -0.6  # exponent of Pilot.factor in the ratio of the RRMSD of the full design to that of the pilot
+# Ratio of the RRMSD of the full design to that of the pilot, whose search is shorter and has fewer tubes, where the
+# pilot has all pixels; exponent of Pilot.factor in this ratio.
+PILOT_RATIO, PILOT_EXPONENT = 0.8, -0.4
 DETAIL_FACTORS = {"draft": 0.2, "standard": 0.02, "fine": 0.02}  # RRMSD due to detail that a pilot lacks / Pilot.detail
 FINE_RATIO = 0.7  # ratio of the RRMSD in fine to that in standard quality
 REMAINING_BLUR = 0.5  # fraction of the blur by an extended source that remains after stage 3
@@ -207,8 +213,8 @@ def predict(scene: Scene, pilot: Pilot, gain: float = 1.0) -> dict[str, dict[str
 
 def predicted_rrmsd(pilot: Pilot, quality: str) -> float:
     """Return the RRMSD of a full design: the scaled RRMSD of its pilot plus that of detail and blur it lacks."""
-    by_pilot = (FINE_RATIO if quality == "fine" else 1.0) * pilot.factor**PILOT_EXPONENT * pilot.light_in(quality).rrmsd
-    return by_pilot + DETAIL_FACTORS[quality] * pilot.detail + REMAINING_BLUR * pilot.blur
+    ratio = PILOT_RATIO * pilot.factor**PILOT_EXPONENT * (FINE_RATIO if quality == "fine" else 1.0)
+    return ratio * pilot.light_in(quality).rrmsd + DETAIL_FACTORS[quality] * pilot.detail + REMAINING_BLUR * pilot.blur
 
 
 def predicted_seconds(scene: Scene, pilot: Pilot) -> float:

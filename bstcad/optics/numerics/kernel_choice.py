@@ -1,16 +1,18 @@
 """Registry of the functions of optics that have a kernel, by device.
 
 A kernel returns the values of the plain form (torch code) of its function to rounding and accepts the same tensors.
-The caller requests a kernel by name and runs the plain form if there is none, as on a GPU.  A kernel for a GPU is one
-more entry in the row of its function.  On every device some computations run on the CPU: the blur by the image of a
-source, stage 1's transport, the map between two faces, the bounds and checks of a net's shape, and the rays by which a
-design is verified.  The cosine transform of stage 2 is scipy's on the CPU and a product of matrices elsewhere.
+The caller requests a kernel by name and runs the plain form if there is none.  Kernels for a GPU are compiled by Warp
+(the extra `gpu`); without it a GPU runs the plain forms.  On every device some computations run on the CPU: the blur by
+the image of a source, stage 1's transport, the map between two faces, the bounds and checks of a net's shape, and the
+rays by which a design is verified.  The cosine transform of stage 2 is scipy's on the CPU and a product of matrices
+elsewhere.
 """
 
 from __future__ import annotations
 
 import functools
 import importlib
+import importlib.util
 from collections.abc import Callable, Sequence
 from operator import attrgetter
 from typing import Any
@@ -27,14 +29,14 @@ KERNELS: dict[str, dict[str, str | Callable[..., Any]]] = {
     "irradiance.picture_error": {"cpu": "kernels.picture_error.PictureError.apply"},
     "trace.behind bspline": {"cpu": "kernels.crossing.behind"},
     "trace.behind radial": {"cpu": "kernels.dome.behind"},
-    "trace.through bspline": {"cpu": "kernels.crossing.landed"},
+    "trace.through bspline": {"cpu": "kernels.crossing.landed", "cuda": "kernels.gpu_crossing.landed"},
     "trace.through radial": {"cpu": "kernels.dome.landed"},
     "trace.simulate bspline": {"cpu": "kernels.forward.simulate"},  # the whole path, from the source to the receiver
     "trace.simulate radial": {"cpu": "kernels.dome.simulate"},
     "trace.land bspline": {"cpu": "kernels.forward.land"},  # the whole path of single rays
     "trace.land radial": {"cpu": "kernels.dome.land"},
     "tubes.search": {"cpu": "kernels.search.search"},  # rays of sources through a front to given points
-    "tubes.collect": {"cpu": "kernels.clip.Clip.apply"},
+    "tubes.collect": {"cpu": "kernels.clip.Clip.apply", "cuda": "kernels.gpu_clip.Clip.apply"},
     "folds.penalty": {"cpu": "kernels.overturned.Folds.apply"},
     "reductions.dot": {"cpu": "numerics.reductions.dot_of_arrays"},
 }
@@ -51,6 +53,8 @@ def kernel(name: str, *tensors: Tensor) -> Callable[..., Any] | None:
     device, dtype = tensors[0].device.type, tensors[0].dtype
     found = KERNELS[name].get(device) if ENABLED else None
     if found is None or dtype not in DTYPES or any(t.device.type != device or t.dtype != dtype for t in tensors):
+        return None
+    if device == "cuda" and not _compiles_for_gpu():
         return None
     return _loaded(found) if isinstance(found, str) else found
 
@@ -70,6 +74,12 @@ def front_kernel(name: str, before: Sequence[Any], *tensors: Tensor) -> Callable
 
 def _forms(interfaces: Sequence[Any]) -> list[tuple[str | None, bool]]:
     return [(SURFACE_FORMS.get(interface.surface.kind), interface.law.reverses) for interface in interfaces]
+
+
+@functools.cache
+def _compiles_for_gpu() -> bool:
+    """Return True if Warp is installed and finds a GPU."""
+    return importlib.util.find_spec("warp") is not None and importlib.import_module("warp").is_cuda_available()
 
 
 @functools.cache

@@ -63,8 +63,10 @@ def through(rays: Rays, interfaces: Sequence[Interface], planes: Sequence[Receiv
     *others, last = interfaces
     for interface in others:
         rays = behind(rays, interface)
-    if all(plane.has_kernel for plane in planes) and (fast := _net_kernel("trace.through", rays, last)):
-        return fast(rays, last, planes)
+    fast = _net_kernel("trace.through", rays, last) if all(plane.has_kernel for plane in planes) else None
+    landed: tuple[Landed, ...] | None = fast(rays, last, planes) if fast else None
+    if landed is not None:
+        return landed
     rays = cross(rays, last).rays
     return tuple(plane.land(rays) for plane in planes)
 
