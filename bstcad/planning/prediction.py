@@ -218,10 +218,14 @@ def predicted_rrmsd(pilot: Pilot, quality: str) -> float:
 
 
 def predicted_seconds(scene: Scene, pilot: Pilot) -> float:
-    """Return the time (s) of a design: times of the pilot's stages, scaled by their sizes, and the rest by `pace`."""
+    """Return the time (s) of a design: typical times of its parts at the `pace` of the machine, or of the pilot.
+
+    The pilot shows what slows a scene down, such as a dome.  Where it is faster than the machine's pace, it only lacks
+    some of the work of a design, such as rays that rate each round.
+    """
     whole, small, times = typical_seconds(scene), typical_seconds(pilot.scene), pilot.seconds
-    tailored = times.first * whole.first / small.first + times.search * whole.search / small.search
-    return tailored + times.rest + pace() * whole.rest
+    first, search = max(pace(), times.first / small.first), max(pace(), times.search / small.search)
+    return first * whole.first + search * whole.search + times.rest + pace() * whole.rest
 
 
 # --- sizes ------------------------------------------------------------------------------------------------------------
