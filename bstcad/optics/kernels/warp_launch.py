@@ -13,8 +13,13 @@ import torch
 import warp as wp
 from torch import Tensor
 
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_ERROR  # Warp otherwise prints lines about itself, also into JSON on stdout
 wp.init()
+
+
+def has_gpu() -> bool:
+    """Return True if Warp finds a GPU."""
+    return bool(wp.is_cuda_available())
 
 
 def launch(kernel: Any, sides: Sequence[int], *arguments: Any) -> None:

@@ -79,7 +79,7 @@ def _forms(interfaces: Sequence[Any]) -> list[tuple[str | None, bool]]:
 @functools.cache
 def _compiles_for_gpu() -> bool:
     """Return True if Warp is installed and finds a GPU."""
-    return importlib.util.find_spec("warp") is not None and importlib.import_module("warp").is_cuda_available()
+    return importlib.util.find_spec("warp") is not None and _loaded("kernels.warp_launch.has_gpu")()
 
 
 @functools.cache
