@@ -34,7 +34,7 @@ from bstcad.scene.scene import Scene
 from bstcad.tailoring.driver import RRMSD_SECONDS, Hooks, Task
 from bstcad.tailoring.settings import COARSEST_GRID
 from bstcad.tailoring.slope_map import SUBCELLS
-from bstcad.tailoring.stage2 import round_shares, sheet_sizes, stage3_sheet_sizes
+from bstcad.tailoring.stage2 import SINGLE_ROUND_FACTOR, round_shares, sheet_sizes, stage3_sheet_sizes
 
 Interval = tuple[float, float, float]  # (low, likely, high); nine of ten designs lie between low and high
 QUALITIES = ("draft", "standard", "fine")  # qualities with a prediction
@@ -49,7 +49,6 @@ PILOT_RAYS = Effort(rays=1024, accuracy=0.05, witness=False, cells=2)
 BLURRED_PILOT_RAYS = replace(PILOT_RAYS, rays=512)
 SEARCH_STAGES = ("stage 2", "stage 3")  # stages that use the minimiser
 PILOT_SHARE = 0.06  # largest share of the time of a design that the search of its pilot takes, unless it is too short
-DRAFT_COARSE_FACTOR = 3  # factor of the evaluations of a draft after coarse rounds (tailoring/stage2.py)
 
 
 @dataclass(frozen=True)
@@ -121,11 +120,12 @@ def run_pilot(scene: Scene, tick: Tick = lambda: None, *, size: Reduction = PILO
     small, factor = pilot_scene(standard, size)
     small = _with_fewer_evaluations(standard, small, size.evaluations)
     few = with_quality(scene, "draft").tailoring.resolved(scene.lens.back.net).stage2_iterations
+    after_coarse = round(SINGLE_ROUND_FACTOR * few)  # evaluations of a draft after coarse rounds
     compilations = RecordingListener()
     options = pipeline.DesignOptions(compare_later=True, effort=size.effort)
 
     def make_design() -> tuple[DesignedLens, LensAfter]:
-        lenses = LensAfter((few, DRAFT_COARSE_FACTOR * few), tick)
+        lenses = LensAfter((few, after_coarse), tick)
         return pipeline.design(small, hooks=lenses.hooks, options=options), lenses
 
     with install_listener("numba:compile", compilations):
@@ -133,7 +133,7 @@ def run_pilot(scene: Scene, tick: Tick = lambda: None, *, size: Reduction = PILO
     if compilations.buffer:  # the first design after an installation waits for the compiler; time another one
         finished, lenses = make_design()
     coarse = any(stage.is_coarse for stage in finished.course.stages)
-    made = None if scene.source.extent else lenses.made.get(DRAFT_COARSE_FACTOR * few if coarse else few)
+    made = None if scene.source.extent else lenses.made.get(after_coarse if coarse else few)
     early = None if made is None else small.as_mounted(replace(made().plain(), index=small.index, losses=None))
     sides, finer = [max(goal.screen.shape) for goal in finished.goals], factor > 1
     pairs = zip(scene.single_target_scenes(), small.single_target_scenes(), strict=True)
