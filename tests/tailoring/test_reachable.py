@@ -18,6 +18,7 @@ from bstcad.optics.surfaces.surfaces import Plane
 from bstcad.optics.trace.reach import largest_deflection
 from bstcad.scene.errors import SceneError
 from bstcad.scene.scene import load
+from bstcad.tailoring import reachable
 from bstcad.tailoring.driver import Edge
 from bstcad.tailoring.grazing import Grazing
 from tests import suite
@@ -90,6 +91,18 @@ def test_parallel_light_reaches_a_disc(wide):
 def test_a_target_within_reach_is_whole(wide, change):
     """Near the lens, too, where its middle alone could not reach the corners: other places do."""
     assert part_of(load(wide, change | {"target.y": change.get("target.y", [-20, 20])})) == (None, None)
+
+
+@pytest.mark.parametrize("half", [20.0, 150.0, 160.0, 170.0, 180.0], ids="{:g}".format)
+def test_few_points_that_reach_all_say_what_all_points_say(wide, half, monkeypatch):
+    """Targets from one within reach to one whose corners are beyond it."""
+    scene = load(wide, {"target.x": [-half, half], "target.y": [-half, half]})
+    found = part_of(scene)
+    tried = []
+    monkeypatch.setattr(reachable, "_reaches_all", lambda *given, **more: tried.append(given))
+    wanted = part_of(scene)
+    assert len(tried) == 1 and found[1] == wanted[1]
+    assert found[0] is wanted[0] is None or np.array_equal(found[0], wanted[0])
 
 
 def test_black_parts_out_of_reach_do_not_count(wide):
