@@ -25,6 +25,7 @@ WITHOUT_BOUND = {  # caches without a bound, and the reason why no request makes
             "app.form._kind_meanings", "app.form.environment", "figures.light_figures.srgb_grey", "report.manual.pages",
             "report.manual.sections", "exports.part_views._letters", "report.units._plain_text",
             "report.units.environment", "runs.environment.version", "scene.schema.schema", "planning.prediction.pace",
+            "optics.numerics.kernel_choice._compiles_for_gpu",
         ),
         "the function has no argument",
     ),
