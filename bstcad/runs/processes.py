@@ -15,6 +15,7 @@ import ctypes
 import gc
 import importlib
 import math
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -225,7 +226,6 @@ def _start(method: str = "loky") -> Executor:
     """Start the second process; method: how loky starts it, "fork" as a copy of this process."""
     with _environment_variable("LOKY_MAX_MEMORY_LEAK_SIZE", MEMORY_LEAK_LIMIT):  # loky reads it when it is imported
         from loky import ProcessPoolExecutor
-        from loky.backend import get_context
 
     atexit.register(end)
     # loky's resource tracker would print warnings about the semaphores of killed runs after our own output
@@ -235,7 +235,7 @@ def _start(method: str = "loky") -> Executor:
         with ignored_by_children(), _environment_variable("PYTHONWARNINGS", quiet):
             return ProcessPoolExecutor(
                 1, timeout=None if method == "fork" else IDLE_TIMEOUT,  # this process may no longer be copied later
-                initializer=_serve, initargs=(os.getpid(),), env=environment, context=get_context(method),
+                initializer=_serve, initargs=(os.getpid(),), env=environment, context=multiprocessing.get_context(method),
             )  # fmt: skip
     except OSError:  # no shared memory for its queues
         return ThreadPoolExecutor(1)

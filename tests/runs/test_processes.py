@@ -142,7 +142,7 @@ def test_a_copy_keeps_what_is_loaded_unless_a_thread_runs(busy):
     code = COPIED.format(busy=busy)
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     copies = not busy and sys.platform == "linux"
-    assert done.stdout.split() == [str(copies), "True", "False", str(1 << 22)], done.stderr
+    assert (done.stdout.split(), done.stderr) == ([str(copies), "True", "False", str(1 << 22)], "")
 
 
 @pytest.mark.parametrize("used", [False, True])
@@ -152,7 +152,7 @@ def test_a_command_copies_its_process_only_before_torch_has_run_in_threads(used)
     code += "import torch; torch.ones(1 << 22).sum()\n" if used else ""
     code += "cli.begin_commands()\nprint(processes.submit(eval, \"'sched' in __import__('sys').modules\").result())\n"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert done.stdout.split() == [str(not used and sys.platform == "linux")], done.stderr
+    assert (done.stdout.split(), done.stderr) == ([str(not used and sys.platform == "linux")], "")
 
 
 def test_a_script_that_guards_nothing_is_not_run_twice(tmp_path):
