@@ -134,19 +134,76 @@ def main(arrays: str, picture: str) -> None:
 
 
 def draw_clay(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return an RGBA image (rows, columns, 4) of triangles `faces` (n, 3) on `vertices` (k, 3; mm), back upwards."""
-    import pyvista
+    """Return an RGBA image (rows, columns, 4) of triangles `faces` (n, 3) on `vertices` (k, 3; mm), back upwards.
 
+    VTK is called without pyvista, whose import takes longer than the picture.
+    """
+    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+    from vtkmodules.vtkRenderingCore import (
+        vtkActor,
+        vtkLight,
+        vtkPolyDataMapper,
+        vtkRenderer,
+        vtkRenderWindow,
+        vtkWindowToImageFilter,
+    )
+    from vtkmodules.vtkRenderingOpenGL2 import vtkRenderStepsPass, vtkSSAAPass
+
+    points, triangles, solid, mapper = vtkPoints(), vtkCellArray(), vtkPolyData(), vtkPolyDataMapper()
+    points.SetData(numpy_to_vtk(vertices.astype(np.float32)))
+    triangles.SetData(3, numpy_to_vtkIdTypeArray(faces.astype(np.int64).ravel()))
+    solid.SetPoints(points)
+    solid.SetPolys(triangles)
+    mapper.SetInputData(solid)
+    actor, renderer, window = vtkActor(), vtkRenderer(), vtkRenderWindow()
+    actor.SetMapper(mapper)
+    actor.GetProperty().SetInterpolationToFlat()
+    actor.GetProperty().SetColor(_clay())
+    for name, value in FINISH.items():
+        getattr(actor.GetProperty(), f"Set{name.title().replace('_', '')}")(value)
+    renderer.AddActor(actor)
     centre = (vertices.min(0) + vertices.max(0)) / 2
     reach = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    plotter = pyvista.Plotter(off_screen=True, window_size=list(PICTURE_SIZE), lighting="none")
-    plotter.add_mesh(pyvista.PolyData.from_regular_faces(vertices.astype(np.float32), faces), color=CLAY, **FINISH)
+    renderer.AutomaticLightCreationOff()
     # The relief is shallow, so the key light grazes the back surface; the fill light keeps the sides visible.
-    _add_lights(plotter, ((centre + 10 * reach * np.array(towards), bright) for towards, bright in CLAY_LIGHTS), centre)
-    plotter.camera_position = centre + reach * np.array(EYE), centre, (0.0, 0.0, 1.0)
-    plotter.camera.view_angle = VIEW_ANGLE
-    plotter.enable_anti_aliasing("ssaa")
-    return plotter.screenshot(transparent_background=True)
+    for towards, bright in CLAY_LIGHTS:
+        light = vtkLight()
+        light.SetLightTypeToSceneLight()
+        light.SetPosition(centre + 10 * reach * np.array(towards))
+        light.SetFocalPoint(centre)
+        light.SetIntensity(bright)
+        renderer.AddLight(light)
+    camera = renderer.GetActiveCamera()
+    camera.SetPosition(centre + reach * np.array(EYE))
+    camera.SetFocalPoint(centre)
+    camera.SetViewUp(0.0, 0.0, 1.0)
+    camera.SetViewAngle(VIEW_ANGLE)
+    renderer.ResetCameraClippingRange()
+    finer, steps = vtkSSAAPass(), vtkRenderStepsPass()
+    finer.SetDelegatePass(steps)
+    renderer.SetPass(finer)
+    renderer.SetBackground(1.0, 1.0, 1.0)
+    window.SetOffScreenRendering(True)
+    window.SetMultiSamples(0)
+    window.SetAlphaBitPlanes(True)
+    window.SetSize(PICTURE_SIZE)
+    window.AddRenderer(renderer)
+    window.Render()
+    shot = vtkWindowToImageFilter()
+    shot.SetInput(window)
+    shot.SetInputBufferTypeToRGBA()
+    shot.ReadFrontBufferOff()
+    shot.ShouldRerenderOff()
+    shot.Update()
+    columns, rows, _ = shot.GetOutput().GetDimensions()
+    return vtk_to_numpy(shot.GetOutput().GetPointData().GetScalars()).reshape(rows, columns, 4)[::-1].copy()
+
+
+def _clay() -> list[float]:
+    """Return red, green and blue of CLAY, each from 0 to 1."""
+    return [int(CLAY[k : k + 2], 16) / 255 for k in (1, 3, 5)]
 
 
 def _solid(vertices: np.ndarray, faces: np.ndarray) -> Any:
@@ -390,7 +447,7 @@ def turnable(lens: Lens, path: RayPath | None = None, cells: int = FINE) -> str:
     values += [_steps(wall[k], low[min(k, 2)], size[min(k, 2)]) for k in range(4)]
     numbers = base64.b64encode(np.concatenate(values).tobytes()).decode()
     shape = {"low": low.tolist(), "size": size.tolist(), "faces": shapes, "rim": wall.shape[1]}
-    lit = {"eye": EYE, "angle": VIEW_ANGLE, "clay": [int(CLAY[k : k + 2], 16) / 255 for k in (1, 3, 5)]}
+    lit = {"eye": EYE, "angle": VIEW_ANGLE, "clay": _clay()}
     lit |= {"lamps": [direction for direction, _ in CLAY_LIGHTS], "bright": [intensity for _, intensity in CLAY_LIGHTS]}
     light = {} if path is None else _light(path)
     return json.dumps(shape | lit | FINISH | {"values": numbers} | light)

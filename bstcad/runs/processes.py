@@ -235,7 +235,8 @@ def _start(method: str = "loky") -> Executor:
         with ignored_by_children(), _environment_variable("PYTHONWARNINGS", quiet):
             return ProcessPoolExecutor(
                 1, timeout=None if method == "fork" else IDLE_TIMEOUT,  # this process may no longer be copied later
-                initializer=_serve, initargs=(os.getpid(),), env=environment, context=multiprocessing.get_context(method),
+                initializer=_serve, initargs=(os.getpid(),), env=environment,
+                context=multiprocessing.get_context(method),
             )  # fmt: skip
     except OSError:  # no shared memory for its queues
         return ThreadPoolExecutor(1)
