@@ -6,11 +6,8 @@ A triangle of flux F and signed area A has the density F / A.  By Green's theore
 
 so each edge is followed from pixel border to pixel border (clip_edges.py).  A piece of it adds to the pixel it crosses
 and, as one number, to all pixels below; a running sum down the columns completes the picture.  The two triangles beside
-an edge traverse it in opposite senses, so it is followed once, with the difference of their densities.  Most tubes have
-one density (`tubes.triangle_fluxes`): then the diagonal between their triangles is not followed.  These even tubes are
-computed in vectors, and the others one by one.  Some triangles are not followed: one that lies in one pixel or is too
-thin gives its flux to a pixel, and one outside the screen or with an invalid corner gives none.  Along its edges the
-density of such a triangle is 0: only its neighbours count there.
+an edge traverse it in opposite senses, so it is followed once, with the difference of their densities (clip_tubes.py).
+Most tubes have one density (`tubes.triangle_fluxes`): then the diagonal between their triangles is not followed.
 
 With L the merit function, G = ∂L/∂I and H(x, y) = ∫_y^∞ G dy, the adjoint needs for each edge Φ = ∫ H dx (for ∂L/∂A)
 and ∫ (1 - s) G ds, ∫ s G ds, s = 0 … 1 along the edge (an edge that moves by δ sweeps the area δ · n ds, n its normal).
@@ -19,9 +16,6 @@ They are computed once for the two triangles beside the edge.
 All lengths but those of the corners in memory are in pixels, x across the columns, y down the rows.  Columns are the
 first index of the sums, as x is that of the tubes: so the rows of tubes of one part, which one thread computes, reach
 few columns.
-
-Corners 0 and 3 of a tube lie in row k, 1 and 2 in row k + 1; the tube before shares 0 and 1.  The triangles are 012 and
-023, or 013 and 123 where the diagonal runs the other way (in odd tubes).
 """
 
 from __future__ import annotations
@@ -37,24 +31,45 @@ from torch import Tensor
 from bstcad.optics.kernels.clip_edges import (
     BLOCK,
     COLUMN,
-    EDGES_END,
     ENDS,
     LENGTH,
     LOWER,
     ON,
-    OUT_OF_RANGE,
     ROW,
     STARTS,
-    STATE,
     UPPER,
     Y,
     add_edges,
     copy_corners,
-    corner_at,
     inlined,
     integrals_along,
     load_corners,
-    put_corner,
+)
+from bstcad.optics.kernels.clip_tubes import (
+    ABOVE,
+    BELOW,
+    FIRST,
+    FLUX,
+    IN_PIXEL,
+    KIND,
+    NUMBER,
+    OTHER,
+    REGULAR,
+    SECOND,
+    SWITCH,
+    TUBES_END,
+    UNIT_1,
+    UNIT_2,
+    densities,
+    half_square_outside,
+    load_row,
+    outside,
+    pixel_of,
+    put_diagonals,
+    set_densities,
+    set_kinds,
+    triangles_of,
+    tube_at,
 )
 from bstcad.optics.numerics import reductions
 from bstcad.optics.numerics.compiling import compiled
@@ -64,176 +79,14 @@ FEW_PARTS, MANY_CELLS = 8, 1 << 21  # most partial sums of a picture of MANY_CEL
 MAX_WIDTH = 1e6  # extent in x of the corners of one part (pixels), above which rounding may reach any column
 ROWS_PER_STRIP = 16  # rows of tubes whose gradient one thread computes at a time
 
-UNEVEN, EVEN, IN_PIXEL = 0.0, 1.0, 2.0  # kinds of tubes; even tubes lie on the screen, and the last kind in one pixel
-# Offsets in `work` of the quantities of tubes: flux; kind; density of the triangle with the edge 01, of that with the
-# edge 23, with the edge 12 below, and with the edge 03 above; density above the edge 03; density of edges.
-FLUX, KIND, FIRST, SECOND, BELOW, ABOVE, BEFORE, WEIGHT = (EDGES_END + LENGTH * k for k in range(8))
-CLIP_WORK = EDGES_END + LENGTH * 8  # length of `work` for a picture
-# Offsets for the adjoint: numbers of the uneven tubes; integrals along the edges 03, 12, 01 and the diagonal
-# (`integrals_along`); the gradient in x and y of the corners 0 to 3.
-NUMBER, ALONG_03, ALONG_12, ALONG_01, ALONG_DIAGONAL = (CLIP_WORK + LENGTH * k for k in (0, 1, 4, 7, 10))
-G_0, G_1, G_2, G_3 = (CLIP_WORK + LENGTH * k for k in (13, 15, 17, 19))
-ADJOINT_WORK = CLIP_WORK + LENGTH * 21  # length of `work` for the adjoint
-
-
-# --- tubes and triangles ----------------------------------------------------------------------------------------------
-
-
-@inlined
-def pixel_at(x, y, columns, rows):
-    """Return (column, row, True if on the screen) of a point."""
-    on = (0.0 <= x < columns) & (0.0 <= y < rows)
-    return (int(x) if on else 0), (int(y) if on else 0), on
-
-
-@inlined
-def in_one_cell(triangle):
-    """Return True if three corners lie in one pixel or in one cell outside the screen."""
-    a, b, c = triangle
-    return (a[2] == b[2]) & (a[3] == b[3]) & (a[2] == c[2]) & (a[3] == c[3])
-
-
-@inlined
-def misses_screen(triangle):
-    """Return True if three corners lie outside the same side of the screen, or one of them is invalid."""
-    a, b, c = triangle
-    return (a[4] & b[4] & c[4]) | ((a[4] | b[4] | c[4]) & OUT_OF_RANGE) != 0
-
-
-@inlined
-def area_of(triangle):
-    """Return the signed area of a triangle (pixel²)."""
-    a, b, c = triangle
-    return 0.5 * ((b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1]))
-
-
-@inlined
-def outside(p, size):
-    """Return the signed distance (pixels) of a coordinate p outside 0 … size; 0 inside."""
-    return p - min(max(p, 0.0), size)
-
-
-@inlined
-def half_square_outside(tube, columns, rows):
-    """Return half the sum of the corners' squared distances outside the border."""
-    a, b, c, d = tube
-    square = outside(a[0], columns) ** 2 + outside(b[0], columns) ** 2
-    square += outside(c[0], columns) ** 2 + outside(d[0], columns) ** 2
-    square += outside(a[1], rows) ** 2 + outside(b[1], rows) ** 2
-    square += outside(c[1], rows) ** 2 + outside(d[1], rows) ** 2
-    return 0.5 * square
-
-
-@inlined
-def _tube_at(r, work):
-    """Return the corners of a tube."""
-    c0, c3 = corner_at(UPPER, r, work), corner_at(UPPER, r + 1, work)
-    return c0, corner_at(LOWER, r, work), corner_at(LOWER, r + 1, work), c3
-
-
-@inlined
-def _triangles_of(tube, odd):
-    """Return the triangle of a tube with the edge 01, and that with the edge 23."""
-    c0, c1, c2, c3 = tube
-    return (c0, c1, c3 if odd else c2), (c1 if odd else c0, c2, c3)
-
-
-@inlined
-def _is_followed(thinnest, triangle):
-    return not (misses_screen(triangle) or in_one_cell(triangle)) and abs(area_of(triangle)) >= thinnest
-
-
-@inlined
-def _switch(rules, difference):
-    """Return (w, dw/d(difference)) of `tubes.triangle_fluxes`, between the limits of `rules`."""
-    _, even, uneven = rules
-    t = min(max((difference - even) / (uneven - even), 0.0), 1.0)
-    return t * t * (3.0 - 2.0 * t), 6.0 * t * (1.0 - t) / (uneven - even)
-
-
-@inlined
-def _densities(rules, tube, odd):
-    """Return the densities of the two triangles of a tube of flux 1, and their derivatives (4) in the two areas.
-
-    Density d_1 in the areas A_1 and A_2, then d_2.  A triangle that is not followed has the density 0.
-    """
-    first, second = _triangles_of(tube, odd)
-    one, two = area_of(first), area_of(second)
-    known = (tube[0][4] | tube[1][4] | tube[2][4] | tube[3][4]) & OUT_OF_RANGE == 0
-    beside = tube[0][4] & tube[1][4] & tube[2][4] & tube[3][4] != 0  # all corners, outside one side of the screen
-    if known and (beside or (in_one_cell(first) and in_one_cell(second))):
-        return 0.0, 0.0, (0.0, 0.0, 0.0, 0.0)
-    if known and min(abs(one), abs(two)) >= rules[0] and abs(one - two) < rules[2] * abs(one + two):
-        area, difference = one + two, (one - two) / (one + two)
-        w, slope = _switch(rules, abs(difference))
-        slope = slope if difference > 0.0 else -slope
-        by_one, by_two = 2.0 * two / (area * area) * slope, -2.0 * one / (area * area) * slope  # ∂w/∂A
-        shared, half_one, half_two = (1.0 - w) / area, 0.5 / one, 0.5 / two
-        in_one, in_two = half_one - 1.0 / area, half_two - 1.0 / area
-        return shared + w * half_one, shared + w * half_two, (
-            -shared / area - w * half_one / one + in_one * by_one, -shared / area + in_one * by_two,
-            -shared / area + in_two * by_one, -shared / area - w * half_two / two + in_two * by_two,
-        )  # fmt: skip
-    d_1 = 0.5 / one if _is_followed(rules[0], first) else 0.0
-    d_2 = 0.5 / two if _is_followed(rules[0], second) else 0.0
-    return d_1, d_2, (-2.0 * d_1 * d_1, 0.0, 0.0, -2.0 * d_2 * d_2)
-
-
-@inlined
-def _pixel_of(triangle, columns, rows):
-    """Return (column, row, True if there is one) of the pixel of the flux of a triangle that is not followed."""
-    a, b, c = triangle
-    i, j, on = a[2], a[3], a[4] == ON
-    if not in_one_cell(triangle):
-        i, j, on = pixel_at((a[0] + b[0] + c[0]) / 3.0, (a[1] + b[1] + c[1]) / 3.0, columns, rows)
-    return i, j, on and not misses_screen(triangle)
-
-
-@inlined
-def _load_row(corner, scale, flux, k, first, count, size, work):
-    """Load a row of tubes, whose upper corners are known; size: columns and rows of the picture."""
-    load_corners(corner, scale, k + 1, first, count + 1, size[0], size[1], LOWER, work)
-    for r in range(count):
-        work[FLUX + r] = flux[k, first + r]
-
-
-@inlined
-def _set_kinds(rules, row, count, work):
-    """Set the kinds of the tubes of a row, and the densities of even tubes; 0 for the others.
-
-    row: number of the row of tubes, plus that of the first tube; the diagonals alternate with it.
-    """
-    thinnest, most, _ = rules
-    for r in range(count):
-        x0, y0, x1, y1 = work[UPPER + r], work[UPPER + Y + r], work[LOWER + r], work[LOWER + Y + r]
-        x3, y3, x2, y2 = work[UPPER + r + 1], work[UPPER + Y + r + 1], work[LOWER + r + 1], work[LOWER + Y + r + 1]
-        both = (x2 - x0) * (y3 - y1) - (x3 - x1) * (y2 - y0)  # twice the area of the tube
-        x, y = (x3, y3) if (row + r) & 1 != 0 else (x2, y2)
-        one = (x1 - x0) * (y - y0) - (x - x0) * (y1 - y0)
-        state = work[UPPER + STATE + r] + work[UPPER + STATE + r + 1]
-        on = state + work[LOWER + STATE + r] + work[LOWER + STATE + r + 1] == 0.0
-        i, j = work[UPPER + COLUMN + r], work[UPPER + ROW + r]
-        in_pixel = on & (i == work[LOWER + COLUMN + r]) & (j == work[LOWER + ROW + r])
-        in_pixel &= (i == work[UPPER + COLUMN + r + 1]) & (j == work[UPPER + ROW + r + 1])
-        in_pixel &= (i == work[LOWER + COLUMN + r + 1]) & (j == work[LOWER + ROW + r + 1])
-        even = on & (not in_pixel) & (abs(2.0 * one - both) <= most * abs(both)) & (abs(both) >= 8.0 * thinnest)
-        density = 2.0 * work[FLUX + r] / (both if even else 1.0)
-        density = density if even else 0.0
-        work[FIRST + r] = work[SECOND + r] = work[BELOW + r] = work[ABOVE + r] = density
-        work[KIND + r] = IN_PIXEL if in_pixel else (EVEN if even else UNEVEN)
-
-
-@inlined
-def _set_densities(r, odd, d_1, d_2, work):
-    work[FIRST + r], work[SECOND + r] = d_1, d_2
-    work[BELOW + r], work[ABOVE + r] = (d_2, d_1) if odd else (d_1, d_2)
-
-
-@inlined
-def _put_diagonal(n, tube, odd, work):
-    """Store the diagonal of an uneven tube, from corner 0 or 1, as edge n."""
-    put_corner(tube[1] if odd else tube[0], STARTS, n, work)
-    put_corner(tube[3] if odd else tube[2], ENDS, n, work)
+# Offsets in `work` of the density above the edge 03, and of the densities of edges.
+BEFORE, WEIGHT = TUBES_END, TUBES_END + LENGTH
+CLIP_WORK = TUBES_END + LENGTH * 2  # length of `work` for a picture
+# Offsets for the adjoint: integrals along the edges 03, 12, 01 (`integrals_along`), along the diagonals that are
+# followed, and of these by tube, 0 for the others; the gradient in x and y of the corners 0 to 3.
+ALONG_03, ALONG_12, ALONG_01, FOLLOWED, ALONG_DIAGONAL = (CLIP_WORK + LENGTH * k for k in range(0, 15, 3))
+G_0, G_1, G_2, G_3 = (CLIP_WORK + LENGTH * k for k in range(15, 23, 2))
+ADJOINT_WORK = CLIP_WORK + LENGTH * 23  # length of `work` for the adjoint
 
 
 # --- the picture ------------------------------------------------------------------------------------------------------
@@ -248,34 +101,41 @@ def _add_to_pixel(sums, first_column, pixel, flux):
 
 
 @njit(error_model="numpy")
-def _add_uneven(sums, size, first_column, rules, row, count, work):
-    """Set the densities of uneven tubes, and add what is not followed.
+def _add_others(sums, size, first_column, rules, row, count, work):
+    """Set the densities of tubes that are not regular, and add what is not followed.
 
-    Returns the number of diagonals to be followed, stored as edges with their densities in WEIGHT, and Σ flux · (mean
-    square of the corners' distance outside the border).
+    Returns Σ flux · (mean square of the corners' distance outside the border).
     """
-    diagonals, far = 0, 0.0
+    far = 0.0
     for r in range(count):
         kind, flux = work[KIND + r], work[FLUX + r]
-        if kind == EVEN or flux == 0.0:
+        if kind == REGULAR or flux == 0.0:
             continue
         if kind == IN_PIXEL:
             pixel = int(work[UPPER + COLUMN + r]), int(work[UPPER + ROW + r]), True
             _add_to_pixel(sums, first_column, pixel, flux)
             continue
-        odd, tube = (row + r) & 1 != 0, _tube_at(r, work)
-        d_1, d_2, _ = _densities(rules, tube, odd)
-        for d, triangle in zip((d_1, d_2), _triangles_of(tube, odd)):  # noqa: B905
+        odd, tube = (row + r) & 1 != 0, tube_at(r, work)
+        d_1, d_2, _ = densities(rules, tube, odd)
+        for d, triangle in zip((d_1, d_2), triangles_of(tube, odd)):  # noqa: B905
             if d == 0.0:
-                _add_to_pixel(sums, first_column, _pixel_of(triangle, *size), 0.5 * flux)
-        _set_densities(r, odd, flux * d_1, flux * d_2, work)
-        if d_1 != d_2:
-            _put_diagonal(diagonals, tube, odd, work)
-            work[WEIGHT + diagonals] = flux * (d_1 - d_2) if odd else flux * (d_2 - d_1)
-            diagonals += 1
+                _add_to_pixel(sums, first_column, pixel_of(triangle, *size), 0.5 * flux)
+        set_densities(r, odd, flux * d_1, flux * d_2, work)
         if tube[0][4] | tube[1][4] | tube[2][4] | tube[3][4] != ON:
             far += 0.5 * flux * half_square_outside(tube, *size)
-    return diagonals, far
+    return far
+
+
+@inlined
+def _put_weighted_diagonals(row, count, work):
+    """Store the diagonals between triangles of different densities as edges with WEIGHT; return their number."""
+    diagonals = 0
+    for r in range(count):
+        work[NUMBER + diagonals] = r
+        work[WEIGHT + diagonals] = work[ABOVE + r] - work[BELOW + r]
+        diagonals += work[FIRST + r] != work[SECOND + r]
+    put_diagonals(diagonals, row, work)
+    return diagonals
 
 
 @njit(error_model="numpy", fastmath={"contract"})
@@ -291,10 +151,10 @@ def _add_block(sums, size, first_column, rules, tubes, seam, work):
     load_corners(corner, scale, rows[0], first, count + 1, size[0], size[1], UPPER, work)
     work[BEFORE : BEFORE + count] = 0.0
     for k in range(rows[0], rows[1]):
-        _load_row(corner, scale, flux, k, first, count, size, work)
-        _set_kinds(rules, k + first, count, work)
-        diagonals, beyond = _add_uneven(sums, size, first_column, rules, k + first, count, work)
-        far += beyond
+        load_row(corner, scale, flux, k, first, count, size, work)
+        set_kinds(rules, k + first, count, work)
+        far += _add_others(sums, size, first_column, rules, k + first, count, work)
+        diagonals = _put_weighted_diagonals(k + first, count, work)
         if diagonals > 0:
             add_edges(sums, size, first_column, STARTS, ENDS, diagonals, WEIGHT, work)
         work[WEIGHT] = work[FIRST] - seam[k - rows[0]]
@@ -407,76 +267,129 @@ def _add_area_gradient(q, triangle, to, r, work):
 
 
 @inlined
-def _set_gradients(count, work):
-    """Set the gradient in the corners by the edges 01, 12, 23 and 03, and by the areas of even tubes."""
+def _integrals_of_triangles(r, odd, work):
+    """Return Φ around the two triangles of a tube."""
+    p_01, p_12, p_32, p_03 = work[ALONG_01 + r], work[ALONG_12 + r], work[ALONG_01 + r + 1], work[ALONG_03 + r]
+    diagonal = work[ALONG_DIAGONAL + r]  # the triangle 012 of an even tube traverses it backwards
+    return p_01 + (diagonal - p_03 if odd else p_12 - diagonal), (p_12 - diagonal if odd else diagonal - p_03) - p_32
+
+
+@inlined
+def _set_gradients(rules, row, count, work):
+    """Set the gradient in the corners by the edges 01, 12, 23 and 03, and by areas and diagonals of regular tubes."""
+    _, even, uneven = rules
     for r in range(count):
         x0, y0, x1, y1 = work[UPPER + r], work[UPPER + Y + r], work[LOWER + r], work[LOWER + Y + r]
         x3, y3, x2, y2 = work[UPPER + r + 1], work[UPPER + Y + r + 1], work[LOWER + r + 1], work[LOWER + Y + r + 1]
-        first, second, below, above = work[FIRST + r], work[SECOND + r], work[BELOW + r], work[ABOVE + r]
-        phi = work[ALONG_01 + r] + work[ALONG_12 + r] - work[ALONG_01 + r + 1] - work[ALONG_03 + r]
+        odd, regular, t, flux = (row + r) & 1 != 0, work[KIND + r] == REGULAR, work[SWITCH + r], work[FLUX + r]
         both = (x2 - x0) * (y3 - y1) - (x3 - x1) * (y2 - y0)
-        q = -first * phi / (both if work[KIND + r] == EVEN else 1.0)  # half of ∂L/∂A
-        q = q if work[KIND + r] == EVEN else 0.0
+        x, y = (x3 if odd else x2), (y3 if odd else y2)
+        one = (x1 - x0) * (y - y0) - (x - x0) * (y1 - y0)
+        two = both - one
+        # ∂L/∂A_k = -F (Φ_k w / (2 A_k²) + (Φ_1 + Φ_2) (1 - w) / A²) + F Σ_l Φ_l (1 / (2 A_l) - 1 / A) ∂w/∂A_k
+        phi_1, phi_2 = _integrals_of_triangles(r, odd, work)
+        w, switching = t * t * (3.0 - 2.0 * t), (t > 0.0) & (t < 1.0)
+        by_one, by_two = 1.0 / (one if regular else 1.0), 1.0 / (two if regular else 1.0)
+        whole = 2.0 / (both if regular & (t < 1.0) else 1.0)  # 1 / A
+        slope = 6.0 * t * (1.0 - t) / (uneven - even) * whole * whole  # |∂w/∂A_k| / (2 A_l), l the other
+        slope = slope if (one - two) * whole > 0.0 else -slope
+        slope = slope * (phi_1 * (by_one - whole) + phi_2 * (by_two - whole)) if switching else 0.0
+        shared = (phi_1 + phi_2) * (1.0 - w) * whole * whole if t < 1.0 else 0.0
+        q_1 = flux * (slope * two - shared - 2.0 * w * phi_1 * by_one * by_one)
+        q_2 = flux * (-slope * one - shared - 2.0 * w * phi_2 * by_two * by_two)
+        q_1, q_2 = (0.5 * q_1 if regular else 0.0), (0.5 * q_2 if regular else 0.0)
+        turn = work[FIRST + r] - work[SECOND + r]
+        turn = turn if regular else 0.0
+        start, end = turn * work[ALONG_DIAGONAL + LENGTH + r], turn * work[ALONG_DIAGONAL + 2 * LENGTH + r]
+        dx, dy = (x3 - x1 if odd else x0 - x2), (y3 - y1 if odd else y0 - y2)
+        first, second, below, above = work[FIRST + r], work[SECOND + r], work[BELOW + r], work[ABOVE + r]
         a_0, a_1 = first * work[ALONG_01 + LENGTH + r], first * work[ALONG_01 + 2 * LENGTH + r]
         b_1, b_2 = below * work[ALONG_12 + LENGTH + r], below * work[ALONG_12 + 2 * LENGTH + r]
         c_3, c_2 = second * work[ALONG_01 + LENGTH + r + 1], second * work[ALONG_01 + 2 * LENGTH + r + 1]
         d_0, d_3 = above * work[ALONG_03 + LENGTH + r], above * work[ALONG_03 + 2 * LENGTH + r]
-        work[G_0 + r] = a_0 * (y1 - y0) - d_0 * (y3 - y0) + q * (y1 - y3)
-        work[G_0 + LENGTH + r] = d_0 * (x3 - x0) - a_0 * (x1 - x0) + q * (x3 - x1)
-        work[G_1 + r] = a_1 * (y1 - y0) + b_1 * (y2 - y1) + q * (y2 - y0)
-        work[G_1 + LENGTH + r] = q * (x0 - x2) - a_1 * (x1 - x0) - b_1 * (x2 - x1)
-        work[G_2 + r] = b_2 * (y2 - y1) - c_2 * (y2 - y3) + q * (y3 - y1)
-        work[G_2 + LENGTH + r] = c_2 * (x2 - x3) - b_2 * (x2 - x1) + q * (x1 - x3)
-        work[G_3 + r] = q * (y0 - y2) - c_3 * (y2 - y3) - d_3 * (y3 - y0)
-        work[G_3 + LENGTH + r] = c_3 * (x2 - x3) + d_3 * (x3 - x0) + q * (x2 - x0)
+        q, more = q_2, q_1 - q_2  # of the whole tube, and more of its first triangle
+        third_x, third_y = more * (y0 - y1) + end * dy, more * (x1 - x0) - end * dx
+        start_x, start_y = start * dy, -start * dx
+        work[G_0 + r] = a_0 * (y1 - y0) - d_0 * (y3 - y0) + q * (y1 - y3) + more * (y1 - y) + (0.0 if odd else start_x)
+        work[G_0 + LENGTH + r] = (
+            d_0 * (x3 - x0) - a_0 * (x1 - x0) + q * (x3 - x1) + more * (x - x1) + (0.0 if odd else start_y)
+        )
+        work[G_1 + r] = a_1 * (y1 - y0) + b_1 * (y2 - y1) + q * (y2 - y0) + more * (y - y0) + (start_x if odd else 0.0)
+        work[G_1 + LENGTH + r] = (
+            q * (x0 - x2) - a_1 * (x1 - x0) - b_1 * (x2 - x1) + more * (x0 - x) + (start_y if odd else 0.0)
+        )
+        work[G_2 + r] = b_2 * (y2 - y1) - c_2 * (y2 - y3) + q * (y3 - y1) + (0.0 if odd else third_x)
+        work[G_2 + LENGTH + r] = c_2 * (x2 - x3) - b_2 * (x2 - x1) + q * (x1 - x3) + (0.0 if odd else third_y)
+        work[G_3 + r] = q * (y0 - y2) - c_3 * (y2 - y3) - d_3 * (y3 - y0) + (third_x if odd else 0.0)
+        work[G_3 + LENGTH + r] = c_3 * (x2 - x3) + d_3 * (x3 - x0) + q * (x2 - x0) + (third_y if odd else 0.0)
 
 
 @inlined
-def _set_flux_gradients(count, first, d_flux, work):
-    """Set the gradient in the flux of even tubes, Φ / A; 0 for the others."""
+def _set_flux_gradients(row, count, first, d_flux, work):
+    """Set the gradient in the flux of regular tubes, Σ Φ_k d_k at flux 1; 0 for the others."""
     for r in range(count):
-        both = (work[LOWER + r + 1] - work[UPPER + r]) * (work[UPPER + Y + r + 1] - work[LOWER + Y + r])
-        both -= (work[UPPER + r + 1] - work[LOWER + r]) * (work[LOWER + Y + r + 1] - work[UPPER + Y + r])
-        phi = work[ALONG_01 + r] + work[ALONG_12 + r] - work[ALONG_01 + r + 1] - work[ALONG_03 + r]
-        d_flux[first + r] = 2.0 * phi / both if work[KIND + r] == EVEN else 0.0
+        phi_1, phi_2 = _integrals_of_triangles(r, (row + r) & 1 != 0, work)
+        d_flux[first + r] = phi_1 * work[UNIT_1 + r] + phi_2 * work[UNIT_2 + r]
 
 
 @njit(error_model="numpy")
-def _list_uneven(rules, row, count, in_flux, work):
-    """Set the densities of uneven tubes and store their diagonals as edges; list them and return their number."""
-    uneven = 0
+def _set_other_densities(rules, row, count, in_flux, work):
+    """Set the densities of tubes that are not regular; return True if there are any whose gradient is needed."""
+    others = False
     for r in range(count):
-        flux = work[FLUX + r]
-        if work[KIND + r] == UNEVEN and flux != 0.0 or work[KIND + r] != EVEN and in_flux:
-            odd, tube = (row + r) & 1 != 0, _tube_at(r, work)
-            d_1, d_2, _ = _densities(rules, tube, odd)
-            _set_densities(r, odd, flux * d_1, flux * d_2, work)
-            _put_diagonal(uneven, tube, odd, work)
-            work[NUMBER + uneven] = r
-            uneven += 1
-    return uneven
+        if _is_other(r, in_flux, work):
+            odd = (row + r) & 1 != 0
+            d_1, d_2, _ = densities(rules, tube_at(r, work), odd)
+            set_densities(r, odd, work[FLUX + r] * d_1, work[FLUX + r] * d_2, work)
+            others = True
+    return others
+
+
+@inlined
+def _is_other(r, in_flux, work):
+    """Return True for a tube that is not regular, and whose gradient in corners or, if `in_flux`, in flux is needed."""
+    kind = work[KIND + r]
+    return ((kind == OTHER) & (work[FLUX + r] != 0.0)) | ((kind != REGULAR) & in_flux)
+
+
+@inlined
+def _integrate_diagonals(g, row, count, in_flux, work):
+    """Store the integrals along the diagonals that count, by tube; 0 for the others."""
+    followed = 0
+    for r in range(count):
+        for k in range(3):
+            work[ALONG_DIAGONAL + LENGTH * k + r] = 0.0
+        work[NUMBER + followed] = r
+        apart = (work[FIRST + r] != work[SECOND + r]) | (work[UNIT_1 + r] != work[UNIT_2 + r])
+        followed += apart | (in_flux & (work[KIND + r] == OTHER))
+    if followed > 0:
+        put_diagonals(followed, row, work)
+        integrals_along(g, STARTS, ENDS, followed, FOLLOWED, work)
+        for n in range(followed):
+            r = int(work[NUMBER + n])
+            for k in range(3):
+                work[ALONG_DIAGONAL + LENGTH * k + r] = work[FOLLOWED + LENGTH * k + n]
 
 
 @njit(error_model="numpy")
-def _add_uneven_gradients(g, size, rules, row, uneven, g_far, first, d_flux, work):
-    """Add the gradient of uneven tubes by their areas, diagonals, pixels and light outside the border.
+def _add_other_gradients(g, size, rules, row, count, g_far, first, d_flux, work):
+    """Add the gradient of tubes that are not regular by their areas, diagonals, pixels and light outside the border.
 
     d_flux (m,) or (0,): receives the gradient in the flux of the row.
     """
-    for n in range(uneven):
-        r = int(work[NUMBER + n])
-        odd, tube, flux = (row + r) & 1 != 0, _tube_at(r, work), work[FLUX + r]
-        d_1, d_2, (one_one, one_two, two_one, two_two) = _densities(rules, tube, odd)
-        one, two = _triangles_of(tube, odd)
-        p_01, p_12, p_32, p_03 = work[ALONG_01 + r], work[ALONG_12 + r], work[ALONG_01 + r + 1], work[ALONG_03 + r]
-        diagonal, turn = work[ALONG_DIAGONAL + n], flux * (d_1 - d_2)
-        at_start, at_end = turn * work[ALONG_DIAGONAL + LENGTH + n], turn * work[ALONG_DIAGONAL + 2 * LENGTH + n]
+    for r in range(count):
+        if not _is_other(r, d_flux.size > 0, work):
+            continue
+        odd, tube, flux = (row + r) & 1 != 0, tube_at(r, work), work[FLUX + r]
+        d_1, d_2, (one_one, one_two, two_one, two_two) = densities(rules, tube, odd)
+        one, two = triangles_of(tube, odd)
+        (phi_1, phi_2), turn = _integrals_of_triangles(r, odd, work), flux * (d_1 - d_2)
+        at_start = turn * work[ALONG_DIAGONAL + LENGTH + r]
+        at_end = turn * work[ALONG_DIAGONAL + 2 * LENGTH + r]
         if odd:
-            phi_1, phi_2 = p_01 + diagonal - p_03, p_12 - p_32 - diagonal
             to_1, to_2, start, end = (G_0, G_1, G_3), (G_1, G_2, G_3), G_1, G_3
             dx, dy = tube[3][0] - tube[1][0], tube[3][1] - tube[1][1]
-        else:  # the triangle 012 traverses the diagonal backwards
-            phi_1, phi_2 = p_01 + p_12 - diagonal, diagonal - p_32 - p_03
+        else:
             to_1, to_2, start, end = (G_0, G_1, G_2), (G_0, G_2, G_3), G_0, G_2
             dx, dy = tube[0][0] - tube[2][0], tube[0][1] - tube[2][1]
         _add_area_gradient(flux * (phi_1 * one_one + phi_2 * two_one), one, to_1, r, work)
@@ -495,7 +408,7 @@ def _add_uneven_gradients(g, size, rules, row, uneven, g_far, first, d_flux, wor
             mean = phi_1 * d_1 + phi_2 * d_2
             for d, triangle in zip((d_1, d_2), (one, two)):  # noqa: B905
                 if d == 0.0:
-                    i, j, on = _pixel_of(triangle, *size)
+                    i, j, on = pixel_of(triangle, *size)
                     mean += 0.5 * g[i, j, 0] if on else 0.0
             d_flux[first + r] = mean + (0.5 * g_far * half_square_outside(tube, *size) if beside else 0.0)
 
@@ -509,19 +422,19 @@ def _add_block_adjoint(g, size, rules, tubes, g_far, d_corner, d_flux, work):
     copy_corners(UPPER + 1, ENDS, count, work)
     integrals_along(g, UPPER, ENDS, count, ALONG_03, work)
     for k in range(rows[0], rows[1]):
-        _load_row(corner, scale, flux, k, first, count, size, work)
-        _set_kinds(rules, k + first, count, work)
+        load_row(corner, scale, flux, k, first, count, size, work)
+        set_kinds(rules, k + first, count, work)
         integrals_along(g, UPPER, LOWER, count + 1, ALONG_01, work)
         copy_corners(LOWER + 1, ENDS, count, work)
         integrals_along(g, LOWER, ENDS, count, ALONG_12, work)
-        uneven = _list_uneven(rules, k + first, count, in_flux, work)
-        _set_gradients(count, work)
+        others = _set_other_densities(rules, k + first, count, in_flux, work)
+        _integrate_diagonals(g, k + first, count, in_flux, work)
+        _set_gradients(rules, k + first, count, work)
         in_row = d_flux[k if in_flux else 0 : k + 1 if in_flux else 0].reshape(-1)
         if in_flux:
-            _set_flux_gradients(count, first, in_row, work)
-        if uneven > 0:
-            integrals_along(g, STARTS, ENDS, uneven, ALONG_DIAGONAL, work)
-            _add_uneven_gradients(g, size, rules, k + first, uneven, g_far, first, in_row, work)
+            _set_flux_gradients(k + first, count, first, in_row, work)
+        if others:
+            _add_other_gradients(g, size, rules, k + first, count, g_far, first, in_row, work)
         for r in range(count):
             d_corner[0, k, first + r] += per_x * work[G_0 + r]
             d_corner[1, k, first + r] += per_y * work[G_0 + LENGTH + r]

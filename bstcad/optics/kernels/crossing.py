@@ -382,7 +382,7 @@ def load_gradient(faces, screens, g, more, status, first, count, work):
 
 @compiled()
 def _cross_adjoint(net, faces, screens, position, direction, status, hits, g, more, d_rays, first, last, own, touched):
-    """Add to own[0] (m, n) the gradient of the merit in the net, from rays first … last - 1 (see reductions.py).
+    """Add to own (m, n) the gradient of the merit in the net, from rays first … last - 1 (see reductions.py).
 
     g: gradients in `outs` of `_cross`.  more: gradients in path and cosine of incidence (2, n), or (2, 0).  d_rays:
     None, or (6, n), which receives the gradient in positions and directions.
@@ -400,7 +400,7 @@ def _cross_adjoint(net, faces, screens, position, direction, status, hits, g, mo
             if work[FATE + r] != 0.0:
                 work[Z + r] = work[SLOPE_X + r] = work[SLOPE_Y + r] = 0.0
         u, v, g_h = work[U : U + count], work[V : V + count], work[Z : Z + count]
-        scatter(own[0], touched[0], u, v, g_h, work[SLOPE_X : SLOPE_X + count], work[SLOPE_Y : SLOPE_Y + count])
+        scatter(own, touched, u, v, g_h, work[SLOPE_X : SLOPE_X + count], work[SLOPE_Y : SLOPE_Y + count])
 
 
 class Form(NamedTuple):
@@ -409,7 +409,7 @@ class Form(NamedTuple):
     cross: Callable[..., None]  # trace of rays across the face, as `_cross`
     adjoint: Callable[..., None]  # adjoint of `cross`, as `_cross_adjoint`
     hits: int  # number of arrays (n,) that `cross` stores for `adjoint`; the first is the path to the face (mm)
-    prepare: Callable[[Rays, Interface], tuple[Rays, Tensor, Any]]  # (rays to be traced, nets, face as numbers)
+    prepare: Callable[[Rays, Interface], tuple[Rays, Tensor, Any]]  # (rays to be traced, net, face as numbers)
     knows_axis: bool = False  # True if light along the axis needs no directions: their array is (3, 0)
 
 
@@ -429,9 +429,9 @@ class Crossing(NamedTuple):
 
 
 class Cross(torch.autograd.Function):
-    """Map (nets, position (3, n), direction (3, n), status (n,), crossing) to (status, path, cos θ, *outs).
+    """Map (net, position (3, n), direction (3, n), status (n,), crossing) to (status, path, cos θ, *outs).
 
-    nets: heights (1, m, n), or the components (3, m, n) of control points (mm).  direction: (3, 0) along the axis.
+    net: heights (m, n), or the control points (m, 4 n) of a net in space (mm).  direction: (3, 0) along the axis.
     outs: landing points (2, n) mm for each screen; or, if rays go on, hit (mm) and direction behind the face, (3, n)
     each.  status: (screens, n), or (1, n).  path (n,) to the face (mm) and cos θ (n,) of incidence have a gradient if
     `crossing.lossy`; otherwise cos θ is empty.  The gradient is taken in heights, positions and directions, where
@@ -440,18 +440,18 @@ class Cross(torch.autograd.Function):
 
     @staticmethod
     def forward(  # noqa: D102
-        ctx: Any, nets: Tensor, position: Tensor, direction: Tensor, status: Tensor, crossing: Crossing
+        ctx: Any, net: Tensor, position: Tensor, direction: Tensor, status: Tensor, crossing: Crossing
     ) -> Any:
         n, (count, components) = status.numel(), crossing.shapes
         outs = torch.empty((count, components, n), dtype=torch.float64)
         hits = [torch.empty(n, dtype=torch.float64) for _ in range(crossing.form.hits)]
         cosine = torch.ones(n if crossing.lossy else 0, dtype=torch.float64)
         fate = status.expand(count if crossing.screens else 1, n).clone()
-        inputs = [net_of(nets), *crossing[1:3], crossing.width, *_doubles([position, direction])]
+        inputs = [net_of(net), *crossing[1:3], crossing.width, *_doubles([position, direction])]
         results = fate.numpy(), outs.numpy(), _arrays(hits), cosine.numpy()
         cross = crossing.form.cross
         reductions.on_threads(lambda first, last: cross(*inputs, *results, first, last), reductions.shares(n, BLOCK))
-        ctx.save_for_backward(nets, position, direction, fate, *hits)
+        ctx.save_for_backward(net, position, direction, fate, *hits)
         ctx.crossing = crossing
         ctx.mark_non_differentiable(fate, *(() if crossing.lossy else (hits[0], cosine)))
         ctx.set_materialize_grads(False)
@@ -460,7 +460,7 @@ class Cross(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, _: None, g_path: Tensor | None, g_cosine: Tensor | None, *g: Tensor | None) -> Any:  # noqa: D102
-        (nets, position, direction, fate, *hits), crossing = ctx.saved_tensors, ctx.crossing
+        (net, position, direction, fate, *hits), crossing = ctx.saved_tensors, ctx.crossing
         n = hits[0].numel()
         known = np.empty((*crossing.shapes, n))
         for into, each in zip(known, g, strict=True):
@@ -472,15 +472,14 @@ class Cross(torch.autograd.Function):
                 row[:] = 0.0 if part is None else part.numpy()
         d_rays = torch.empty((6, n), dtype=torch.float64) if any(ctx.needs_input_grad[1:3]) else None
         shares = reductions.shares(n, BLOCK)
-        buffers = [reductions.buffers(len(shares), *nets.shape[1:]) for _ in nets]
-        inputs = [net_of(nets), *crossing[1:3], *_doubles([position, direction]), fate.numpy(), _arrays(hits)]
+        owns, ranges = reductions.buffers(len(shares), *net.shape)
+        inputs = [net_of(net), *crossing[1:3], *_doubles([position, direction]), fate.numpy(), _arrays(hits)]
         inputs += [known, more, None if d_rays is None else d_rays.numpy()]
-        owns, ranges = (zip(*each, strict=True) for each in zip(*buffers, strict=True))
         tasks = [(*share, own, touched) for share, own, touched in zip(shares, owns, ranges, strict=True)]
         reductions.on_threads(lambda *task: crossing.form.adjoint(*inputs, *task), tasks)
-        d_nets = torch.from_numpy(np.stack([reductions.merged(*each) for each in buffers])).to(nets.dtype)
+        d_net = torch.from_numpy(reductions.merged(owns, ranges)).to(net.dtype)
         d_position, d_direction = (None, None) if d_rays is None else d_rays.to(position.dtype).split(3)
-        return d_nets, d_position, d_direction, None, None
+        return d_net, d_position, d_direction, None, None
 
 
 def _arrays(tensors: Sequence[Tensor]) -> tuple[np.ndarray, ...]:
@@ -493,10 +492,10 @@ def _doubles(tensors: Sequence[Tensor]) -> tuple[np.ndarray, ...]:
 
 
 def prepare_heights(rays: Rays, interface: Interface) -> tuple[Rays, Tensor, Faces]:
-    """Return (rays that start below the net, heights (1, m, n) in the frame of the kernels, face as numbers)."""
+    """Return (rays that start below the net, heights (m, n) in the frame of the kernels, face as numbers)."""
     if rays.axial and interface.status_if_missed == Status.MISSED_FRONT:
         rays = _start_below_net(rays, interface)
-    heights, (faces, _) = interface.net.heights[None], kernel_arguments.faces(interface, None, rays.sense, rays.z)
+    heights, (faces, _) = interface.net.heights, kernel_arguments.faces(interface, None, rays.sense, rays.z)
     return rays, -heights if rays.sense < 0 else heights, faces
 
 
@@ -525,14 +524,14 @@ def _across(
 ) -> tuple[Tensor, Rays, tuple[Tensor, ...]]:
     """Return (status for each plane; rays behind the face, with old positions and directions; `outs` of `Cross`)."""
     shape, lossy = rays.status.shape, bool(interface.losses)
-    rays, nets, faces = form.prepare(rays, interface)
+    rays, net, faces = form.prepare(rays, interface)
     given = rays.position, rays.direction
     if rays.axial and form.knows_axis and not any(t.requires_grad for t in given):
         given = rays.position, rays.direction[..., :0]
     vectors = (reflect_z(t, rays.sense).reshape(3, -1).contiguous() for t in given)
     screens = kernel_arguments.screens(interface, planes, rays.sense) if planes else None
     status, path, cos_in, *outs = Cross.apply(
-        nets, *vectors, rays.status.reshape(-1), Crossing(form, faces, screens, lossy, width=shape[-1]),
+        net, *vectors, rays.status.reshape(-1), Crossing(form, faces, screens, lossy, width=shape[-1]),
     )  # fmt: skip
     status = status.view(len(status), *shape)
     traced = replace(rays, status=status.amin(0) if len(status) > 1 else status[0])  # lost: on none of the planes

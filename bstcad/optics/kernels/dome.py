@@ -65,10 +65,12 @@ from bstcad.optics.kernels.forward import (
     Z,
     to_screen,
 )  # fmt: skip
-from bstcad.optics.kernels.spline import basis, bend, beyond2, curved_piece, net_of, piece, scatter
+from bstcad.optics.kernels.spline import basis, bend, beyond2, net_of
+from bstcad.optics.kernels.wide import add_to_space_span, curved_space_piece, space_piece
 from bstcad.optics.lens.interfaces import Interface
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.light.emitters import Emitter
+from bstcad.optics.numerics import reductions
 from bstcad.optics.numerics.compiling import compiled
 from bstcad.optics.numerics.records import DomeFront, Faces, floats
 from bstcad.optics.receivers.receivers import Receiver
@@ -120,16 +122,11 @@ def _set(work, offset, r, vector):
 
 @njit(inline="always")
 def patch(net, faces, u, v):
-    """Return S, ∂S/∂x and ∂S/∂y (mm), relative to the centre, at (u, v)."""
-    m, n, scale_x, scale_y = faces.m, faces.n, faces.per_x, faces.per_y
-    i, a0, a2, p0, p2 = basis(u, m)
-    j, b0, b2, q0, q2 = basis(v, n)
-    along_u, along_v = (a0, a2, p0 * scale_x, p2 * scale_x), (b0, b2, q0 * scale_y, q2 * scale_y)
-    at, size = np.uint64(i * n + j), np.uint64(m * n)
-    x, x_x, x_y = piece(net, n, at, along_u, along_v)
-    y, y_x, y_y = piece(net, n, at + size, along_u, along_v)
-    z, z_x, z_y = piece(net, n, at + size + size, along_u, along_v)
-    return (x, y, z), (x_x, y_x, z_x), (x_y, y_y, z_y)
+    """Return S, ∂S/∂x and ∂S/∂y (mm), relative to the centre, at (u, v); net: `packed`, flattened."""
+    i, a0, a2, p0, p2 = basis(u, faces.m)
+    j, b0, b2, q0, q2 = basis(v, faces.n)
+    per_x, per_y, at, row = faces.per_x, faces.per_y, np.uint64(4 * (i * faces.n + j)), np.uint64(4 * faces.n)
+    return space_piece(net, at, row, a0, a2, p0 * per_x, p2 * per_x, b0, b2, q0 * per_y, q2 * per_y)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
@@ -261,7 +258,7 @@ def _deflect(faces, count, work):
 
 @compiled()
 def _cross(net, face, screens, width, position, direction, status, outs, hits, cosine, first, last):
-    """Trace rays as `crossing._cross` does; net: flattened (3, m, n); hits: path (mm), and u and v of each hit."""
+    """Trace rays as `crossing._cross` does; net: `packed`, flattened; hits: path (mm), and u and v of each hit."""
     work, active, faces = np.zeros(CROSSING_WORK), np.empty(BLOCK, np.uint32), face.faces
     path, hit_u, hit_v = hits
     for begin in range(first, last, BLOCK):
@@ -288,8 +285,8 @@ def _cross(net, face, screens, width, position, direction, status, outs, hits, c
 @njit(error_model="numpy", fastmath={"contract"})
 def _restore_hit(net, faces, hits, first, count, work):
     """Compute hit, normal and derivatives of the surface from u and v."""
-    m, n, scale_x, scale_y = faces.m, faces.n, faces.per_x, faces.per_y
-    size = np.uint64(m * n)
+    m, n, per_x, per_y = faces.m, faces.n, faces.per_x, faces.per_y
+    row = np.uint64(4 * n)
     for r in range(count):
         u, v = hits[1][first + r], hits[2][first + r]
         if work[FATE + r] != 0.0:
@@ -297,17 +294,16 @@ def _restore_hit(net, faces, hits, first, count, work):
         work[U + r], work[V + r] = u, v
         i, a0, a2, p0, p2 = basis(u, m)
         j, b0, b2, q0, q2 = basis(v, n)
-        along_u, along_v = (a0, a2, p0 * scale_x, p2 * scale_x), (b0, b2, q0 * scale_y, q2 * scale_y)
-        bends, at = (bend(u, m) * scale_x * scale_x, bend(v, n) * scale_y * scale_y), np.uint64(i * n + j)
-        x, x_x, x_y, x_xx, x_xy, x_yy = curved_piece(net, n, at, along_u, along_v, bends)
-        y, y_x, y_y, y_xx, y_xy, y_yy = curved_piece(net, n, at + size, along_u, along_v, bends)
-        z, z_x, z_y, z_xx, z_xy, z_yy = curved_piece(net, n, at + size + size, along_u, along_v, bends)
-        work[X + r], work[Y + r], work[SAG + r] = x, y, z
-        _set(work, S_X, r, (x_x, y_x, z_x))
-        _set(work, S_Y, r, (x_y, y_y, z_y))
-        _set(work, S_XX, r, (x_xx, y_xx, z_xx))
-        _set(work, S_XY, r, (x_xy, y_xy, z_xy))
-        _set(work, S_YY, r, (x_yy, y_yy, z_yy))
+        s, s_x, s_y, s_xx, s_xy, s_yy = curved_space_piece(
+            net, np.uint64(4 * (i * n + j)), row, a0, a2, p0 * per_x, p2 * per_x, b0, b2, q0 * per_y, q2 * per_y,
+            bend(u, m) * per_x * per_x, bend(v, n) * per_y * per_y,
+        )  # fmt: skip
+        work[X + r], work[Y + r], work[SAG + r] = s
+        _set(work, S_X, r, s_x)
+        _set(work, S_Y, r, s_y)
+        _set(work, S_XX, r, s_xx)
+        _set(work, S_XY, r, s_xy)
+        _set(work, S_YY, r, s_yy)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
@@ -374,9 +370,25 @@ def _chain(faces, count, work, path, d_rays, first):
         _set(work, GAMMA, r, (gamma[0] * per_y, gamma[1] * per_y, gamma[2] * per_y) if alive else (0.0, 0.0, 0.0))
 
 
+@njit(error_model="numpy", fastmath={"contract"})
+def _scatter(faces, count, work, own, touched):
+    """Add ∂L/∂(S, ∂S/∂u, ∂S/∂v) of rays to the nine control points of their spans; own (m, 4 n): see reductions.py."""
+    m, n = faces.m, faces.n
+    for r in range(count):
+        if work[FATE + r] != 0.0:
+            continue
+        i, a0, a2, p0, p2 = basis(work[U + r], m)
+        j, b0, b2, q0, q2 = basis(work[V + r], n)
+        reductions.clear(own, touched, i, i + 3)
+        add_to_space_span(
+            own, np.uint64(4 * (i * n + j)), np.uint64(4 * n), a0, a2, p0, p2, b0, b2, q0, q2,
+            _get(work, ALPHA, r), _get(work, BETA, r), _get(work, GAMMA, r),
+        )  # fmt: skip
+
+
 @compiled()
 def _cross_adjoint(net, face, screens, position, direction, status, hits, g, more, d_rays, first, last, own, touched):
-    """Add to each of own[0] … own[2] (m, n) the gradient in a component of the control points (see crossing.py)."""
+    """Add to own (m, 4 n) the gradient in the control points (see crossing.py)."""
     work, faces = np.empty(DOME_WORK), face.faces
     for begin in range(first, last, BLOCK):
         count = min(BLOCK, last - begin)
@@ -385,24 +397,18 @@ def _cross_adjoint(net, face, screens, position, direction, status, hits, g, mor
         _leave(faces, count, work)
         crossing.load_gradient(faces, screens, g, more, status, begin, count, work)
         _chain(faces, count, work, hits[0], d_rays, begin)
-        u, v = work[U : U + count], work[V : V + count]
-        for c in range(3):
-            alpha, beta, gamma = ALPHA + BLOCK * c, BETA + BLOCK * c, GAMMA + BLOCK * c
-            scatter(
-                own[c], touched[c], u, v,
-                work[alpha : alpha + count], work[beta : beta + count], work[gamma : gamma + count],
-            )  # fmt: skip
+        _scatter(faces, count, work, own, touched)
 
 
 def prepare(rays: Rays, interface: Interface) -> tuple[Rays, Tensor, RadialFace]:
-    """Return (the rays, components (3, m, n) of the control points relative to the centre (mm), face as numbers)."""
+    """Return (the rays, `packed` control points, face as numbers)."""
     points, face = _as_numbers(interface)
     faces, _ = kernel_arguments.faces(interface, None, rays.sense, rays.z)
     return rays, points, face._replace(faces=faces)
 
 
 def _as_numbers(interface: Interface) -> tuple[Tensor, RadialFace]:
-    """Return components (3, m, n) of the control points relative to the centre (mm), and the face as numbers."""
+    """Return the `packed` control points, and the face as numbers."""
     surface = interface.surface
     assert isinstance(surface, RadialSurface)
     faces, _ = kernel_arguments.faces(interface, None, 1, surface.z)
@@ -411,8 +417,13 @@ def _as_numbers(interface: Interface) -> tuple[Tensor, RadialFace]:
         radius=surface.radius, tolerance=tolerance, max_step=radial.MAX_STEP * surface.radius,
         min_cosine=radial.MIN_COSINE, newton_steps=radial.NEWTON_STEPS,
     )  # fmt: skip
-    points = torch.stack([(surface.radius + surface.heights.double()) * d for d in surface.directions])
-    return points, RadialFace(faces=faces, **search)
+    return packed(surface), RadialFace(faces=faces, **search)
+
+
+def packed(surface: RadialSurface) -> Tensor:
+    """Return the control points (mm) relative to the centre, differentiable: (m, 4 n), (x, y, z, 0) of each."""
+    directions = torch.nn.functional.pad(surface.directions.movedim(0, -1), (0, 1))
+    return ((surface.radius + surface.heights.double())[..., None] * directions).flatten(1)
 
 
 # --- the whole path ---------------------------------------------------------------------------------------------------

@@ -14,10 +14,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numba import njit
 
-from bstcad.optics.kernels.dome import clamped, dot, patch, times
+from bstcad.optics.kernels.dome import clamped, dot, packed, patch, times
 from bstcad.optics.kernels.spline import net_of
 from bstcad.optics.numerics import reductions
 from bstcad.optics.numerics.compiling import compiled
@@ -64,8 +63,7 @@ def distance_of_facets(surface: RadialSurface, corners: np.ndarray) -> float:
 
 def _as_numbers(surface: RadialSurface) -> tuple[np.ndarray, Chart]:
     (x, y), (pitch_x, pitch_y), (m, n) = (float(surface.x[0]), float(surface.y[0])), surface.pitch, surface.shape
-    points = torch.stack([(surface.radius + surface.heights.detach().double()) * d for d in surface.directions])
-    return net_of(points), Chart(
+    return net_of(packed(surface)), Chart(
         m, n, x, y, per_x=1 / float(pitch_x), per_y=1 / float(pitch_y), radius=float(surface.radius)
     )
 

@@ -382,12 +382,12 @@ def landed(rays: Rays, interface: Interface, planes: Sequence[Receiver]) -> tupl
     screens = kernel_arguments.screens(interface, planes, rays.sense)
     if screens.tilted is not None:
         return None
-    rays, nets, faces = prepare_heights(rays, interface)
+    rays, net, faces = prepare_heights(rays, interface)
     position, direction = (
         reflect_z(t.double(), rays.sense).reshape(3, -1).contiguous() for t in (rays.position, rays.direction)
     )
-    throws = torch.from_numpy(screens.throws).to(nets.device)
-    heights, status = nets[0].double().contiguous(), rays.status.reshape(1, -1)
+    throws = torch.from_numpy(screens.throws).to(net.device)
+    heights, status = net.double().contiguous(), rays.status.reshape(1, -1)
     fate, places = CrossAndLand.apply(heights, (position, direction, status), _face(faces), throws)
     shape = rays.status.shape
     return tuple(
