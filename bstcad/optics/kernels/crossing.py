@@ -384,8 +384,8 @@ def load_gradient(faces, screens, g, more, status, first, count, work):
 def _cross_adjoint(net, faces, screens, position, direction, status, hits, g, more, d_rays, first, last, own, touched):
     """Add to own (m, n) the gradient of the merit in the net, from rays first … last - 1 (see reductions.py).
 
-    g: gradients in `outs` of `_cross`.  more: gradients in path and cosine of incidence (2, n), or (2, 0).  d_rays:
-    None, or (6, n), which receives the gradient in positions and directions.
+    g: gradients in `outs` of `_cross`, in one array or two.  more: gradients in path and cosine of incidence (2, n), or
+    (2, 0).  d_rays: None, or (6, n), which receives the gradient in positions and directions.
     """
     work, path = np.empty(ADJOINT_WORK), hits[0]
     for begin in range(first, last, BLOCK):
@@ -462,9 +462,6 @@ class Cross(torch.autograd.Function):
     def backward(ctx: Any, _: None, g_path: Tensor | None, g_cosine: Tensor | None, *g: Tensor | None) -> Any:  # noqa: D102
         (net, position, direction, fate, *hits), crossing = ctx.saved_tensors, ctx.crossing
         n = hits[0].numel()
-        known = np.empty((*crossing.shapes, n))
-        for into, each in zip(known, g, strict=True):
-            into[:] = 0.0 if each is None else each.numpy()
         more = np.empty((2, 0))
         if g_path is not None or g_cosine is not None:
             more = np.zeros((2, n))
@@ -474,12 +471,21 @@ class Cross(torch.autograd.Function):
         shares = reductions.shares(n, BLOCK)
         owns, ranges = reductions.buffers(len(shares), *net.shape)
         inputs = [net_of(net), *crossing[1:3], *_doubles([position, direction]), fate.numpy(), _arrays(hits)]
+        known = _gradients(g, (crossing.shapes[1], n), as_one=crossing.screens is not None)
         inputs += [known, more, None if d_rays is None else d_rays.numpy()]
         tasks = [(*share, own, touched) for share, own, touched in zip(shares, owns, ranges, strict=True)]
         reductions.on_threads(lambda *task: crossing.form.adjoint(*inputs, *task), tasks)
         d_net = torch.from_numpy(reductions.merged(owns, ranges)).to(net.dtype)
         d_position, d_direction = (None, None) if d_rays is None else d_rays.to(position.dtype).split(3)
         return d_net, d_position, d_direction, None, None
+
+
+def _gradients(g: Sequence[Tensor | None], shape: tuple[int, int], as_one: bool) -> Any:
+    """Return gradients of a shape, 0 for None, as float64 arrays, copied only if needed; or as one array of them."""
+    known = [torch.zeros(shape, dtype=torch.float64) if each is None else each.double().contiguous() for each in g]
+    if not as_one:
+        return _arrays(known)
+    return (torch.stack(known) if len(known) > 1 else known[0][None]).numpy()
 
 
 def _arrays(tensors: Sequence[Tensor]) -> tuple[np.ndarray, ...]:
