@@ -51,6 +51,7 @@ from bstcad.manufacture.shop import as_built, rounds
 from bstcad.manufacture.shop.as_built import AsBuilt, Retailored
 from bstcad.manufacture.shop.rounds import Compensated
 from bstcad.manufacture.tolerance import tolerances
+from bstcad.manufacture.tolerance.grades import making_of
 from bstcad.manufacture.tolerance.tolerances import Tolerances
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.trace.measure import FULL, Effort, Light, SpectralLine
@@ -441,7 +442,7 @@ def _contents(made: DesignedLens, proof: Proof, estimates: tuple[LeftOut, ...]) 
     diagnosed, facts = diagnosis(alone, made.course, proof, goal.picture), circumstances(made.device)
     return contents_of(
         made, proof, course=made.course, circumstances=facts, simulated=[name for name, _ in simulated(scene)],
-        estimates=estimates, diagnosis=diagnosed,
+        estimates=estimates, diagnosis=diagnosed, making=making_of(scene.tolerance, proof.lens),
     )  # fmt: skip
 
 

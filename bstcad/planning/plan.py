@@ -13,7 +13,9 @@ import numpy as np
 
 from bstcad.analysis.etendue import FORBIDDEN, etendue
 from bstcad.analysis.light import blur
+from bstcad.analysis.sharp_throw import sharp_throw
 from bstcad.designs.pipeline import reachable_part
+from bstcad.manufacture.tolerance.grades import making_of
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.receivers.goal import worst
 from bstcad.optics.surfaces.sides import as_pair, scaled
@@ -47,10 +49,14 @@ def plan(
     """Yield the entries of `plan --json`: first the effects, then the predictions (see `predict_qualities`).
 
     simulated: effects that are simulated.  goals: for each target its key, left_out (neglected effects, ordered by
-    change of the RRMSD), blur, unreachable and etendue.  Those of the most blurred target are repeated outside goals.
+    change of the RRMSD), blur, unreachable, sharp_throw and etendue.  Those of the most blurred target are repeated
+    outside goals.
 
     unreachable: part of the target that light cannot reach (optics.trace.reach.unreached); None: none, or a tailored
     front.
+
+    sharp_throw: longest throw of a sharp picture (analysis.sharp_throw.SharpThrow), with cells of a pixel;
+    None: an even target, or not known.
 
     etendue: {fits, narrowest, unit} of analysis.etendue.Etendue; None: a source without extent.
 
@@ -137,6 +143,12 @@ def _goal_effects(scene: Scene, lens: Lens, key: str) -> dict[str, Any]:
     estimates, image = left_out(scene, lens, target), blur(scene.channels(), lens, scene.target.screen, target)
     fits = etendue(scene.light, lens, goal)
     rounded = {"blur": image and round_numbers(asdict(image), 3), "unreachable": beyond and round_numbers(beyond, 3)}
+    size = next((each.blur_pixels or 0.0 for each in estimates if each.kind == "source size"), 0.0)
+    width = image.width if image else size * scene.target.screen.pixel_side
+    light, making = scene.with_source_scaled(0.0).channels(), making_of(scene.tolerance, lens)
+    throw = sharp_throw(light, lens, scene.target.screen, making, source_image=width)
+    sharp = None if scene.target.uniform else throw
+    rounded["sharp_throw"] = sharp and round_numbers(asdict(sharp), 3)
     rounded["etendue"] = fits and round_numbers(asdict(fits), 3)
     return {"key": key, "left_out": [asdict(estimate) for estimate in estimates], **rounded}
 

@@ -24,6 +24,7 @@ from pydantic_core import from_json, to_json, to_jsonable_python
 from bstcad.analysis.cost import lifted, unlit
 from bstcad.analysis.etendue import Etendue, etendue
 from bstcad.analysis.light import Blur, FinestDetail, finest_detail
+from bstcad.analysis.sharp_throw import Making, SharpThrow, sharp_throw
 from bstcad.analysis.steepness import Steepness
 from bstcad.analysis.top_hat import FlatTop
 from bstcad.designs.course import (
@@ -178,6 +179,7 @@ class Contents:
     stability: Mapping[str, float | int | None] | None = None
     blur: Blur | None = None  # blur by the source's size; None: a point source or parallel light
     finest_detail: FinestDetail | None = None  # finest detail on the target; None: no size of the source
+    sharp_throw: SharpThrow | None = None  # longest throw of a sharp picture; None: not known, or no plate
     lines: tuple[LineFigures, ...] = ()  # lines of the spectrum; empty: the source has one wavelength
     picture: tuple[str, ...] = ()  # sentences on how a file was read: first of its pictures, transparency, tones, fit
     given_up: tuple[str, ...] = ()  # text of the remarks
@@ -266,17 +268,21 @@ def contents_of(
     simulated: Sequence[str],
     estimates: tuple[LeftOut, ...],
     diagnosis: Mapping[str, Any],
+    making: Making,
 ) -> Contents:
     """Return the contents of report.json.
 
     circumstances: present version, machine and versions of libraries; those known in `course` have priority.
     simulated: names of the simulated effects.  estimates: effects that are not simulated.  diagnosis: convergence,
-    remaining_error and bounds.
+    remaining_error and bounds.  making: errors of a made part that spread light.
     """
     scene, goals, source = design.scene, design.goals, design.scene.source
     known = {key: value for key, value in vars(course).items() if value is not None}
     goal, light, figures = goals[proof.worst], proof.light, figures_of(goals, proof.lights)
     stated = figures[proof.worst]
+    right = stated.right_down_to or 0.0
+    finest = _finest_detail(source, proof, goal.screen, estimates, least=right)
+    light_of_centre, image = scene.with_source_scaled(0.0).channels(), finest.source_image if finest else 0.0
     contents = Contents(
         **{**circumstances, **known},
         **diagnosis,
@@ -305,7 +311,8 @@ def contents_of(
         shape=proof.shape,
         stability=proof.stability,
         blur=proof.blur,
-        finest_detail=_finest_detail(source, proof, goal.screen, estimates, least=stated.right_down_to or 0.0),
+        finest_detail=finest,
+        sharp_throw=sharp_throw(light_of_centre, proof.lens, goal.screen, making, source_image=image, least=right),
         picture=scene.picture_remarks(),
         lines=tuple(
             LineFigures(k.wavelength, k.share, rrmsd_of_pictures(goal.picture, k.picture)) for k in proof.lines

@@ -27,6 +27,7 @@ RECORDS = {  # JSON file: (module, names of its records), with the record of the
         ("verify/verdict.py", ["Check"]),
         ("verify/light_limits.py", ["LightValue"]),
         ("analysis/light.py", ["Blur", "FinestDetail"]),
+        ("analysis/sharp_throw.py", ["SharpThrow"]),
         ("verify/judges/comparison.py", ["Judge"]),
         ("report/prescription.py", ["Order"]),
     ],

@@ -219,6 +219,7 @@ class TestCommand:
             "left_out",
             "blur",
             "unreachable",
+            "sharp_throw",
             "etendue",
             "files",
         }
@@ -226,9 +227,12 @@ class TestCommand:
         assert set(found) == keys and err == ""
         assert found["blur"] is None and found["unreachable"] is None  # a beam of no size, all within reach
         assert found["predicted"] is None and "target.z" in found["not_predicted"]
+        throw = found["sharp_throw"]
+        assert throw["throw"] == pytest.approx(throw["distance"] * throw["cell"] / throw["spot"], rel=5e-3)
         assert cli.run(few) == 0
         out, _ = capsys.readouterr()
-        assert all(words in out for words in ("vignetting", "Fresnel", '[[effects]] kind = "fresnel"', "not predicted"))
+        said = "vignetting", "Fresnel", '[[effects]] kind = "fresnel"', "not predicted", "sharp up to a throw of"
+        assert all(words in out for words in said)
         assert max(map(len, out.splitlines())) <= 100
 
     def test_predictions_as_json_and_as_a_table(self, capsys, known_pilot):

@@ -60,6 +60,10 @@ DETAIL = {
     "width": 5.57, "source_image": 5.55, "pixel": 0.39, "distance": 600.0, "nearer_distance": 250.0,
     "nearer_width": 2.356, "of": "source.divergence = 0.53 degrees", "assumed": False,
 }  # fmt: skip
+SHARP = {
+    "throw": 812.0, "distance": 600.0, "cell": 0.39, "spot": 0.288, "spots": {"form": 0.27, "source": 0.1},
+    "grade": "milled-polished", "words": "milled by a router", "assumed": False,
+}  # fmt: skip
 ALONE = {"nearer_distance": None, "nearer_width": None}
 SHAPE = {"centre_thickness": 12.0, "thickness_min": 5.8, "radius_min_concave": 8.9, "radius_min_convex": None}
 
@@ -100,6 +104,13 @@ SAID = [  # changes of REPORT: words of the page; do they stand on the terminal,
     ({"finest_detail": DETAIL}, "degrees); it would be 2.4 mm with the target 250 mm instead of 600 mm from", True),
     ({"finest_detail": DETAIL | ALONE | {"assumed": True}}, "0.53 degrees, assumed, since the scene", True),
     ({"finest_detail": DETAIL | {"source_image": 0.1}}, "pixels; the image of the source is 0.1 mm wide (so", True),
+    ({"sharp_throw": SHARP}, "Sharp up to a throw of", True),
+    (
+        {"sharp_throw": SHARP},
+        "is 0.29 mm wide: 0.27 mm by the form, 0.1 mm by the source (part: milled by",
+        True,
+    ),
+    ({"sharp_throw": SHARP | {"assumed": True}}, "by a router; assumed, since the scene states no grade)", True),
     ({"shape": SHAPE}, "smallest convex radius none", True),
     ({"prescription": {"outline": {"radius": 7.5, "shape": "circle"}}}, "Ø 15 mm", True),
     ({"title": "[red]Letters[/red]"}, "[red]Letters[/red]", True),

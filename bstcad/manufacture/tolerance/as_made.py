@@ -18,16 +18,15 @@ from torch import Tensor
 
 from bstcad.analysis.neglected_effects import difference
 from bstcad.analysis.scattering import Scatter
-from bstcad.manufacture.tolerance.grades import GRADES, base_grade, finish_of, graded_table
+from bstcad.manufacture.tolerance.grades import GRADES, base_grade, finish_of, form_of, graded_table
 from bstcad.manufacture.tolerance.perturbations import Setup, form_error
 from bstcad.optics.lens.lens import Lens
-from bstcad.optics.lens.passes import BACK
 from bstcad.optics.light.channels import Channel, weighted_sum
 from bstcad.optics.receivers.goal import Goal
 from bstcad.optics.receivers.irradiance import rrmsd_of_pictures
 from bstcad.optics.trace.finish import Finish, finished_pictures
 from bstcad.optics.trace.unfolding import per_radian
-from bstcad.scene.quality import FORM, NONE, Tolerance, settings_of
+from bstcad.scene.quality import Tolerance
 from bstcad.tailoring.source_image import BlurOperator, ExtendedSource, blurred, blurs, with_border
 from bstcad.verify.nominal import Nominal
 
@@ -193,13 +192,10 @@ class SceneLight:
 
 def _with_form_error(lens: Lens, light: SceneLight, table: Sequence[Tolerance]) -> Lens:
     """Return the lens with one random form error on its back, whose RMS is the limit of back.form."""
-    values = settings_of(table, FORM[0])
-    if values.get("grade") == NONE or BACK not in lens.passes.faces:
+    form = form_of(table, lens)
+    if form is None:
         return lens
-    grade = GRADES.get(values.get("grade", ""))
-    size = values.get("limit", 0.0 if grade is None else grade.form)
-    relative = 0.15 if grade is None else grade.form_length
-    length = values.get("correlation_length", relative * 2 * min(lens.outline.half_extent))
+    size, length = form
     try:
         kind = form_error(lens, length, FORM_SEED)
     except ValueError:  # the net is too coarse for the correlation length

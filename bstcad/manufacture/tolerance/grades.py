@@ -17,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+from bstcad.analysis.sharp_throw import Making
 from bstcad.manufacture.tolerance.perturbations import Kind, Perturbation, Setup, form_error, kinds, ripple
 from bstcad.optics.lens.lens import Lens
 from bstcad.optics.lens.passes import BACK, FRONT
@@ -144,6 +145,26 @@ def finish_of(table: Sequence[Tolerance]) -> Finish:
     ripple, period = (0.0, finish.period) if grade is None else (grade.ripple, grade.period)
     finish = replace(finish, ripple=marks.get("limit", ripple), period=marks.get("period", period))
     return replace(finish, **{key: values[key] for key in FINISH_KEYS if key in values})
+
+
+def form_of(table: Sequence[Tolerance], lens: Lens) -> tuple[float, float] | None:
+    """Return RMS and correlation length (mm) of the back's form error by a `graded_table`; None: there is none."""
+    values = settings_of(table, FORM[0])
+    if values.get("grade") == NONE or BACK not in lens.passes.faces:
+        return None
+    grade = GRADES.get(values.get("grade", ""))
+    size = values.get("limit", 0.0 if grade is None else grade.form)
+    relative = GRADES[DEFAULT_GRADE].form_length if grade is None else grade.form_length
+    return size, values.get("correlation_length", relative * 2 * min(lens.outline.half_extent))
+
+
+def making_of(tolerance: Sequence[Tolerance], lens: Lens) -> Making:
+    """Return the errors that spread light, by the [[tolerance]] tables of a scene; without a grade, DEFAULT_GRADE."""
+    table = graded_table(tolerance)
+    name = base_grade(table)
+    words = GRADES[name].words if name in GRADES else "as stated in the scene"
+    stated = any(entry.name is None and entry.grade is not None for entry in tolerance)
+    return Making(finish_of(table), form_of(table, lens), name, words, assumed=not stated)
 
 
 def perturbations(setup: Setup, table: Sequence[Tolerance], material: str | None = None) -> tuple[Perturbation, ...]:

@@ -146,7 +146,7 @@ def _typed_jet(net: Any, count: int, bends: int) -> Any:
             context.make_tuple(
                 builder, triple, [builder.extract_element(vector, ir.Constant(INDEX, lane)) for lane in range(3)]
             )
-            for vector in _space_jet(vectors, data, at, row, weights[:8], weights[8:])
+            for vector in _space_jet(vectors, data, at, row, along=weights[:8], bends=weights[8:])
         ]
         return context.make_tuple(builder, signature.return_type, parts)
 
