@@ -17,7 +17,7 @@ from bstcad.planning.prediction import Interval
 from bstcad.planning.preview import Preview
 from bstcad.report.record import LEFT_OUT, LeftOut, changes
 from bstcad.report.report import lit_sentences, made_sentences
-from bstcad.report.units import Rows, duration, number, quantity, tables
+from bstcad.report.units import Rows, duration, number, paragraphs, quantity, tables
 
 SOLID_CELLS = 96  # cells per side of the mesh of the solid on the page
 # Error of the preview's thicknesses and relief, as a fraction of the relief.  The largest differences from finished
@@ -76,7 +76,7 @@ def figures(found: Preview) -> Rows:
 
 
 def of_plan(plan: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the effects in `plan --json`: the simulated ones and a row for each left out; also net and verdict."""
+    """Return the effects in `plan --json`: simulated ones, rows of those left out, net, verdict and throw."""
     rows = [
         [" ".join(filter(None, (LEFT_OUT[entry.kind], entry.detail and f"({entry.detail})"))), *changes(entry), of]
         for goal in plan["goals"]
@@ -84,7 +84,9 @@ def of_plan(plan: Mapping[str, Any]) -> dict[str, Any]:
         for entry in (LeftOut(**item) for item in goal["left_out"])
     ]
     simulated = [item["what"] for item in plan["simulated"]]
-    return {"simulated": simulated, "left_out": rows, "net": plan["net"], "verdict": plan.get("verdict")}
+    sharp = " ".join(sentence for goal in plan["goals"] for sentence in paragraphs("plan.txt.j2", "throw", goal=goal))
+    known = {"net": plan["net"], "verdict": plan.get("verdict"), "sharp": sharp}
+    return {"simulated": simulated, "left_out": rows, **known}
 
 
 def of_predictions(plan: Mapping[str, Any]) -> dict[str, Any]:

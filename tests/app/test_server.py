@@ -220,6 +220,22 @@ def test_a_preview_that_fails_is_told_without_folders(own, monkeypatch, stage):
     assert str(own.outside) not in answer.text
 
 
+def test_the_page_is_told_up_to_which_throw_the_picture_is_sharp(own, monkeypatch):
+    throw = {"throw": 42.3, "distance": 250.0, "cell": 0.39, "spot": 2.31, "spots": {"source": 2.3, "form": 0.2}}
+    throw |= {"grade": "moulded", "words": "moulded plastic", "assumed": True, "unit": "mm"}
+    goals = [{"key": "target", "left_out": [], "sharp_throw": throw}]
+    plan = {"simulated": [], "goals": goals, "net": "129 control points"}
+    monkeypatch.setattr(own.workbench.desk, "answer", lambda *_: ("effects", plan))
+    told = own.ask("/api/scene/small/preview", {"page": "p", "number": 1}).json["sharp"]
+    assert told == (
+        "The picture is sharp up to a throw of 42 mm, where a point of it would be 0.39 mm wide, a pixel; on the "
+        "target, 250 mm from the back, a point of the picture is 2.3 mm wide: 2.3 mm by the source, 0.2 mm by the form "
+        "(part: moulded plastic; assumed, since the scene states no grade)."
+    )
+    goals[0]["sharp_throw"] = None
+    assert own.ask("/api/scene/small/preview", {"page": "p", "number": 1}).json["sharp"] == ""
+
+
 # ---- requests that are wrong -----------------------------------------------------------------------------------------
 
 WRONG = [

@@ -326,6 +326,7 @@ function noPlan(sentence) {
   qualities = {};
   for (const table of [element("predicted"), element("left-out").querySelector("table")]) table.tBodies[0].replaceChildren();
   element("net").textContent = "";
+  element("sharp").textContent = "";
   element("comes-to").textContent = "";
   element("notes").textContent = sentence;
   showQuality();
@@ -400,6 +401,7 @@ function showPlan(reply) {
   if (reply.refused) noPlan(`No estimate: ${reply.refused}.`);
   else if (reply.stage === "effects") {
     element("net").textContent = reply.net ?? "";
+    element("sharp").textContent = reply.sharp ?? "";
     const several = reply.left_out.some((cells) => cells[4]);
     element("left-out").querySelector("th:last-child").hidden = !several;
     const rows = reply.left_out.map((cells) => row(several ? cells : cells.slice(0, 4), { numbers: [1, 2, 3] }));
