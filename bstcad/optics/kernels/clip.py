@@ -307,7 +307,7 @@ def _set_gradients(rules, row, count, work):
         b_1, b_2 = below * work[ALONG_12 + LENGTH + r], below * work[ALONG_12 + 2 * LENGTH + r]
         c_3, c_2 = second * work[ALONG_01 + LENGTH + r + 1], second * work[ALONG_01 + 2 * LENGTH + r + 1]
         d_0, d_3 = above * work[ALONG_03 + LENGTH + r], above * work[ALONG_03 + 2 * LENGTH + r]
-        q, more = q_2, q_1 - q_2  # of the whole tube, and more of its first triangle
+        q, more = q_2, q_1 - q_2  # coefficients of the gradients of the whole area, and of the first triangle alone
         third_x, third_y = more * (y0 - y1) + end * dy, more * (x1 - x0) - end * dx
         start_x, start_y = start * dy, -start * dx
         work[G_0 + r] = a_0 * (y1 - y0) - d_0 * (y3 - y0) + q * (y1 - y3) + more * (y1 - y) + (0.0 if odd else start_x)
